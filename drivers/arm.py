@@ -1,0 +1,137 @@
+"""The Arm contract: what every arm, real or simulated, is to the motion loop.
+
+One blocking call per cycle for all axes, in joint space and SI units. This room knows nothing of identification,
+and a driver does no mathematics beyond units and transmission.
+
+Timing. `exchange(torque)` of cycle k waits for the start of cycle k, hands the torque over and returns the sample of
+that cycle: positions at its stamp, and in `Sample.torque` the torque that acts from that stamp until the next one,
+after clipping and quantisation. Sample-to-actuation is therefore exactly one period.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from enum import Enum
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.clock import Clock
+
+Vector = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Counts = NDArray[np.int64]
+
+
+class StopKind(Enum):
+    """How an arm is told to stop from below; a coordinated stop is the motion loop's, not the driver's."""
+
+    TORQUE_OFF = "torque_off"  # no torque; an arm without brakes falls
+    QUICK_STOP = "quick_stop"  # the drives decelerate on their own, then hold or release as configured
+
+
+@dataclass(frozen=True)
+class ArmDescription:
+    """What an open arm says of itself.
+
+    Attributes:
+        joint_names: in the order of every vector.
+        rate: cycles per second.
+        torque_limit: clip of the driver [N m or N], shape (joints,).
+        torque_resolution: smallest step of the torque [N m or N], shape (joints,); 0 where continuous.
+        position_resolution: smallest step of the position [rad or m], shape (joints,); 0 where continuous.
+        identities: per axis, what hardware answered (vendor, product, serial, firmware), for the record.
+        software: name and version of the driver.
+    """
+
+    joint_names: tuple[str, ...]
+    rate: float
+    torque_limit: Vector
+    torque_resolution: Vector
+    position_resolution: Vector
+    identities: tuple[str, ...]
+    software: str
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """What one cycle brought.
+
+    Attributes:
+        cycle: number of the cycle since `open`.
+        stamp_ns: monotonic time at which the positions were sampled [ns] (of the request, not of the replies).
+        position: [rad or m], shape (joints,).
+        velocity: measured by the drive [rad/s or m/s], shape (joints,), or None where the drive gives none.
+        torque: the torque that acts from this stamp to the next one, clipped and quantised [N m or N], (joints,).
+        valid: which axes answered in this cycle, shape (joints,).
+        age: cycles since each axis answered, shape (joints,); 0 where `valid`.
+        lost: frames lost since `open`.
+        status: slow per-axis status words, with `status_age` cycles since they were read.
+    """
+
+    cycle: int
+    stamp_ns: int
+    position: Vector
+    velocity: Vector | None
+    torque: Vector
+    valid: Flags
+    age: Counts
+    lost: int = 0
+    status: tuple[int, ...] = field(default=())
+    status_age: int = 0
+
+
+class Arm(ABC):
+    """A context manager with a handful of methods. Entering opens, leaving closes; closing stops torque first."""
+
+    clock: Clock
+
+    @abstractmethod
+    def open(self) -> None:
+        """Take the arm exclusively and make it answer. Raises DriverError when it cannot be had."""
+
+    @abstractmethod
+    def describe(self) -> ArmDescription:
+        """Say what is open. Raises DriverError when the arm is not open."""
+
+    @abstractmethod
+    def enable(self) -> None:
+        """Energise all axes with zero torque. Raises DriverError; on failure no axis stays energised."""
+
+    @abstractmethod
+    def exchange(self, torque: Vector | None) -> Sample:
+        """One cycle for all axes.
+
+        Args:
+            torque: to act from this cycle's stamp on [N m or N], shape (joints,); None only looks, and is the
+                only value an arm that is not enabled accepts.
+
+        Returns:
+            The sample of this cycle.
+
+        Raises:
+            DriverError: not open, a torque while not enabled, a torque that is not finite or of the wrong shape,
+                or the bus is gone. A torque that raises has not been sent.
+        """
+
+    @abstractmethod
+    def stop(self, kind: StopKind) -> None:
+        """Stop from any state, any number of times; never raises."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Torque off, release the arm; safe from any state, any number of times."""
+
+    def __enter__(self) -> Self:
+        """Open."""
+        self.open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close, whatever happened."""
+        self.close()

@@ -1,0 +1,64 @@
+"""The clocks a loop can run on: the machine's, or a virtual one that waits for nobody.
+
+Everything that knows time takes one of these, so that leases, watchdogs and deadlines agree and a loop behaves the
+same in real and in virtual time.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Protocol
+
+
+class Clock(Protocol):
+    """Monotonic time in integer nanoseconds."""
+
+    @property
+    def lock_step(self) -> bool:
+        """Whether time stands still until it is told to move, so that a consumer may be waited for."""
+
+    @property
+    def utc_offset_ns(self) -> int:
+        """What to add to `now_ns` to get nanoseconds since 1970 in UTC."""
+
+    def now_ns(self) -> int:
+        """Monotonic time [ns]."""
+
+    def sleep_until_ns(self, deadline_ns: int) -> None:
+        """Return at or after `deadline_ns`; at once when it has passed."""
+
+
+class RealClock:
+    """The machine's monotonic clock."""
+
+    lock_step = False
+
+    def __init__(self) -> None:
+        self.utc_offset_ns = time.time_ns() - time.monotonic_ns()
+
+    def now_ns(self) -> int:
+        """Monotonic time [ns]."""
+        return time.monotonic_ns()
+
+    def sleep_until_ns(self, deadline_ns: int) -> None:
+        """Sleep until the absolute deadline."""
+        while (remaining := deadline_ns - time.monotonic_ns()) > 0:
+            time.sleep(remaining * 1e-9)
+
+
+class VirtualClock:
+    """Time that jumps to whatever is waited for; `utc_offset_ns` is fixed so that runs repeat to the byte."""
+
+    lock_step = True
+
+    def __init__(self, start_ns: int = 0, utc_offset_ns: int = 0) -> None:
+        self._now = start_ns
+        self.utc_offset_ns = utc_offset_ns
+
+    def now_ns(self) -> int:
+        """Virtual time [ns]."""
+        return self._now
+
+    def sleep_until_ns(self, deadline_ns: int) -> None:
+        """Move time forward to the deadline; time never runs backwards."""
+        self._now = max(self._now, deadline_ns)

@@ -1,0 +1,1 @@
+"""What an arm is, in configuration, and where each mistake in it stands."""

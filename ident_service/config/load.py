@@ -1,0 +1,106 @@
+"""From a file name, or the name of a shipped arm, to a checked `ArmConfig`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from ident_service.config.schema import ArmConfig, DHTable, FourierMotion, SimulatedDriver
+from ident_service.config.source import KeyPath, Tree, read_tree
+from ident_service.errors import ConfigError, Problem, UsageError
+
+# In a wheel the descriptions lie inside the package, in a checkout beside it.
+_SHIPPED = (Path(__file__).parent.parent / "configs", Path(__file__).parent.parent.parent / "configs")
+_PER_JOINT = ("encoder_resolution", "torque_resolution", "torque_noise")
+
+
+def shipped_arms() -> dict[str, Path]:
+    """Names and files of the arm descriptions that come with this package."""
+    folder = next((folder for folder in _SHIPPED if folder.is_dir()), None)
+    return {} if folder is None else {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+def find_arm(arm: str) -> Path:
+    """The file of an arm given as a path or as the name of a shipped description.
+
+    Raises:
+        UsageError: neither exists.
+    """
+    if Path(arm).is_file():
+        return Path(arm)
+    shipped = shipped_arms()
+    if arm in shipped:
+        return shipped[arm]
+    raise UsageError(f"no arm description {arm!r}: not a file, and not one of {', '.join(shipped)}")
+
+
+def load_arm(arm: str | Path) -> ArmConfig:
+    """Read and check an arm description.
+
+    Args:
+        arm: a YAML file, or the name of a shipped description.
+
+    Raises:
+        UsageError: no such file and no such name.
+        ConfigError: every mistake in it, each with file, line and column.
+    """
+    path = find_arm(str(arm))
+    tree = read_tree(path)
+    try:
+        config = ArmConfig.model_validate(tree.value)
+    except ValidationError as error:
+        raise ConfigError(list(_problems(error, tree, path))) from None
+    problems = [tree.problem(where, message, path) for where, message in _disagreements(config)]
+    if problems:
+        raise ConfigError(problems)
+    return config
+
+
+def _problems(error: ValidationError, tree: Tree, path: Path) -> Iterator[Problem]:
+    seen = set()
+    for mistake in error.errors(include_url=False):
+        where = _where(mistake["loc"], tree.value)
+        message = mistake["msg"].removeprefix("Value error, ")
+        if mistake["type"] == "extra_forbidden":
+            message = f"unknown key {where[-1]!r}"
+        elif mistake["type"] == "missing":
+            message = f"{mistake['loc'][-1]!r} is missing"
+        name = ".".join(str(part) for part in where)
+        problem = tree.problem(where, f"{name}: {message}" if name else message, path)
+        if problem not in seen:
+            seen.add(problem)
+            yield problem
+
+
+def _where(loc: tuple[int | str, ...], value: Any) -> KeyPath:
+    """The part of a validator's location that exists in the file: it also names union branches and missing keys."""
+    where: list[str | int] = []
+    for part in loc:
+        if isinstance(value, tuple) and isinstance(part, int):
+            value = dict(enumerate(value))
+        if isinstance(value, dict) and part in value:
+            where.append(part)
+            value = value[part]
+    return tuple(where)
+
+
+def _disagreements(config: ArmConfig) -> Iterator[tuple[KeyPath, str]]:
+    """Mistakes that only show when two sections are held together."""
+    names = _joint_names(config.kinematics.dh, config)
+    if config.kinematics.dh is not None and config.joints and tuple(config.joints) != tuple(config.kinematics.dh.joints):
+        yield ("joints",), f"joints: {', '.join(config.joints)} are not those of kinematics.dh: {', '.join(names)}"
+    for label, motion in (("identification", config.motions.identification), ("validation", config.motions.validation)):
+        if isinstance(motion, FourierMotion) and names and tuple(motion.joints) != names:
+            yield ("motions", label, "joints"), f"motions.{label}.joints: must be {', '.join(names)}, in this order"
+    if isinstance(config.driver, SimulatedDriver) and names:
+        for key in _PER_JOINT:
+            given = getattr(config.driver, key)
+            if isinstance(given, tuple) and len(given) != len(names):
+                yield ("driver", key), f"driver.{key}: {len(given)} values for {len(names)} joints"
+
+
+def _joint_names(table: DHTable | None, config: ArmConfig) -> tuple[str, ...]:
+    return tuple(table.joints) if table is not None else tuple(config.joints)

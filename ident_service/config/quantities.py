@@ -1,0 +1,119 @@
+"""Types of single values in a configuration: angles, positive numbers, intervals, files read beside the YAML.
+
+Boundary: one value at a time; what a value means for an arm is `schema.py`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+MAX_FILE_BYTES = 16 * 2**20
+_PI = re.compile(r"^\s*([+-]?)\s*(\d+(?:\.\d*)?)?\s*\*?\s*pi\s*(?:/\s*(\d+(?:\.\d*)?))?\s*$")
+_DEGREES = re.compile(r"^\s*([+-]?\d+(?:\.\d*)?)\s*deg\s*$")
+
+
+class LocatedStr(str):
+    """A YAML string that remembers the folder of the file it stands in, so that paths mean the same everywhere."""
+
+    __slots__ = ("folder",)
+    folder: Path
+
+    def __new__(cls, value: str, folder: Path) -> LocatedStr:
+        """Make the string with its folder."""
+        located = super().__new__(cls, value)
+        located.folder = folder
+        return located
+
+
+class Section(BaseModel):
+    """A frozen part of a configuration that refuses keys it does not know."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+def _angle(value: Any) -> Any:
+    if isinstance(value, str):
+        if match := _PI.match(value):
+            sign, factor, divisor = match.groups()
+            if divisor is not None and float(divisor) == 0.0:
+                raise ValueError("an angle cannot be divided by zero")
+            return (-1.0 if sign == "-" else 1.0) * float(factor or 1.0) * math.pi / float(divisor or 1.0)
+        if match := _DEGREES.match(value):
+            return math.radians(float(match.group(1)))
+        raise ValueError(f"not an angle: {str(value)!r}; write radians, a fraction of pi such as -pi/2, or '90 deg'")
+    return value
+
+
+def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
+    if not pair[0] < pair[1]:
+        raise ValueError(f"lower bound {pair[0]:g} is not below upper bound {pair[1]:g}; check order and units")
+    return pair
+
+
+Number = Annotated[float, Field(strict=True)]
+Angle = Annotated[float, BeforeValidator(_angle)]
+Positive = Annotated[float, Field(gt=0, strict=True)]
+NonNegative = Annotated[float, Field(ge=0, strict=True)]
+Interval = Annotated[tuple[Angle, Angle], AfterValidator(_ordered)]
+Vector3 = tuple[Number, Number, Number]
+
+
+class TextFile(Section):
+    """The whole content of a file named in the configuration, so that the arm's hash covers it."""
+
+    name: str
+    text: str
+
+
+def read_beside(value: Any) -> Any:
+    """Read the file a `LocatedStr` names, relative to the YAML file it stands in; bounded in size."""
+    if not isinstance(value, str):
+        return value
+    folder = value.folder if isinstance(value, LocatedStr) else Path.cwd()
+    path = folder / value
+    if not path.is_file():
+        raise ValueError(f"no such file: {path}")
+    if path.stat().st_size > MAX_FILE_BYTES:
+        raise ValueError(f"{path} is larger than {MAX_FILE_BYTES} bytes")
+    try:
+        return {"name": path.name, "text": path.read_text(encoding="utf-8")}
+    except UnicodeDecodeError:
+        raise ValueError(f"{path} is not UTF-8 text") from None
+
+
+TextBeside = Annotated[TextFile, BeforeValidator(read_beside)]
+
+
+class ParameterTable(Section):
+    """Named link parameters: inline `{m1: 2.0, ...}` or a JSON file with `names` and `values`."""
+
+    names: tuple[str, ...]
+    values: tuple[Number, ...]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_file_or_mapping(cls, value: Any) -> Any:
+        if isinstance(value, str):
+            value = read_beside(value)
+            try:
+                content = json.loads(value["text"])
+                return {"names": tuple(content["names"]), "values": tuple(float(v) for v in content["values"])}
+            except (ValueError, KeyError, TypeError) as error:
+                raise ValueError(f"{value['name']} is not a JSON object with names and values: {error}") from None
+        if isinstance(value, dict) and set(value) != {"names", "values"}:
+            return {"names": tuple(value), "values": tuple(value.values())}
+        return value
+
+    @model_validator(mode="after")
+    def _check(self) -> ParameterTable:
+        if len(self.names) != len(self.values):
+            raise ValueError(f"{len(self.names)} names but {len(self.values)} values")
+        if len(set(self.names)) != len(self.names):
+            raise ValueError("a parameter name stands twice")
+        return self

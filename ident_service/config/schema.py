@@ -1,0 +1,247 @@
+"""What an arm is, in configuration: kinematics, limits, gains, physical constraints, motions, driver.
+
+Boundary: data only. Reading YAML is `source.py` and `load.py`; what the numbers do is other rooms' business.
+SI units; angles in radians. Tables 2, 4, 5 and 7 and eqs. 25, 26, 28 of Sousa & Cortesao 2014 have their place here.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Annotated, Any, Literal
+
+from pydantic import ConfigDict, Field, model_validator
+
+from ident_service.config.quantities import (
+    Angle,
+    Interval,
+    NonNegative,
+    Number,
+    ParameterTable,
+    Positive,
+    Section,
+    TextBeside,
+    Vector3,
+)
+
+JointTerm = Literal["drive_inertia", "viscous", "coulomb", "offset"]
+FeasibleSetName = Literal["pseudo_inertia", "inertia"]
+PerJoint = NonNegative | tuple[NonNegative, ...]
+
+
+class DHRow(Section):
+    """One row of a Denavit-Hartenberg table (table 2); the joint variable adds to theta or, if prismatic, to d."""
+
+    type: Literal["revolute", "prismatic"] = "revolute"
+    theta: Angle = 0.0
+    d: Number = 0.0
+    a: Number = 0.0
+    alpha: Angle = 0.0
+
+
+class DHTable(Section):
+    """A serial chain, standard (distal frames, `Rz(theta) Tz(d) Tx(a) Rx(alpha)`) or modified (Craig) convention."""
+
+    convention: Literal["standard", "modified"]
+    joints: Annotated[dict[str, DHRow], Field(min_length=1)]
+
+
+class Kinematics(Section):
+    """Exactly one description of the mechanism."""
+
+    dh: DHTable | None = None
+    urdf: TextBeside | None = None
+    mjcf: TextBeside | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Kinematics:
+        if sum(source is not None for source in (self.dh, self.urdf, self.mjcf)) != 1:
+            raise ValueError("give exactly one of dh, urdf, mjcf")
+        return self
+
+
+class Box(Section):
+    """An axis-aligned box in a link frame [m] (table 7)."""
+
+    lower: Vector3
+    upper: Vector3
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Box:
+        for axis, lower, upper in zip("xyz", self.lower, self.upper, strict=True):
+            if not lower < upper:
+                raise ValueError(f"{axis}: lower bound {lower:g} is not below upper bound {upper:g}; check order and units")
+        return self
+
+
+class Body(Section):
+    """What is known beforehand about the link a joint moves (eqs. 25, 26)."""
+
+    mass: Interval | None = None
+    center_of_mass: Box | None = None
+
+
+class Joint(Section):
+    """Limits, gains and body of one joint; what a motion needs may be left out of an arm that is only identified."""
+
+    position: Interval | None = None
+    velocity: Positive | None = None
+    acceleration: Positive | None = None
+    jerk: Positive | None = None
+    torque: Positive | None = None
+    following_error: Positive | None = None
+    home: Angle | None = None
+    kp: Positive | None = None
+    kd: Positive | None = None
+    body: Body = Body()
+
+    @model_validator(mode="after")
+    def _home_inside(self) -> Joint:
+        if self.home is not None and self.position is not None and not self.position[0] <= self.home <= self.position[1]:
+            raise ValueError(f"home {self.home:g} lies outside position [{self.position[0]:g}, {self.position[1]:g}]")
+        return self
+
+
+class Mass(Section):
+    """Bounds of the whole arm's mass [kg]; the moving links only."""
+
+    lower: NonNegative = 0.0
+    upper: Positive | None = None
+
+
+class Constraints(Section):
+    """Physical knowledge about the whole arm (eqs. 25, 28)."""
+
+    total_mass: Mass = Mass()
+    positive: tuple[Literal["drive_inertia", "viscous", "coulomb"], ...] = ("drive_inertia", "viscous", "coulomb")
+
+
+class Control(Section):
+    """The computed-torque loop (eq. 76): rate [Hz] and cut-off of the velocity low-pass [Hz]."""
+
+    rate: Positive = 1000.0
+    velocity_cutoff: Positive = 30.0
+
+
+class Smoothing(Section):
+    """Zero-phase Butterworth low-pass and central differences (5.2.2)."""
+
+    order: Annotated[int, Field(ge=1, le=8)] = 3
+    cutoff: Positive = 8.0
+    filter_torque: bool = False
+
+
+class Reversal(Section):
+    """Which rows the unknown friction of a joint near standstill excludes from that joint's equations."""
+
+    speed: NonNegative = 0.05
+    window: NonNegative = 0.2
+
+
+class Identification(Section):
+    """How a recording becomes equations."""
+
+    smoothing: Smoothing = Smoothing()
+    reversal: Reversal = Reversal()
+    edge: NonNegative = 0.5
+    block: Positive = 1.0
+
+
+class FourierJoint(Section):
+    """Coefficients of one joint (table 5): a, b [rad/s], q0 [rad]."""
+
+    a: Annotated[tuple[Number, ...], Field(min_length=1)]
+    b: Annotated[tuple[Number, ...], Field(min_length=1)]
+    q0: Number
+
+    @model_validator(mode="after")
+    def _same_length(self) -> FourierJoint:
+        if len(self.a) != len(self.b):
+            raise ValueError(f"{len(self.a)} sine but {len(self.b)} cosine coefficients")
+        return self
+
+
+class FourierMotion(Section):
+    """A finite Fourier series (eq. 78), `base_frequency` in Hz."""
+
+    kind: Literal["fourier"]
+    base_frequency: Positive
+    periods: Annotated[int, Field(ge=1)] = 3
+    joints: dict[str, FourierJoint]
+
+    @model_validator(mode="after")
+    def _same_harmonics(self) -> FourierMotion:
+        if len({len(joint.a) for joint in self.joints.values()}) > 1:
+            raise ValueError("the joints have different numbers of harmonics")
+        return self
+
+
+class SeededMotion(Section):
+    """A random Fourier motion, the same for the same seed, scaled into the arm's limits with a share left over."""
+
+    kind: Literal["seeded"]
+    seed: Annotated[int, Field(ge=0)]
+    base_frequency: Positive = 0.05
+    harmonics: Annotated[int, Field(ge=1, le=50)] = 5
+    periods: Annotated[int, Field(ge=1)] = 3
+    use: Annotated[float, Field(gt=0, le=1)] = 0.7
+
+
+Motion = Annotated[FourierMotion | SeededMotion, Field(discriminator="kind")]
+
+
+class Motions(Section):
+    """The motion to identify from and the one to validate on."""
+
+    identification: Motion = SeededMotion(kind="seeded", seed=1)
+    validation: Motion = SeededMotion(kind="seeded", seed=2)
+
+
+class SimulatedDriver(Section):
+    """The simulated arm: true parameters and imperfections, all per joint or one number for all."""
+
+    kind: Literal["simulated"]
+    time: Literal["virtual", "real"] = "virtual"
+    seed: Annotated[int, Field(ge=0)] = 0
+    truth: ParameterTable | None = None
+    encoder_resolution: PerJoint = 0.0
+    torque_resolution: PerJoint = 0.0
+    torque_noise: PerJoint = 0.0
+    delay_cycles: Annotated[int, Field(ge=1, le=100)] = 1
+
+
+class PluginDriver(Section):
+    """A driver that another distribution provides; it checks its own options."""
+
+    model_config = ConfigDict(frozen=True, extra="allow")
+
+    kind: str
+
+
+def _driver_kind(value: Any) -> str:
+    kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
+    return "simulated" if kind == "simulated" else "plugin"
+
+
+class ArmConfig(Section):
+    """A whole arm as its YAML file describes it; the first thing that passes every door."""
+
+    format: Literal["ident-arm"]
+    version: Literal[1]
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+    description: str = ""
+    kinematics: Kinematics
+    gravity: Vector3 = (0.0, 0.0, -9.81)
+    terms: tuple[JointTerm, ...] = ("drive_inertia", "viscous", "coulomb", "offset")
+    joints: dict[str, Joint] = {}
+    constraints: Constraints = Constraints()
+    prior: ParameterTable | None = None
+    feasible_set: FeasibleSetName = "pseudo_inertia"
+    control: Control = Control()
+    identification: Identification = Identification()
+    motions: Motions = Motions()
+    driver: SimulatedDriver | PluginDriver | None = None
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of the whole resolved description, files it names included."""
+        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()

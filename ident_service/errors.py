@@ -1,0 +1,99 @@
+"""Every error this package raises on purpose.
+
+::
+
+    IdentError
+    ├── UsageError (ValueError)        a command or call that cannot be meant: missing file, contradictory options
+    ├── ConfigError (ValueError)       an arm description with mistakes, all of them, each with file:line:column
+    ├── ModelError (ValueError)        a mechanism or array shape that the model cannot represent
+    ├── RecordingError (ValueError)    a recording that cannot be used: wrong joints, NaN, too short, torn row
+    ├── ParameterError (ValueError)    a parameter file or expression that does not parse or does not fit
+    ├── SolverError (RuntimeError)     the conic solver stopped anywhere but at an optimum
+    ├── MotionRefused (ValueError)     a motion that would leave the arm's limits, refused before anything moves
+    └── ArmError (RuntimeError)        something below the motion loop
+        ├── DriverError (OSError)      the arm cannot be opened, enabled or reached
+        └── ArmFault                   the guard or a drive stopped a motion; carries code and last samples
+
+Each leaf also is the builtin it resembles, so that callers who do not know this package can catch it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+
+class IdentError(Exception):
+    """Base of all errors raised on purpose; the command line turns it into one message and an exit code."""
+
+
+class UsageError(IdentError, ValueError):
+    """The request itself cannot be meant: a file that does not exist, options that contradict each other."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One mistake in a configuration file, with the place to mend it (lines and columns count from 1)."""
+
+    path: Path
+    line: int
+    column: int
+    message: str
+
+    def __str__(self) -> str:
+        return f"{self.path}:{self.line}:{self.column}: {self.message}"
+
+
+class ConfigError(IdentError, ValueError):
+    """An arm description has mistakes; `problems` holds all of them."""
+
+    def __init__(self, problems: Sequence[Problem]) -> None:
+        self.problems = tuple(problems)
+        super().__init__("\n".join(str(problem) for problem in self.problems))
+
+
+class ModelError(IdentError, ValueError):
+    """A mechanism the model cannot represent, or an array whose shape does not fit it."""
+
+
+class RecordingError(IdentError, ValueError):
+    """A recording cannot be used; the message says which file, where in it, and what to do."""
+
+    def __init__(self, path: Path | str, message: str) -> None:
+        self.path = Path(path)
+        super().__init__(f"{path}: {message}")
+
+
+class ParameterError(IdentError, ValueError):
+    """A parameter file, a parameter name or an expression does not parse or does not fit the arm."""
+
+
+class SolverError(IdentError, RuntimeError):
+    """The conic solver ended without an optimum; `status` is its own word for it."""
+
+    def __init__(self, problem: str, status: str) -> None:
+        self.problem = problem
+        self.status = status
+        super().__init__(f"{problem}: the solver stopped with status {status}")
+
+
+class MotionRefused(IdentError, ValueError):
+    """A motion would leave the arm's limits; nothing has moved."""
+
+
+class ArmError(IdentError, RuntimeError):
+    """Something below the motion loop failed."""
+
+
+class DriverError(ArmError, OSError):
+    """The arm cannot be opened, enabled or reached."""
+
+
+class ArmFault(ArmError):
+    """A motion was stopped; `code` names the fault, `samples` are the last ones before it."""
+
+    def __init__(self, code: str, message: str, samples: Sequence[object] = ()) -> None:
+        self.code = code
+        self.samples = tuple(samples)
+        super().__init__(f"{code}: {message}")

@@ -1,0 +1,88 @@
+"""Ordinary least squares from triangular factors, with the paper's standard deviations (eqs. 59-70, 81-84)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from ident_service.model.chain import Array
+from ident_service.model.information import Information
+
+_RANK_TOLERANCE = 1e-10
+
+
+@dataclass(frozen=True)
+class LeastSquares:
+    """An unconstrained estimate.
+
+    Attributes:
+        beta: estimate in SI units, shape (base,); zero along directions that the data do not see.
+        R1: triangular factor of W (eq. 64), shape (base, base).
+        rho1: transformed torques (eq. 67), shape (base,).
+        rho2: norm of what no beta explains, |rho_2| of eq. 70.
+        inverse: pseudo-inverse of R1, shape (base, base).
+        condition_number: of W (2-norm, SI units); infinite when W has not full rank.
+        rank: of W.
+        standard_deviations: eq. 81, which takes residuals for white, shape (base,); infinite where W is blind.
+    """
+
+    beta: Array
+    R1: Array
+    rho1: Array
+    rho2: float
+    inverse: Array
+    condition_number: float
+    rank: int
+    standard_deviations: Array
+
+
+def ordinary_least_squares(information: Information) -> LeastSquares:
+    """Minimise |omega - W beta| (eq. 60) from the factors of the equations."""
+    stacked = information.stacked()
+    R1, rho1, rho2 = stacked[:-1, :-1], stacked[:-1, -1], abs(float(stacked[-1, -1]))
+    # Columns differ by orders of magnitude in SI units; rank is judged on unit columns.
+    norms = np.linalg.norm(R1, axis=0)
+    scale = np.where(norms > 0.0, norms, 1.0)
+    U, s, Vt = scipy.linalg.svd(R1 / scale)
+    rank = int(np.sum(s > _RANK_TOLERANCE * s[0])) if s[0] > 0.0 else 0
+    inverse = ((Vt[:rank].T / s[:rank]) @ U[:, :rank].T) / scale[:, None]
+    singular = np.linalg.svd(R1, compute_uv=False)
+    beta = inverse @ rho1
+    unseen = np.linalg.norm(Vt[rank:], axis=0) > 1e-6
+    degrees = max(int(information.rows.sum()) - information.base, 1)
+    squared = rho2**2 + float(np.sum((rho1 - R1 @ beta) ** 2))
+    deviations = np.sqrt(squared / degrees) * np.linalg.norm(inverse, axis=1)
+    return LeastSquares(
+        beta=beta,
+        R1=R1,
+        rho1=rho1,
+        rho2=rho2,
+        inverse=inverse,
+        condition_number=float(singular[0] / singular[-1]) if rank == information.base else float("inf"),
+        rank=rank,
+        standard_deviations=np.where(unseen, np.inf, deviations),
+    )
+
+
+@dataclass(frozen=True)
+class TorqueError:
+    """How well parameters explain torques: eq. 84 in percent, and root mean square [N m or N]; whole and per joint."""
+
+    relative_percent: float
+    rms: float
+    joint_relative_percent: Array
+    joint_rms: Array
+
+
+def torque_error(information: Information, beta: Array) -> TorqueError:
+    """Torque error of `beta` on the equations of `information`."""
+    errors, torques = information.squared_residuals(beta), information.squared_torques()
+    rows = np.maximum(information.rows, 1)
+    return TorqueError(
+        relative_percent=100.0 * float(np.sqrt(errors.sum() / torques.sum())),
+        rms=float(np.sqrt(errors.sum() / rows.sum())),
+        joint_relative_percent=100.0 * np.sqrt(errors / np.where(torques > 0.0, torques, np.inf)),
+        joint_rms=np.sqrt(errors / rows),
+    )

@@ -1,0 +1,1 @@
+"""Excitation: motions that teach, and what they ask of the arm."""

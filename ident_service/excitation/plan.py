@@ -1,0 +1,67 @@
+"""The motion an arm description asks for: a published Fourier series, or a seeded one scaled into the limits."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from ident_service.config.limits import MotionLimits, motion_limits
+from ident_service.config.schema import FourierMotion, SeededMotion
+from ident_service.errors import MotionRefused
+from ident_service.excitation.demands import demands, require_within_limits
+from ident_service.excitation.fourier import Excitation, FourierSeries
+from ident_service.model.arm_model import ArmModel
+
+
+def excitation(model: ArmModel, purpose: Literal["identification", "validation"]) -> Excitation:
+    """The motion configured for a purpose, proven to stay inside the arm's limits.
+
+    Raises:
+        MotionRefused: limits are missing, or the motion leaves them.
+    """
+    limits = motion_limits(model.config)
+    motion = getattr(model.config.motions, purpose)
+    series = _published(motion) if isinstance(motion, FourierMotion) else _seeded(motion, model, limits)
+    require_within_limits(series, model, limits)
+    return Excitation(purpose, series, motion.periods, model.config.sha256)
+
+
+def _published(motion: FourierMotion) -> FourierSeries:
+    joints = motion.joints.values()
+    return FourierSeries(
+        motion.base_frequency,
+        np.array([joint.a for joint in joints]),
+        np.array([joint.b for joint in joints]),
+        np.array([joint.q0 for joint in joints]),
+    )
+
+
+def _seeded(motion: SeededMotion, model: ArmModel, limits: MotionLimits) -> FourierSeries:
+    """A random series, each joint scaled to use the same share of its tightest limit, then all of them for torque."""
+    rng = np.random.default_rng(motion.seed)
+    shape = (model.chain.joints, motion.harmonics)
+    middle = 0.5 * (limits.lower + limits.upper)
+    series = FourierSeries(motion.base_frequency, rng.normal(size=shape), rng.normal(size=shape), middle)
+    asked = demands(series, model)
+    room = np.minimum(limits.upper - middle, middle - limits.lower)
+    used = np.max(
+        [
+            np.maximum(asked.highest - middle, middle - asked.lowest) / room,
+            asked.velocity / limits.velocity,
+            asked.acceleration / limits.acceleration,
+            asked.jerk / limits.jerk,
+        ],
+        axis=0,
+    )
+    factor = (motion.use / used)[:, None]
+    series = FourierSeries(motion.base_frequency, series.a * factor, series.b * factor, middle)
+    for _ in range(20):
+        torque = demands(series, model).torque
+        if torque is None or bool(np.all(torque <= motion.use * limits.torque)):
+            return series
+        series = series.scaled(0.8)
+    raise MotionRefused(
+        f"{model.config.name}: gravity alone asks for more than {motion.use:.0%} of a torque limit around the middle of the "
+        "position limits; give a Fourier motion of your own under motions"
+    )

@@ -1,0 +1,69 @@
+"""From a configuration to the arm's model: chain, parameter layout and prior parameters in one frozen object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ident_service.config.schema import ArmConfig
+from ident_service.errors import ModelError
+from ident_service.model.chain import Array, Chain, chain_from_dh
+from ident_service.model.layout import Layout
+
+
+@dataclass(frozen=True)
+class ArmModel:
+    """A mechanism with named parameters.
+
+    Attributes:
+        config: what it was made from.
+        chain: the mechanism.
+        layout: names and order of delta.
+        prior: CAD parameters [SI], shape (layout.size,), or None where nothing is known.
+    """
+
+    config: ArmConfig
+    chain: Chain
+    layout: Layout
+    prior: Array | None
+
+
+def arm_model(config: ArmConfig) -> ArmModel:
+    """Build the model of an arm.
+
+    Raises:
+        ModelError: a mechanism that is not a tree of one-degree-of-freedom joints, or joints of the configuration
+            that the mechanism does not have.
+        ParameterError: prior parameters that the arm does not have.
+    """
+    kinematics = config.kinematics
+    inertias: Array | None = None
+    if kinematics.dh is not None:
+        chain = chain_from_dh(kinematics.dh, config.gravity)
+    else:
+        # Pinocchio is not needed, and not loaded, for an arm that a DH table describes.
+        from ident_service.model.rigid_body import read_mjcf, read_urdf
+
+        if kinematics.urdf is not None:
+            chain, inertias = read_urdf(kinematics.urdf, config.gravity)
+        elif kinematics.mjcf is not None:
+            chain, inertias = read_mjcf(kinematics.mjcf, config.gravity)
+        else:
+            raise ModelError(f"{config.name}: no kinematics")
+    if config.joints and tuple(config.joints) != chain.names:
+        raise ModelError(
+            f"{config.name}: joints are configured as {', '.join(config.joints)} "
+            f"but the mechanism has {', '.join(chain.names)}, in this order"
+        )
+    layout = Layout(chain.revolute, config.terms)
+    prior: Array | None = None
+    if config.prior is not None:
+        prior = layout.vector(config.prior)
+    elif inertias is not None and bool(np.all(inertias[:, 9] > 0.0)):
+        prior = np.zeros(layout.size)
+        for link in range(layout.joints):
+            prior[layout.inertial(link)] = inertias[link]
+    if prior is not None:
+        prior.setflags(write=False)
+    return ArmModel(config, chain, layout, prior)

@@ -1,0 +1,132 @@
+"""Base parameters: what a motion can teach at all (4.1).
+
+`beta = K delta` with `K = P_b^T + K_d P_d^T` (eqs. 38, 39), found numerically (Gautier 1991): the regressor at random
+states has the structural rank of the mechanism; base columns are the first independent ones from the left (4.1), the
+others' coefficients come from least squares and are rounded to decimals that the geometry explains.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from ident_service.errors import ParameterError
+from ident_service.model.chain import Array, Chain
+from ident_service.model.expressions import format_expression, parameter_matrix
+from ident_service.model.layout import Layout
+from ident_service.model.regressor import joint_regressor
+
+_RANK_TOLERANCE = 1e-8
+_DECIMALS = 11
+_SEED = 20140301
+
+
+@dataclass(frozen=True)
+class BaseParameters:
+    """The grouping of link parameters into base parameters.
+
+    Attributes:
+        names: link parameter names, the columns of K.
+        K: eq. 38, shape (base, link parameters).
+        base: columns P_b selects, increasing, shape (base,); `K[:, base]` is invertible.
+        units: the unit of each base parameter, empty strings where unknown.
+    """
+
+    names: tuple[str, ...]
+    K: Array
+    base: NDArray[np.intp]
+    units: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        self.K.setflags(write=False)
+        self.base.setflags(write=False)
+
+    @property
+    def size(self) -> int:
+        """Number of base parameters, n_b."""
+        return int(self.K.shape[0])
+
+    @cached_property
+    def dependent(self) -> NDArray[np.intp]:
+        """Columns P_d selects: everything that is not a base column."""
+        return np.setdiff1d(np.arange(len(self.names)), self.base)
+
+    @cached_property
+    def expressions(self) -> tuple[str, ...]:
+        """Each base parameter as a sum of link parameters (table 3)."""
+        return tuple(
+            format_expression([(float(row[column]), self.names[column]) for column in np.flatnonzero(row)]) for row in self.K
+        )
+
+
+def base_parameters(chain: Chain, layout: Layout) -> BaseParameters:
+    """Base parameters of a mechanism; the same ones every time for the same mechanism."""
+    rng = np.random.default_rng(_SEED)
+    samples = max(8, -(-4 * layout.size // chain.joints))
+    states = rng.uniform(-np.pi, np.pi, size=(3, samples, chain.joints))
+    H = joint_regressor(chain, layout, *states).transpose(0, 2, 1).reshape(-1, layout.size)
+    base, K_d = _first_independent(H)
+    K = np.zeros((len(base), layout.size))
+    K[np.arange(len(base)), base] = 1.0
+    dependent = np.setdiff1d(np.arange(layout.size), base)
+    K[:, dependent] = K_d
+    return BaseParameters(layout.names, K, base, tuple(layout.units[column] for column in base))
+
+
+def _first_independent(H: Array) -> tuple[NDArray[np.intp], Array]:
+    """First independent columns from the left, and what the others are made of: `H_d = H_b K_d` (eq. 32)."""
+    base = _independent_columns(H)
+    norms = np.linalg.norm(H, axis=0)
+    dependent = np.setdiff1d(np.arange(H.shape[1]), base)
+    H_b = H[:, base] / norms[base]
+    q, r = np.linalg.qr(H_b)
+    K_d = scipy.linalg.solve_triangular(r, q.T @ H[:, dependent])
+    K_d += scipy.linalg.solve_triangular(r, q.T @ (H[:, dependent] - H_b @ K_d))
+    K_d /= norms[base][:, None]
+    K_d[:, norms[dependent] <= _RANK_TOLERANCE * norms.max()] = 0.0
+    return base, _round_digits(K_d)
+
+
+def _round_digits(values: Array) -> Array:
+    """Decimals that people can read: rounding noise of the least squares becomes zero, geometry stays."""
+    return np.round(values, _DECIMALS) + 0.0
+
+
+def base_from_expressions(expressions: tuple[str, ...], names: tuple[str, ...]) -> BaseParameters:
+    """The grouping that a table of expressions defines, no arm model needed.
+
+    Args:
+        expressions: one per base parameter.
+        names: link parameter names that delta consists of.
+
+    Raises:
+        ParameterError: expressions that do not parse, use foreign names, or are not independent of each other.
+    """
+    K = parameter_matrix(expressions, names)
+    _, R, order = scipy.linalg.qr(K.T, mode="economic", pivoting=True)
+    rank = int(np.sum(np.abs(np.diag(R)) > _RANK_TOLERANCE * max(1.0, abs(R[0, 0]))))
+    if rank < len(expressions):
+        raise ParameterError(f"expression {int(order[rank]) + 1} is a combination of the others: {expressions[order[rank]]!r}")
+    base = _independent_columns(K)
+    return BaseParameters(names, K, base, ("",) * len(expressions))
+
+
+def _independent_columns(matrix: Array) -> NDArray[np.intp]:
+    """First independent columns from the left; numerically null columns are none."""
+    norms = np.linalg.norm(matrix, axis=0)
+    Q = np.zeros((matrix.shape[0], 0))
+    chosen: list[int] = []
+    # Columns that are only rounding noise must go before any scaling, or the noise looks like rank.
+    for column in np.flatnonzero(norms > _RANK_TOLERANCE * norms.max()):
+        residual = matrix[:, column] / norms[column]
+        for _ in range(2):
+            residual = residual - Q @ (Q.T @ residual)
+        length = float(np.linalg.norm(residual))
+        if length > _RANK_TOLERANCE:
+            chosen.append(int(column))
+            Q = np.column_stack([Q, residual / length])
+    return np.array(chosen, dtype=np.intp)

@@ -1,0 +1,133 @@
+"""What a set of equations knows about the base parameters: per joint, the R of `[H_b | tau]` (eqs. 64-70).
+
+Two factors merge by a QR of the two stacked, so information of blocks, logs and arms adds up in any order, and joints
+can be weighted afterwards. Columns that a joint cannot feel (links nearer the base) are left out of its factor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident_service.errors import ModelError
+from ident_service.model.chain import Array, Chain
+from ident_service.model.layout import Layout
+
+
+@dataclass(frozen=True)
+class Information:
+    """One triangular factor per joint.
+
+    Attributes:
+        supports: per joint, which base parameters it feels, increasing.
+        factors: per joint, upper triangular R of `[H_b[:, support] | tau]`, shape (rows <= k + 1, k + 1).
+        rows: equations that went into each factor, shape (joints,).
+        base: number of base parameters.
+    """
+
+    supports: tuple[NDArray[np.intp], ...]
+    factors: tuple[Array, ...]
+    rows: NDArray[np.int64]
+    base: int
+
+    def __post_init__(self) -> None:
+        for array in (*self.factors, self.rows):
+            array.setflags(write=False)
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        return len(self.factors)
+
+    def merged(self, other: Information) -> Information:
+        """The information of both sets of equations together.
+
+        Raises:
+            ModelError: the two belong to different models.
+        """
+        if self.base != other.base or self.joints != other.joints:
+            raise ModelError(f"{self.base} base parameters of {self.joints} joints against {other.base} of {other.joints}")
+        factors = tuple(triangle(np.vstack(pair)) for pair in zip(self.factors, other.factors, strict=True))
+        return Information(self.supports, factors, self.rows + other.rows, self.base)
+
+    def stacked(self, weights: Array | None = None) -> Array:
+        """The triangular factor of all joints' equations together, `[R1 rho1; 0 |rho2|]` of eqs. 64-70.
+
+        Args:
+            weights: per joint, what its equations are multiplied by, shape (joints,); ones when None.
+
+        Returns:
+            Upper triangular, shape (base + 1, base + 1).
+        """
+        rows = []
+        for joint, (support, factor) in enumerate(zip(self.supports, self.factors, strict=True)):
+            full = np.zeros((factor.shape[0], self.base + 1))
+            full[:, support] = factor[:, :-1]
+            full[:, -1] = factor[:, -1]
+            rows.append(full if weights is None else weights[joint] * full)
+        R = triangle(np.vstack(rows))
+        return np.vstack([R, np.zeros((self.base + 1 - R.shape[0], self.base + 1))])
+
+    def squared_residuals(self, beta: Array) -> Array:
+        """Per joint, the sum of squared torque errors of `beta` [N^2 m^2 or N^2], shape (joints,)."""
+        errors = [
+            factor[:, -1] - factor[:, :-1] @ beta[support]
+            for support, factor in zip(self.supports, self.factors, strict=True)
+        ]
+        return np.array([float(error @ error) for error in errors])
+
+    def squared_torques(self) -> Array:
+        """Per joint, the sum of squared torques [N^2 m^2 or N^2], shape (joints,)."""
+        return np.array([float(factor[:, -1] @ factor[:, -1]) for factor in self.factors])
+
+    def scores(self, beta: Array) -> Array:
+        """Gradient of half the squared residual, `W^T (omega - W beta)`, summed over joints, shape (base,)."""
+        total = np.zeros(self.base)
+        for support, factor in zip(self.supports, self.factors, strict=True):
+            total[support] += factor[:, :-1].T @ (factor[:, -1] - factor[:, :-1] @ beta[support])
+        return total
+
+
+def triangle(rows: Array) -> Array:
+    """R of a QR decomposition, signs as they fall."""
+    return np.asarray(np.linalg.qr(rows, mode="r"))
+
+
+def supports(chain: Chain, layout: Layout, base_columns: NDArray[np.intp]) -> tuple[NDArray[np.intp], ...]:
+    """Per joint, the base columns of the links that it carries and of its own joint terms."""
+    links = base_columns // layout.per_link
+    own_term = base_columns % layout.per_link >= 10
+    felt = []
+    for joint in range(chain.joints):
+        carried = np.array([joint in chain.ancestors(int(link)) for link in links])
+        felt.append(np.flatnonzero(np.where(own_term, links == joint, carried)))
+    return tuple(felt)
+
+
+def empty_information(joint_supports: tuple[NDArray[np.intp], ...], base: int) -> Information:
+    """No equations yet."""
+    factors = tuple(np.zeros((0, len(support) + 1)) for support in joint_supports)
+    return Information(joint_supports, factors, np.zeros(len(joint_supports), dtype=np.int64), base)
+
+
+def information_of(
+    H_b: Array, torque: Array, keep: NDArray[np.bool_], joint_supports: tuple[NDArray[np.intp], ...]
+) -> Information:
+    """Information of one block of samples.
+
+    Args:
+        H_b: base regressor, shape (joints, base, samples).
+        torque: [N m or N], shape (samples, joints).
+        keep: which equations count, shape (samples, joints).
+        joint_supports: from `supports`.
+    """
+    factors = []
+    for joint, support in enumerate(joint_supports):
+        mask = keep[:, joint]
+        rows = np.empty((int(mask.sum()), len(support) + 1), order="F")
+        rows[:, :-1] = H_b[joint, support].T[mask]
+        rows[:, -1] = torque[mask, joint]
+        factors.append(triangle(rows))
+    return Information(joint_supports, tuple(factors), keep.sum(axis=0).astype(np.int64), H_b.shape[1])

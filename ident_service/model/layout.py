@@ -1,0 +1,99 @@
+"""Names, order and units of the link parameters delta (eqs. 12, 13, 27, 28).
+
+Per link k: `Lxx Lxy Lxz Lyy Lyz Lzz lx ly lz m`, then the joint terms the model has, in the order `Ia fv fc fo`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident_service.config.quantities import ParameterTable
+from ident_service.config.schema import JointTerm
+from ident_service.errors import ParameterError
+
+INERTIAL = ("Lxx", "Lxy", "Lxz", "Lyy", "Lyz", "Lzz", "lx", "ly", "lz", "m")
+TERM_SYMBOLS: dict[JointTerm, str] = {"drive_inertia": "Ia", "viscous": "fv", "coulomb": "fc", "offset": "fo"}
+_TERM_ORDER: tuple[JointTerm, ...] = ("drive_inertia", "viscous", "coulomb", "offset")
+_REVOLUTE_UNITS = {"Ia": "kg m^2", "fv": "N m s/rad", "fc": "N m", "fo": "N m"}
+_PRISMATIC_UNITS = {"Ia": "kg", "fv": "N s/m", "fc": "N", "fo": "N"}
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where each link parameter stands in delta.
+
+    Attributes:
+        revolute: per joint, True where it turns and False where it slides.
+        terms: joint terms of the model, in the order of the conventions.
+    """
+
+    revolute: tuple[bool, ...]
+    terms: tuple[JointTerm, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "terms", tuple(term for term in _TERM_ORDER if term in self.terms))
+
+    @property
+    def joints(self) -> int:
+        """Number of joints, which is the number of links."""
+        return len(self.revolute)
+
+    @property
+    def per_link(self) -> int:
+        """Number of parameters of one link."""
+        return len(INERTIAL) + len(self.terms)
+
+    @property
+    def size(self) -> int:
+        """Number of parameters of the arm, n in the paper."""
+        return self.per_link * self.joints
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """All names, `Lxx1 ... foN`."""
+        symbols = INERTIAL + tuple(TERM_SYMBOLS[term] for term in self.terms)
+        return tuple(f"{symbol}{link}" for link in range(1, self.joints + 1) for symbol in symbols)
+
+    @cached_property
+    def units(self) -> tuple[str, ...]:
+        """The unit of each parameter."""
+        inertial = ("kg m^2",) * 6 + ("kg m",) * 3 + ("kg",)
+        units: list[str] = []
+        for revolute in self.revolute:
+            table = _REVOLUTE_UNITS if revolute else _PRISMATIC_UNITS
+            units += [*inertial, *(table[TERM_SYMBOLS[term]] for term in self.terms)]
+        return tuple(units)
+
+    def inertial(self, link: int) -> slice:
+        """Columns of the ten inertial parameters of `link` (counted from 0)."""
+        start = link * self.per_link
+        return slice(start, start + len(INERTIAL))
+
+    def term_columns(self, term: JointTerm) -> NDArray[np.intp]:
+        """Columns of one joint term, shape (joints,), or empty where the model has no such term."""
+        if term not in self.terms:
+            return np.zeros(0, dtype=np.intp)
+        return np.arange(self.joints) * self.per_link + len(INERTIAL) + self.terms.index(term)
+
+    def term_values(self, term: JointTerm, delta: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Values of one joint term in `delta`, shape (joints,), zero where the model has no such term."""
+        columns = self.term_columns(term)
+        return delta[columns] if len(columns) else np.zeros(self.joints)
+
+    def vector(self, table: ParameterTable) -> NDArray[np.float64]:
+        """Delta from named values, shape (size,); names that are not given are zero.
+
+        Raises:
+            ParameterError: names that this arm does not have.
+        """
+        index = {name: column for column, name in enumerate(self.names)}
+        if unknown := [name for name in table.names if name not in index]:
+            raise ParameterError(f"parameters this arm does not have: {', '.join(unknown)}")
+        delta = np.zeros(self.size)
+        for name, value in zip(table.names, table.values, strict=True):
+            delta[index[name]] = value
+        return delta

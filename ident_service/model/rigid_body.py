@@ -1,0 +1,168 @@
+"""The door to pinocchio: mechanisms read from URDF and MJCF, and models it can run, from a chain and delta.
+
+Pinocchio keeps a link's inertia as mass, centre of mass and inertia about the centre of mass in the joint frame; here
+stand the conversions from and to delta (eqs. 5, 8), whose inertia is about the link frame's origin.
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from ident_service.config.quantities import TextFile
+from ident_service.errors import ModelError
+from ident_service.model.chain import WORLD, Array, Chain
+from ident_service.model.layout import Layout
+
+_SUPPORTED = ("JointModelR", "JointModelP")
+_UNSUPPORTED = ("JointModelPlanar",)
+_FORBIDDEN_XML = re.compile(r"<!\s*(DOCTYPE|ENTITY)|<\s*(include|mimic)\b|\bxi:include\b", re.IGNORECASE)
+
+
+def read_urdf(file: TextFile, gravity: tuple[float, float, float]) -> tuple[Chain, Array]:
+    """Chain and link inertias of a URDF; fixed joints are merged into their parents.
+
+    Returns:
+        The chain, and the ten inertial parameters per link (eq. 13) in SI units, shape (joints, 10).
+
+    Raises:
+        ModelError: not a URDF, entities or includes, or a joint that is neither revolute, continuous nor prismatic.
+    """
+    _refuse_foreign(file, "URDF")
+    return _read(file, gravity, "URDF", lambda: pin.buildModelFromXML(file.text))
+
+
+def read_mjcf(file: TextFile, gravity: tuple[float, float, float]) -> tuple[Chain, Array]:
+    """As `read_urdf`, for an MJCF file of hinge and slide joints."""
+    _refuse_foreign(file, "MJCF")
+    with tempfile.TemporaryDirectory() as folder:
+        # Pinocchio reads MJCF from a path only; alone in a folder, the file cannot reach any other.
+        path = Path(folder) / "arm.xml"
+        path.write_text(file.text, encoding="utf-8")
+        return _read(file, gravity, "MJCF", lambda: pin.buildModelFromMJCF(str(path)))
+
+
+def _refuse_foreign(file: TextFile, kind: str) -> None:
+    if found := _FORBIDDEN_XML.search(file.text):
+        raise ModelError(f"{file.name}: {found.group(0)!r} is refused in a {kind}; give one self-contained file")
+
+
+def _read(
+    file: TextFile, gravity: tuple[float, float, float], kind: str, build: Callable[[], pin.Model]
+) -> tuple[Chain, Array]:
+    try:
+        model = build()
+    except Exception as error:  # noqa: BLE001  # pinocchio raises whatever its XML libraries raise
+        raise ModelError(f"{file.name}: not a {kind} that can be read: {error}") from None
+    return _chain(model, gravity, file.name)
+
+
+def _chain(model: pin.Model, gravity: tuple[float, float, float], name: str) -> tuple[Chain, Array]:
+    n = model.njoints - 1
+    if n == 0:
+        raise ModelError(f"{name}: no movable joint")
+    data = model.createData()
+    revolute, axes = [], []
+    for k in range(1, n + 1):
+        kind = model.joints[k].shortname()
+        if not kind.startswith(_SUPPORTED) or kind in _UNSUPPORTED:
+            raise ModelError(f"{name}: joint {model.names[k]!r} is a {kind}; only revolute and prismatic joints are supported")
+        screw = np.asarray(data.joints[k].S).reshape(6)
+        turns = bool(np.any(screw[3:]))
+        revolute.append(turns)
+        axes.append(screw[3:] if turns else screw[:3])
+    placements = [model.jointPlacements[k] for k in range(1, n + 1)]
+    chain = Chain(
+        names=tuple(model.names[1:]),
+        parents=tuple(int(model.parents[k]) - 1 for k in range(1, n + 1)),
+        revolute=tuple(revolute),
+        axes=np.array(axes, dtype=float),
+        rotation=np.array([placement.rotation for placement in placements]),
+        translation=np.array([placement.translation for placement in placements]),
+        link_rotation=np.tile(np.eye(3), (n, 1, 1)),
+        link_translation=np.zeros((n, 3)),
+        gravity=np.array(gravity, dtype=float),
+    )
+    return chain, np.array([delta_from_inertia(model.inertias[k]) for k in range(1, n + 1)])
+
+
+def delta_from_inertia(inertia: pin.Inertia) -> Array:
+    """The ten parameters of eq. 13 about the origin of the frame the inertia is expressed in, shape (10,)."""
+    m, mx, my, mz, xx, xy, yy, xz, yz, zz = inertia.toDynamicParameters()
+    return np.array([xx, xy, xz, yy, yz, zz, mx, my, mz, m])
+
+
+def inertia_from_delta(parameters: Array) -> pin.Inertia:
+    """The inverse of `delta_from_inertia`; `parameters` shape (10,), with positive mass.
+
+    Raises:
+        ModelError: the mass is not positive, so that no centre of mass exists.
+    """
+    xx, xy, xz, yy, yz, zz, mx, my, mz, m = (float(value) for value in parameters)
+    if not m > 0.0:
+        raise ModelError(f"a link of mass {m:g} kg has no centre of mass; give the constrained estimate instead")
+    return pin.Inertia.FromDynamicParameters(np.array([m, mx, my, mz, xx, xy, yy, xz, yz, zz]))
+
+
+def link_frame(chain: Chain, link: int) -> pin.SE3:
+    """Placement of the link frame in the joint frame."""
+    return pin.SE3(chain.link_rotation[link], chain.link_translation[link])
+
+
+def joint_frame_inertias(chain: Chain, layout: Layout, delta: Array) -> list[pin.Inertia]:
+    """Each link's inertia in its joint's frame, whatever frame delta is expressed in.
+
+    Raises:
+        ModelError: a link without positive mass.
+    """
+    return [
+        inertia_from_delta(delta[layout.inertial(k)]).se3Action(link_frame(chain, k)) for k in range(chain.joints)
+    ]
+
+
+def pinocchio_model(chain: Chain, layout: Layout, delta: Array) -> pin.Model:
+    """A pinocchio model of the chain with the inertias of `delta` and its drive inertias as armature.
+
+    Every joint has one position coordinate, continuous joints too. Friction stays with whoever integrates, because
+    pinocchio's has no sticking.
+
+    Raises:
+        ModelError: `delta` does not fit the layout, or a link has no positive mass.
+    """
+    if delta.shape != (layout.size,):
+        raise ModelError(f"{delta.shape=} but the layout has {layout.size} parameters")
+    model = pin.Model()
+    model.gravity = pin.Motion(chain.gravity, np.zeros(3))
+    for k in range(chain.joints):
+        axis = chain.axes[k]
+        joint = pin.JointModelRevoluteUnaligned(axis) if chain.revolute[k] else pin.JointModelPrismaticUnaligned(axis)
+        placement = pin.SE3(chain.rotation[k], chain.translation[k])
+        parent = 0 if chain.parents[k] == WORLD else chain.parents[k] + 1
+        index = model.addJoint(parent, joint, placement, chain.names[k])
+        inertia = inertia_from_delta(delta[layout.inertial(k)])
+        model.appendBodyToJoint(index, inertia, link_frame(chain, k))
+    model.armature = layout.term_values("drive_inertia", delta)
+    return model
+
+
+class InverseDynamics:
+    """Torque of a chain with known parameters at one state, fast enough for a control loop; no friction."""
+
+    def __init__(self, chain: Chain, layout: Layout, delta: Array) -> None:
+        self._model = pinocchio_model(chain, layout, delta)
+        self._data = self._model.createData()
+
+    def torque(self, position: Array, velocity: Array, acceleration: Array) -> NDArray[np.float64]:
+        """`M(q) ddq + c(q, dq) + g(q)` [N m or N], shape (joints,), drive inertia included."""
+        return np.asarray(pin.rnea(self._model, self._data, position, velocity, acceleration))
+
+    def mass_matrix(self, position: Array) -> NDArray[np.float64]:
+        """M(q), shape (joints, joints), drive inertia included."""
+        upper = pin.crba(self._model, self._data, position)
+        return np.asarray(np.triu(upper) + np.triu(upper, 1).T)

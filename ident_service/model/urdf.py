@@ -1,0 +1,97 @@
+"""A chain with parameters as URDF: link frames are joint frames, inertias about centres of mass, no meshes.
+
+URDF has viscous damping and Coulomb friction per joint; drive inertia and torque offset have no place in it and stay
+in the parameter file.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET  # noqa: S405  # only writes here; reading goes through pinocchio after a check
+
+import numpy as np
+
+from ident_service.config.schema import Joint
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.chain import WORLD, Array
+
+BASE_LINK = "base_link"
+
+
+def urdf_text(model: ArmModel, delta: Array | None) -> str:
+    """The arm as URDF.
+
+    Args:
+        model: the mechanism and its limits.
+        delta: link parameters, shape (layout.size,); without them the file has kinematics only.
+
+    Raises:
+        ModelError: a link without positive mass, which URDF cannot express.
+    """
+    robot = ET.Element("robot", name=model.config.name)
+    ET.SubElement(robot, "link", name=BASE_LINK)
+    inertials = None if delta is None else _inertials(model, delta)
+    chain, layout = model.chain, model.layout
+    for k, name in enumerate(chain.names):
+        link = ET.SubElement(robot, "link", name=_link_name(model, k))
+        if inertials is not None:
+            mass, center, inertia = inertials[k]
+            inertial = ET.SubElement(link, "inertial")
+            ET.SubElement(inertial, "origin", xyz=_numbers(center), rpy="0 0 0")
+            ET.SubElement(inertial, "mass", value=repr(mass))
+            entries = {key: repr(float(inertia[i, j])) for key, (i, j) in _ENTRIES.items()}
+            ET.SubElement(inertial, "inertia", entries)
+        settings = model.config.joints.get(name, Joint())
+        bounded = settings.position is not None or not chain.revolute[k]
+        kind = ("revolute" if bounded else "continuous") if chain.revolute[k] else "prismatic"
+        joint = ET.SubElement(robot, "joint", name=name, type=kind)
+        parent = chain.parents[k]
+        ET.SubElement(joint, "parent", link=BASE_LINK if parent == WORLD else _link_name(model, parent))
+        ET.SubElement(joint, "child", link=_link_name(model, k))
+        ET.SubElement(joint, "origin", xyz=_numbers(chain.translation[k]), rpy=_numbers(_roll_pitch_yaw(chain.rotation[k])))
+        ET.SubElement(joint, "axis", xyz=_numbers(chain.axes[k]))
+        if bounded:
+            lower, upper = settings.position or (-1.0, 1.0)
+            ET.SubElement(
+                joint,
+                "limit",
+                lower=repr(lower),
+                upper=repr(upper),
+                velocity=repr(settings.velocity or 0.0),
+                effort=repr(settings.torque or 0.0),
+            )
+        if delta is not None:
+            viscous, coulomb = (float(layout.term_values(term, delta)[k]) for term in ("viscous", "coulomb"))
+            ET.SubElement(joint, "dynamics", damping=repr(viscous), friction=repr(coulomb))
+    ET.indent(robot)
+    return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
+
+
+_ENTRIES = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
+
+
+def _inertials(model: ArmModel, delta: Array) -> list[tuple[float, Array, Array]]:
+    from ident_service.model.rigid_body import joint_frame_inertias
+
+    return [
+        (float(inertia.mass), np.asarray(inertia.lever), np.asarray(inertia.inertia))
+        for inertia in joint_frame_inertias(model.chain, model.layout, delta)
+    ]
+
+
+def _link_name(model: ArmModel, link: int) -> str:
+    return f"{model.chain.names[link]}_link"
+
+
+def _numbers(values: Array) -> str:
+    return " ".join(repr(float(value) + 0.0) for value in values)
+
+
+def _roll_pitch_yaw(rotation: Array) -> Array:
+    """URDF's fixed-axis angles [rad]: R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    flat = float(np.hypot(rotation[0, 0], rotation[1, 0]))
+    pitch = np.arctan2(-rotation[2, 0], flat)
+    if flat > 1e-12:
+        return np.array(
+            [np.arctan2(rotation[2, 1], rotation[2, 2]), pitch, np.arctan2(rotation[1, 0], rotation[0, 0])]
+        )
+    return np.array([np.arctan2(-rotation[1, 2], rotation[1, 1]), pitch, 0.0])

@@ -1,0 +1,65 @@
+"""Computed torque with a proportional and derivative loop (5.2.1, eq. 76, figure 3).
+
+    alpha = ddq_r + K_d (dq_r - dq) + K_p (q_r - q)          tau = M(q) alpha + c(q, dq) + g(q)
+
+with the prior (CAD) model. Velocity comes from encoder differences through a first-order low-pass, because at 1 kHz
+one encoder step is a tenth of a radian per second.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drivers.arm import Flags, Vector
+from ident_service.config.limits import MotionLimits
+from ident_service.motion.reference import Setpoint
+from ident_service.model.rigid_body import InverseDynamics
+
+
+class ComputedTorque:
+    """The control law and its velocity filter.
+
+    Attributes:
+        velocity: filtered velocity of the last update [rad/s or m/s], shape (joints,).
+    """
+
+    def __init__(
+        self, dynamics: InverseDynamics, limits: MotionLimits, period: float, velocity_cutoff: float, position: Vector
+    ) -> None:
+        """Begin at rest.
+
+        Args:
+            dynamics: the prior model.
+            limits: for the gains.
+            period: of the loop [s].
+            velocity_cutoff: of the low-pass [Hz].
+            position: where the arm stands [rad or m], shape (joints,).
+        """
+        self._dynamics = dynamics
+        self._kp, self._kd = limits.kp, limits.kd
+        self._period = period
+        self._gain = 1.0 - float(np.exp(-2.0 * np.pi * velocity_cutoff * period))
+        self._position = position.copy()
+        self.velocity = np.zeros_like(position)
+
+    def torque(self, position: Vector, valid: Flags, reference: Setpoint) -> Vector:
+        """One update.
+
+        Args:
+            position: measured [rad or m], shape (joints,).
+            valid: where `position` is fresh; elsewhere the arm is taken to have gone on as it went.
+            reference: where it should be.
+
+        Returns:
+            Torque [N m or N], shape (joints,), not yet limited.
+        """
+        if not valid.all():
+            position = np.where(valid, position, self._position + self._period * self.velocity)
+        self.velocity = self.velocity + self._gain * ((position - self._position) / self._period - self.velocity)
+        self._position = position
+        alpha = (
+            reference.acceleration
+            + self._kd * (reference.velocity - self.velocity)
+            + self._kp * (reference.position - position)
+        )
+        return self._dynamics.torque(position, self.velocity, alpha)

@@ -1,0 +1,118 @@
+"""Where the arm should be: the excitation, and jerk-limited ways to it, back from it, and to a stop.
+
+Every way that is not the excitation itself is a ruckig trajectory within the arm's velocity, acceleration and jerk.
+Boundary: pure functions of time; ruckig is imported nowhere else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import ruckig
+
+from ident_service.config.limits import MotionLimits, Vector
+from ident_service.errors import MotionRefused
+from ident_service.excitation.fourier import Excitation
+
+
+@dataclass(frozen=True)
+class Setpoint:
+    """Position [rad or m], velocity and acceleration of all joints, each of shape (joints,)."""
+
+    position: Vector
+    velocity: Vector
+    acceleration: Vector
+
+
+class Reference(Protocol):
+    """A way from now on; after `duration` it stands at its last setpoint."""
+
+    @property
+    def duration(self) -> float:
+        """Length [s]."""
+
+    def at(self, time: float) -> Setpoint:
+        """Setpoint at `time` [s] since the way began."""
+
+
+class FourierReference:
+    """The excitation."""
+
+    def __init__(self, excitation: Excitation) -> None:
+        self._series = excitation.series
+        self.duration = excitation.duration
+
+    def at(self, time: float) -> Setpoint:
+        """Setpoint at `time` [s]."""
+        position, velocity, acceleration, _ = self._series.at(min(time, self.duration))
+        return Setpoint(position, velocity, acceleration)
+
+
+class RuckigReference:
+    """A jerk-limited trajectory."""
+
+    def __init__(self, parameters: ruckig.InputParameter) -> None:
+        self._trajectory = ruckig.Trajectory(parameters.degrees_of_freedom)
+        result = ruckig.Ruckig(parameters.degrees_of_freedom).calculate(parameters, self._trajectory)
+        if result not in (ruckig.Result.Working, ruckig.Result.Finished):
+            raise MotionRefused(f"no jerk-limited way exists within the limits: {result}")
+        self.duration = float(self._trajectory.duration)
+
+    def at(self, time: float) -> Setpoint:
+        """Setpoint at `time` [s]."""
+        position, velocity, acceleration = self._trajectory.at_time(min(time, self.duration))[:3]
+        return Setpoint(np.array(position), np.array(velocity), np.array(acceleration))
+
+    def extent(self) -> tuple[Vector, Vector]:
+        """Lowest and highest position on the way, each of shape (joints,)."""
+        extrema = self._trajectory.position_extrema
+        return np.array([bound.min for bound in extrema]), np.array([bound.max for bound in extrema])
+
+
+def way(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference:
+    """From one moving state to another, all joints arriving together.
+
+    Raises:
+        MotionRefused: no such way exists within the limits, or it would leave the position limits.
+    """
+    parameters = _parameters(start, limits)
+    parameters.target_position = end.position.tolist()
+    parameters.target_velocity = end.velocity.tolist()
+    parameters.target_acceleration = end.acceleration.tolist()
+    reference = RuckigReference(parameters)
+    lowest, highest = reference.extent()
+    if bool(np.any(lowest < limits.lower) or np.any(highest > limits.upper)):
+        joint = int(np.argmax(np.maximum(limits.lower - lowest, highest - limits.upper)))
+        raise MotionRefused(
+            f"the way to or from the motion swings joint {joint + 1} to {lowest[joint]:.3f}..{highest[joint]:.3f}, "
+            f"outside {limits.lower[joint]:g}..{limits.upper[joint]:g}; begin nearer to it or slower"
+        )
+    return reference
+
+
+def stop(start: Setpoint, limits: MotionLimits) -> RuckigReference:
+    """From a moving state to rest, each joint as soon as it can."""
+    parameters = _parameters(start, limits)
+    parameters.control_interface = ruckig.ControlInterface.Velocity
+    parameters.synchronization = ruckig.Synchronization.No
+    parameters.target_velocity = [0.0] * len(start.velocity)
+    parameters.target_acceleration = [0.0] * len(start.velocity)
+    return RuckigReference(parameters)
+
+
+def rest(position: Vector) -> Setpoint:
+    """Standing still."""
+    return Setpoint(position, np.zeros_like(position), np.zeros_like(position))
+
+
+def _parameters(start: Setpoint, limits: MotionLimits) -> ruckig.InputParameter:
+    parameters = ruckig.InputParameter(len(start.position))
+    parameters.current_position = start.position.tolist()
+    parameters.current_velocity = start.velocity.tolist()
+    parameters.current_acceleration = start.acceleration.tolist()
+    parameters.max_velocity = limits.velocity.tolist()
+    parameters.max_acceleration = limits.acceleration.tolist()
+    parameters.max_jerk = limits.jerk.tolist()
+    return parameters

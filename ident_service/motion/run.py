@@ -1,0 +1,253 @@
+"""One run: approach, excite, return, every cycle guarded, every cycle recorded.
+
+The loop owns no file: it hands samples to a sink that keeps the disk away. The stop path is `_halt`: torque off, no
+condition, nothing that can raise.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.arm import Arm, Sample, StopKind, Vector
+from ident_service.config.limits import MotionLimits, motion_limits
+from ident_service.errors import ArmFault, DriverError, MotionRefused
+from ident_service.excitation.fourier import Excitation
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.rigid_body import InverseDynamics
+from ident_service.motion.control import ComputedTorque
+from ident_service.motion.guard import REACTIONS, Fault, Guard, Reaction
+from ident_service.motion.reference import FourierReference, Reference, Setpoint, rest, stop, way
+from ident_service.motion.states import MOVING, State, next_state
+
+_KEPT_SAMPLES = 100
+_REST_CYCLES = 20
+_WARNING, _ERROR, _INFO = 30, 40, 20  # levels of rcl_interfaces/msg/Log
+
+
+class Sink(Protocol):
+    """Where samples go; `record.recorder.Recorder` is one."""
+
+    def put(
+        self,
+        stamp_ns: int,
+        position: Vector,
+        velocity: Vector | None,
+        torque: Vector,
+        reference_position: Vector,
+        reference_velocity: Vector,
+        cycle: int,
+        lateness_ns: int,
+        compute_ns: int,
+        valid: NDArray[np.bool_],
+        age: NDArray[np.int64],
+        lost: int,
+    ) -> bool:
+        """Take one cycle; False when the sink cannot keep up."""
+
+    def event(self, stamp_ns: int, level: int, message: str) -> bool:
+        """Take one line of the story."""
+
+
+@dataclass(frozen=True)
+class RunReport:
+    """How a run went.
+
+    Attributes:
+        state: DONE, or STOPPED where somebody asked for a stop.
+        cycles: exchanged.
+        peak_following_error: [rad or m], shape (joints,).
+        peak_torque: that left [N m or N], shape (joints,).
+        warnings: how often each mild fault was seen.
+    """
+
+    state: State
+    cycles: int
+    peak_following_error: Vector
+    peak_torque: Vector
+    warnings: dict[str, int]
+
+
+def run(
+    arm: Arm,
+    model: ArmModel,
+    excitation: Excitation,
+    sink: Sink,
+    stop_requested: Callable[[], bool] = lambda: False,
+) -> RunReport:
+    """Move an open arm along an excitation and back to where it stood.
+
+    Args:
+        arm: open, not enabled.
+        model: with the prior parameters that control needs.
+        excitation: checked against the limits beforehand.
+        sink: takes every sample.
+        stop_requested: asked every cycle; True brings the arm to a controlled stop.
+
+    Returns:
+        The report of a run that ended in DONE or, after a request, in STOPPED.
+
+    Raises:
+        MotionRefused: nothing has moved; the message says why.
+        ArmFault: a fault stopped the motion; the arm is stopped or without torque.
+        DriverError: the arm refused to be enabled.
+    """
+    return _Run(arm, model, excitation, sink, stop_requested).run()
+
+
+@dataclass
+class _Peaks:
+    following_error: Vector
+    torque: Vector
+
+
+@dataclass
+class _Run:
+    arm: Arm
+    model: ArmModel
+    excitation: Excitation
+    sink: Sink
+    stop_requested: Callable[[], bool]
+    state: State = State.IDLE
+    last: deque[Sample] = field(default_factory=lambda: deque(maxlen=_KEPT_SAMPLES))
+
+    def run(self) -> RunReport:
+        limits = motion_limits(self.model.config)
+        if self.model.prior is None:
+            raise MotionRefused(f"{self.model.config.name}: computed torque needs prior parameters")
+        dynamics = InverseDynamics(self.model.chain, self.model.layout, self.model.prior)
+        period = 1.0 / self.arm.describe().rate
+        sample = self._look(limits, period)
+        home = sample.position.copy()
+        ways = self._ways(home, limits)
+        self._guard = Guard(self.model.chain.names, limits, period, home)
+        self._control = ComputedTorque(dynamics, limits, period, self.model.config.control.velocity_cutoff, home)
+        self._peaks = _Peaks(np.zeros_like(home), np.zeros_like(home))
+        self._begin_ns, self._way = sample.stamp_ns, ways.pop(0)
+        torque, _ = self._guard.torque(self._control.torque(home, sample.valid, rest(home)))
+        try:
+            self.arm.enable()
+            self._enter(State.APPROACHING, sample.stamp_ns)
+            fault = self._loop(torque, ways, limits, period)
+        except BaseException:
+            self._halt()
+            raise
+        self._halt()
+        if fault is not None:
+            raise ArmFault(fault.code, fault.message, self.last)
+        return RunReport(
+            self.state,
+            self.last[-1].cycle + 1,
+            self._peaks.following_error,
+            self._peaks.torque,
+            dict(self._guard.warnings),
+        )
+
+    def _look(self, limits: MotionLimits, period: float) -> Sample:
+        """Samples without torque: the arm must be where it may be, and at rest."""
+        samples = [self.arm.exchange(None) for _ in range(_REST_CYCLES)]
+        first, last = samples[0], samples[-1]
+        if not all(bool(sample.valid.all() and np.isfinite(sample.position).all()) for sample in samples):
+            raise MotionRefused("not every axis answers; check the bus before anything moves")
+        drift = np.abs(last.position - first.position) / (period * (_REST_CYCLES - 1))
+        if bool(np.any(drift > 0.05 * limits.velocity)):
+            raise MotionRefused("the arm is moving; it must be at rest and supported before a run begins")
+        names = self.model.chain.names
+        outside = [
+            f"{name} at {q:.3f}, limits {low:g}..{high:g}"
+            for name, q, low, high in zip(names, last.position, limits.lower, limits.upper, strict=True)
+            if not low <= q <= high
+        ]
+        if outside:
+            raise MotionRefused("outside the position limits: " + "; ".join(outside))
+        return last
+
+    def _ways(self, home: Vector, limits: MotionLimits) -> list[Reference]:
+        exciting = FourierReference(self.excitation)
+        start, end = exciting.at(0.0), exciting.at(exciting.duration)
+        return [way(rest(home), start, limits), exciting, way(end, rest(home), limits)]
+
+    def _loop(self, torque: Vector, ways: list[Reference], limits: MotionLimits, period: float) -> Fault | None:
+        """Cycle until done, stopped or faulted; the fault that ended the motion, if one did."""
+        followers = {State.APPROACHING: State.EXCITING, State.EXCITING: State.RETURNING, State.RETURNING: State.DONE}
+        ended_by: Fault | None = None
+        expected_ns: int | None = None
+        while True:
+            try:
+                sample = self.arm.exchange(torque)
+            except DriverError as error:
+                self._enter(State.FAULTED, self.arm.clock.now_ns())
+                return Fault("driver", REACTIONS["driver"], str(error))
+            woken_ns = self.arm.clock.now_ns()
+            lateness_ns = 0 if expected_ns is None else max(0, woken_ns - expected_ns)
+            expected_ns = woken_ns - lateness_ns + round(period * 1e9) if lateness_ns < period * 1e9 else None
+            self.last.append(sample)
+            elapsed = (sample.stamp_ns - self._begin_ns) * 1e-9
+            while elapsed >= self._way.duration:
+                if self.state is State.STOPPING:
+                    self._enter(State.STOPPED, sample.stamp_ns)
+                    return ended_by
+                self._enter(followers[self.state], sample.stamp_ns)
+                if self.state is State.DONE:
+                    return None
+                self._begin_ns += round(self._way.duration * 1e9)
+                self._way = ways.pop(0)
+                elapsed = (sample.stamp_ns - self._begin_ns) * 1e-9
+            reference = self._way.at(elapsed)
+            usable, fault = self._guard.feedback(sample, reference, self._control.velocity)
+            wanted = self._control.torque(sample.position, usable, reference)
+            torque, torque_fault = self._guard.torque(wanted)
+            if torque_fault is not None and (fault is None or torque_fault.reaction > fault.reaction):
+                fault = torque_fault
+            compute_ns = self.arm.clock.now_ns() - woken_ns
+            if not self._record(sample, reference, lateness_ns, compute_ns) and self.state is not State.STOPPING:
+                fault = fault or Fault("recorder_behind", REACTIONS["recorder_behind"], "the recorder cannot keep up")
+            self._remember(sample, reference)
+            if fault is not None and fault.reaction is Reaction.TORQUE_OFF:
+                self._enter(State.FAULTED, sample.stamp_ns)
+                self._tell(_ERROR, sample.stamp_ns, fault)
+                return fault
+            asked = self.state in MOVING and self.stop_requested()
+            must_stop = fault is not None and fault.reaction is Reaction.CONTROLLED_STOP
+            if self.state in MOVING and (asked or must_stop):
+                ended_by = fault if must_stop else None
+                if ended_by is not None:
+                    self._tell(_ERROR, sample.stamp_ns, ended_by)
+                self._enter(State.STOPPING, sample.stamp_ns)
+                self._begin_ns, self._way = sample.stamp_ns, stop(reference, limits)
+
+    def _record(self, sample: Sample, reference: Setpoint, lateness_ns: int, compute_ns: int) -> bool:
+        return self.sink.put(
+            sample.stamp_ns,
+            sample.position,
+            sample.velocity,
+            sample.torque,
+            reference.position,
+            reference.velocity,
+            sample.cycle,
+            lateness_ns,
+            compute_ns,
+            sample.valid,
+            sample.age,
+            sample.lost,
+        )
+
+    def _remember(self, sample: Sample, reference: Setpoint) -> None:
+        error = np.where(sample.valid, np.abs(reference.position - sample.position), 0.0)
+        np.maximum(self._peaks.following_error, error, out=self._peaks.following_error)
+        np.maximum(self._peaks.torque, np.abs(sample.torque), out=self._peaks.torque)
+
+    def _enter(self, state: State, stamp_ns: int) -> None:
+        self.state = next_state(self.state, state)
+        self.sink.event(stamp_ns, _INFO, state.value)
+
+    def _tell(self, level: int, stamp_ns: int, fault: Fault) -> None:
+        self.sink.event(stamp_ns, level, f"{fault.code}: {fault.message}")
+
+    def _halt(self) -> None:
+        self.arm.stop(StopKind.TORQUE_OFF)

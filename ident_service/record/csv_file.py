@@ -1,0 +1,186 @@
+"""Reads CSV recordings: header `t,q1..qN,tau1..tauN`, optional `dq1..dqN`, in any order, plain or gzip.
+
+Time `t` is in seconds and becomes integer nanoseconds by decimal arithmetic, so that a UTC time keeps all its digits.
+Torque counts as sampled at its stamp. A CSV file has no end mark: a row that does not fit is an error, not a tear.
+"""
+
+from __future__ import annotations
+
+import gzip
+import zlib
+from collections.abc import Iterator, Mapping
+from decimal import Decimal
+from pathlib import Path
+from typing import IO, Final, cast
+
+import numpy as np
+
+from ident_service.errors import RecordingError
+from ident_service.record.assemble import assemble
+from ident_service.record.csv_header import CsvColumns, parse_header
+from ident_service.record.files import require_file, sha256
+from ident_service.record.recording import BLOCK_SAMPLES, Block
+
+GZIP_MAGIC: Final = b"\x1f\x8b"
+MAX_EXPANDED: Final = 4 << 30
+MAX_RATIO: Final = 200
+
+_STEP: Final = 1 << 20
+_RATIO_FROM: Final = 64 << 20
+_MAX_SECONDS: Final = 9.2e9
+_FIRST_ROW: Final = 2  # line numbers count from 1, and the header is line 1
+
+
+class CsvRecording:
+    """A Recording in a CSV file; its columns are the joints 1..N and have no names.
+
+    Attributes:
+        path: the file.
+        sha256: of the file's bytes, compressed where it is.
+        joint_names: empty.
+        joints: number of joints.
+        torque_held: False.
+        torn: False; what does not fit raises.
+    """
+
+    joint_names: tuple[str, ...] = ()
+    torque_held = False
+    torn = False
+
+    def __init__(self, path: Path | str, *, columns: Mapping[str, str] | None = None) -> None:
+        """Open the file and read its header.
+
+        Args:
+            path: the file.
+            columns: for a file with another header, its name for each of `t`, `q1`, `tau1`, ...; columns that are
+                not named here are then left out.
+
+        Raises:
+            UsageError: no such file.
+            RecordingError: the header does not fit; the message has all that is wrong with it.
+        """
+        self.path = Path(path)
+        require_file(self.path)
+        self._size = self.path.stat().st_size
+        self.sha256 = sha256(self.path, self._size)
+        first = next(self._lines(), [b""])
+        try:
+            header = first[0].decode("utf-8-sig")
+        except UnicodeDecodeError as error:
+            raise RecordingError(self.path, "line 1: the header is not text") from error
+        self._columns: CsvColumns = parse_header(self.path, header, columns)
+        self.joints = self._columns.joints
+
+    def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
+        """Read the samples in order, `samples` at a time (the last block is shorter).
+
+        Raises:
+            RecordingError: a row with too few or too many fields, a field that is no finite number, a time that
+                does not increase, a damaged or oversized gzip file; names the line.
+        """
+        names = [str(joint + 1) for joint in range(self.joints)]
+        return assemble(self._pieces(), samples, self.path, names, place=lambda index: f"line {index + _FIRST_ROW}")
+
+    def _pieces(self) -> Iterator[Block]:
+        line = 1
+        blank: int | None = None
+        for lines in self._lines():
+            start = 1 if line == 1 else 0
+            rows = lines[start:]
+            first = line + start
+            line += len(lines)
+            # Empty lines at the very end are no rows; in the middle they are rows that got lost.
+            while rows and not rows[-1].strip():
+                blank = first + len(rows) - 1 if blank is None else min(blank, first + len(rows) - 1)
+                rows.pop()
+            if not rows:
+                continue
+            if blank is not None and blank < first + len(rows):
+                raise RecordingError(self.path, f"line {blank}: is empty; a row is missing, remove the line")
+            for begin in range(0, len(rows), BLOCK_SAMPLES):
+                yield self._parse(rows[begin : begin + BLOCK_SAMPLES], first + begin)
+
+    def _parse(self, rows: list[bytes], first: int) -> Block:
+        """Rows to a block; `first` is the line number of the first one."""
+        columns = self._columns
+        separators = columns.fields - 1
+        if any(row.count(b",") != separators for row in rows):
+            self._explain(rows, first)
+        try:
+            fields = b",".join(rows).decode("ascii").split(",")
+            values = np.array(list(map(float, fields))).reshape(len(rows), columns.fields)
+        except ValueError:
+            self._explain(rows, first)
+        # Python reads 1_000 as a number; in a data file it is a slip.
+        if any(b"_" in row for row in rows):
+            self._explain(rows, first)
+        times = fields[columns.time :: columns.fields]
+        bad = ~(np.abs(values[:, columns.time]) < _MAX_SECONDS)
+        if bad.any():
+            index = int(np.argmax(bad))
+            raise RecordingError(self.path, f"line {first + index}: time t is {times[index].strip()}; not in seconds?")
+        try:
+            stamps = np.array([round(Decimal(time) * 1_000_000_000) for time in times], np.int64)
+        except ArithmeticError as error:
+            raise RecordingError(self.path, f"line {first} or later: a time t is beyond all exponents") from error
+        velocity = None if columns.velocity is None else values[:, columns.velocity]
+        return Block(stamps, values[:, columns.position], values[:, columns.torque], velocity)
+
+    def _explain(self, rows: list[bytes], first: int) -> None:
+        """Raise for the first row that does not fit."""
+        names = self._columns.names
+        for line, row in enumerate(rows, first):
+            if not row.strip():
+                raise RecordingError(self.path, f"line {line}: is empty; a row is missing, remove the line")
+            fields = row.decode("utf-8", errors="replace").split(",")
+            if len(fields) != len(names):
+                raise RecordingError(
+                    self.path,
+                    f"line {line}: has {len(fields)} fields but the header has {len(names)}; "
+                    "the row is torn or malformed, remove it if it is the last one",
+                )
+            for name, field in zip(names, fields, strict=True):
+                if not _is_number(field):
+                    raise RecordingError(self.path, f"line {line}: {name} is {field[:40]!r}, not a number")
+
+    def _lines(self) -> Iterator[list[bytes]]:
+        """The file's lines, some at a time, without their ends."""
+        tail = b""
+        for data in self._expanded():
+            lines = (tail + data).split(b"\n")
+            tail = lines.pop()
+            if len(tail) > _STEP:
+                raise RecordingError(self.path, f"a line of more than {_STEP} bytes; this is no CSV file")
+            if lines:
+                yield lines
+        if tail:
+            yield [tail]
+
+    def _expanded(self) -> Iterator[bytes]:
+        """The file's bytes, decompressed where needed, a bounded number in all."""
+        total = 0
+        try:
+            with self.path.open("rb") as raw:
+                compressed = raw.read(len(GZIP_MAGIC)) == GZIP_MAGIC
+                raw.seek(0)
+                stream = cast(IO[bytes], gzip.GzipFile(fileobj=raw)) if compressed else raw
+                while data := stream.read(_STEP):
+                    total += len(data)
+                    if compressed and (
+                        total > MAX_EXPANDED or (total > _RATIO_FROM and total > MAX_RATIO * self._size)
+                    ):
+                        raise RecordingError(self.path, f"expands {self._size} bytes to more than {total}; refused")
+                    yield data
+        except (EOFError, zlib.error, OSError) as error:
+            # gzip's own BadGzipFile is an OSError.
+            raise RecordingError(self.path, f"cannot be read beyond {total} bytes of text: {error}") from error
+
+
+def _is_number(field: str) -> bool:
+    if "_" in field or not field.isascii():
+        return False
+    try:
+        float(field)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,91 @@
+"""The header of a CSV recording: which column is what, or everything that is wrong with it at once."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident_service.errors import RecordingError
+
+_NAME: Final = re.compile(r"(q|dq|tau)([1-9]\d{0,3})")
+
+
+@dataclass(frozen=True)
+class CsvColumns:
+    """Where in a row each quantity stands.
+
+    Attributes:
+        names: of all columns, as the file has them.
+        time: index of the time [s].
+        position: indices of the positions, joint 1 first, shape (joints,).
+        torque: indices of the torques, shape (joints,).
+        velocity: indices of the velocities, shape (joints,), or None.
+    """
+
+    names: tuple[str, ...]
+    time: int
+    position: NDArray[np.intp]
+    torque: NDArray[np.intp]
+    velocity: NDArray[np.intp] | None
+
+    @property
+    def fields(self) -> int:
+        """Fields in a row."""
+        return len(self.names)
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        return len(self.position)
+
+
+def parse_header(path: Path, header: str, columns: Mapping[str, str] | None = None) -> CsvColumns:
+    """Find the columns.
+
+    Args:
+        path: for messages.
+        header: the first line.
+        columns: the file's name for each of ours, where it has others; None reads ours.
+
+    Raises:
+        RecordingError: the message lists all problems.
+    """
+    names = tuple(name.strip() for name in header.split(","))
+    if not header.strip():
+        raise RecordingError(path, "is empty; expected a header t,q1..qN,tau1..tauN")
+    problems = [f"column {name!r} appears twice" for name in sorted(set(names)) if names.count(name) > 1]
+    if columns is None:
+        place = {name: index for index, name in enumerate(names)}
+    else:
+        problems += [f"no column {theirs!r} for {ours}" for ours, theirs in columns.items() if theirs not in names]
+        place = {ours: names.index(theirs) for ours, theirs in columns.items() if theirs in names}
+    numbers: dict[str, set[int]] = {"q": set(), "dq": set(), "tau": set()}
+    for name in place:
+        if match := _NAME.fullmatch(name):
+            numbers[match[1]].add(int(match[2]))
+        elif name != "t":
+            problems.append(f"unknown column {name!r}")
+    if "t" not in place:
+        problems.append("no column 't' (time in seconds)")
+    joints = max((number for found in numbers.values() for number in found), default=0)
+    if joints == 0:
+        problems.append("no joints")
+    for kind, found in numbers.items():
+        missing = [f"{kind}{number}" for number in range(1, joints + 1) if number not in found]
+        if missing and (found or kind != "dq"):
+            more = f" and {len(missing) - 8} more" if len(missing) > 8 else ""
+            problems.append(f"missing {', '.join(missing[:8])}{more}")
+    if problems:
+        raise RecordingError(path, f"line 1: {'; '.join(problems)}; expected a header t,q1..qN,tau1..tauN")
+
+    def indices(kind: str) -> NDArray[np.intp]:
+        return np.array([place[f"{kind}{number}"] for number in range(1, joints + 1)], np.intp)
+
+    velocity = indices("dq") if numbers["dq"] else None
+    return CsvColumns(names, place["t"], indices("q"), indices("tau"), velocity)

@@ -1,0 +1,217 @@
+"""Reads JointState recordings in MCAP: our own, and ROS 2 bags from anywhere.
+
+Our own say in their metadata how far UTC is from the monotonic clock, and that torque is held from stamp to stamp; of
+a bag neither is known. A file that was cut off is read up to the cut, and so is one with a damaged chunk.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import IO, Final
+
+import numpy as np
+from mcap.opcode import Opcode
+
+from ident_service.errors import RecordingError
+from ident_service.record import mcap_records as mcap
+from ident_service.record.assemble import assemble
+from ident_service.record.extras import Extras, read_extras
+from ident_service.record.files import require_file, sha256
+from ident_service.record.joint_state import JointStateDecoder, Layout, PayloadError
+from ident_service.record.messages import JOINT_STATE
+from ident_service.record.recording import BLOCK_SAMPLES, Block
+from ident_service.record.writer import METADATA_NAME
+
+# 292 years: what is beyond cannot be a log time, and would not fit an int64.
+_MAX_STAMP: Final = (1 << 63) - 1
+
+
+class McapRecording:
+    """A Recording in an MCAP file.
+
+    Attributes:
+        path: the file.
+        sha256: of the bytes it had when opened; bytes that a writer adds later are not read.
+        joint_names: in the order of the block's columns.
+        joints: number of joints.
+        torque_held: True for our own recordings.
+        torn: whether the file ends, or is damaged, before its end mark.
+        metadata: the record `ident`, empty for a bag.
+        damage: what is wrong where the file is torn, else empty.
+    """
+
+    def __init__(self, path: Path | str, *, topic: str = "/joint_states", order: Sequence[str] | None = None) -> None:
+        """Open the file, check all of its chunks and find the joints.
+
+        Args:
+            path: the file.
+            topic: with sensor_msgs/msg/JointState on it.
+            order: joints to read, in the order of the columns; None takes the first message's.
+
+        Raises:
+            UsageError: no such file.
+            RecordingError: not MCAP, no such topic or joints, no position or effort.
+        """
+        self.path = Path(path)
+        self.torn = False
+        self.damage = ""
+        self.metadata: dict[str, str] = {}
+        self._topic = topic
+        require_file(self.path)
+        with self._open() as stream:
+            self._size = stream.seek(0, 2)
+            stream.seek(0)
+            if stream.read(len(mcap.MAGIC)) != mcap.MAGIC:
+                raise RecordingError(self.path, "is not an MCAP file")
+        self.sha256 = sha256(self.path, self._size)
+        self._verify()
+        self._offset_ns = self._utc_offset()
+        self.torque_held = self.metadata.get("torque_hold") == "zero_order"
+        layout, payload = self._first(order)
+        self.joint_names = tuple(order) if order is not None else layout.names
+        self.joints = len(self.joint_names)
+        self._decoder = JointStateDecoder(
+            self.joint_names, others=order is not None, velocity=_has_velocity(layout, payload)
+        )
+
+    def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
+        """Read the samples in order, `samples` at a time (the last block is shorter).
+
+        Velocity is there when the first message has one; a first velocity of nothing but NaN counts as none.
+
+        Raises:
+            RecordingError: values that are not finite, stamps that repeat or run backwards, messages whose joints
+                change; names the first one.
+        """
+        return assemble(self._pieces(min(samples, BLOCK_SAMPLES)), samples, self.path, self.joint_names)
+
+    def read_extras(self) -> Extras:
+        """Read what stands beside the samples: metadata, attachments, events, the arm's description.
+
+        Raises:
+            RecordingError: attachments of more than 64 MiB.
+        """
+        with self._open() as stream:
+            return read_extras(self.path, stream, self._size, self._offset_ns)
+
+    def _pieces(self, samples: int) -> Iterator[Block]:
+        payloads: list[bytes] = []
+        log_times: list[int] = []
+        read = 0
+        for log_time, payload in self._payloads():
+            payloads.append(payload)
+            log_times.append(min(log_time, _MAX_STAMP))
+            if len(payloads) == max(samples, 1):
+                yield self._decode(payloads, log_times, read)
+                read += len(payloads)
+                payloads, log_times = [], []
+        if payloads:
+            yield self._decode(payloads, log_times, read)
+
+    def _decode(self, payloads: Sequence[bytes], log_times: Sequence[int], before: int) -> Block:
+        try:
+            block = self._decoder.decode(payloads, log_times)
+        except PayloadError as error:
+            raise RecordingError(
+                self.path,
+                f"message {before + error.index} on {self._topic} {error}; choose the joints or another topic",
+            ) from error
+        return Block(block.stamp_ns - self._offset_ns, block.position, block.torque, block.velocity)
+
+    def _payloads(self, directory: mcap.Directory | None = None) -> Iterator[tuple[int, bytes]]:
+        """Log time [ns] and payload of each message on the topic, up to the tear."""
+        directory = directory or mcap.Directory()
+        chosen: dict[int, bool] = {}
+        try:
+            with self._open() as stream:
+                for run in mcap.contents(stream, self._size):
+                    for channel_id, log_time, payload in mcap.messages(run, directory):
+                        if (wanted := chosen.get(channel_id)) is None:
+                            wanted = chosen[channel_id] = self._is_chosen(channel_id, directory)
+                        if wanted:
+                            yield log_time, payload
+        except mcap.TornError as error:
+            self._tear(error)
+        except (mcap.TooLargeError, OSError) as error:
+            raise RecordingError(self.path, str(error)) from error
+
+    def _is_chosen(self, channel_id: int, directory: mcap.Directory) -> bool:
+        channel = directory.channels.get(channel_id)
+        if channel is None:
+            raise mcap.TornError("a message of a channel that was never announced")
+        if channel.topic != self._topic:
+            return False
+        if (schema := directory.schema_of(channel)) != JOINT_STATE or channel.message_encoding != "cdr":
+            raise RecordingError(
+                self.path, f"{self._topic} carries {schema} as {channel.message_encoding}, not {JOINT_STATE} as cdr"
+            )
+        return True
+
+    def _first(self, order: Sequence[str] | None) -> tuple[Layout, bytes]:
+        """The first message that has one of the wanted joints."""
+        directory = mcap.Directory()
+        seen: dict[str, None] = {}
+        for index, (_, payload) in enumerate(self._payloads(directory)):
+            try:
+                layout = Layout.parse(payload)
+            except PayloadError as error:
+                raise RecordingError(self.path, f"message {index} on {self._topic}: {error}") from error
+            seen.update(dict.fromkeys(layout.names))
+            if not layout.names:
+                raise RecordingError(self.path, f"message {index} on {self._topic} names no joints")
+            if order is None or not seen.keys().isdisjoint(order):
+                self._require(order, layout)
+                return layout, payload
+        if seen:
+            raise RecordingError(self.path, f"{self._topic} has joints {list(seen)} but none of {list(order or ())}")
+        topics = sorted({c.topic for c in directory.channels.values() if directory.schema_of(c) == JOINT_STATE})
+        cut = f" before the damage ({self.damage})" if self.torn else ""
+        raise RecordingError(self.path, f"no message on {self._topic}{cut}; topics with joint states: {topics}")
+
+    def _require(self, order: Sequence[str] | None, layout: Layout) -> None:
+        if missing := [name for name in order or () if name not in layout.names]:
+            raise RecordingError(self.path, f"{self._topic} lacks joints {missing}; it has {list(layout.names)}")
+        if layout.position is None or layout.effort is None:
+            what = "position" if layout.position is None else "effort, which is the torque"
+            raise RecordingError(self.path, f"{self._topic} has no {what}; identification needs both")
+
+    def _verify(self) -> None:
+        """Read every chunk and every metadata record once, so that `torn` is known from the start."""
+        try:
+            with self._open() as stream:
+                for opcode, content in mcap.records(stream, self._size, {Opcode.CHUNK, Opcode.METADATA}):
+                    if opcode == Opcode.CHUNK:
+                        mcap.expand(content)
+                    elif (record := mcap.metadata(content)).name == METADATA_NAME:
+                        self.metadata.update(record.metadata)
+        except mcap.TornError as error:
+            self._tear(error)
+        except (mcap.TooLargeError, OSError) as error:
+            raise RecordingError(self.path, str(error)) from error
+
+    def _tear(self, error: mcap.TornError) -> None:
+        self.torn = True
+        self.damage = str(error)
+
+    def _utc_offset(self) -> int:
+        text = self.metadata.get("utc_offset_ns", "0")
+        try:
+            offset = int(text)
+            np.int64(offset)
+        except (ValueError, OverflowError) as error:
+            raise RecordingError(self.path, f"metadata utc_offset_ns is {text[:40]!r}, not nanoseconds") from error
+        return offset
+
+    def _open(self) -> IO[bytes]:
+        try:
+            return self.path.open("rb")
+        except OSError as error:
+            raise RecordingError(self.path, f"cannot be read: {error.strerror}") from error
+
+
+def _has_velocity(layout: Layout, payload: bytes) -> bool:
+    if layout.velocity is None:
+        return False
+    values = np.frombuffer(payload, "<f8", len(layout.names), layout.velocity)
+    return not bool(np.isnan(values).all())

@@ -1,0 +1,181 @@
+"""The record layer of an MCAP file (https://mcap.dev/spec), read forwards and up to the first damage.
+
+The index at the end of a file is not used: a recording that was cut off has none. Everything is bounded before it is
+expanded: a record and an expanded chunk to 64 MiB each, a chunk to the size it declares.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Collection, Iterator
+from io import BytesIO
+from typing import IO, Any, Final
+
+import lz4.frame  # type: ignore[import-untyped]
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+MAX_RECORD: Final = 64 << 20
+
+_HEAD: Final = struct.Struct("<BQ")
+_MESSAGE: Final = struct.Struct("<BQHIQQ")
+_MESSAGE_FIELDS: Final = _MESSAGE.size - _HEAD.size
+_CONTENTS: Final = frozenset({Opcode.CHUNK, Opcode.MESSAGE, Opcode.CHANNEL, Opcode.SCHEMA})
+
+Message = tuple[int, int, bytes]
+
+
+class TornError(Exception):
+    """The file ends, or makes no sense, from here on."""
+
+
+class TooLargeError(Exception):
+    """A record or chunk beyond the bounds above."""
+
+
+class Directory:
+    """The channels and schemas met so far, by id."""
+
+    def __init__(self) -> None:
+        self.channels: dict[int, Channel] = {}
+        self.schemas: dict[int, str] = {}
+
+    def schema_of(self, channel: Channel) -> str:
+        """Name of the channel's message type, empty where the file does not say."""
+        return self.schemas.get(channel.schema_id, "")
+
+
+def records(stream: IO[bytes], size: int, wanted: Collection[int]) -> Iterator[tuple[int, bytes]]:
+    """Walk the file's records in order and read those wanted.
+
+    Args:
+        stream: the file, from its first byte on.
+        size: how many of its bytes to read at most.
+        wanted: opcodes to read; the others are stepped over.
+
+    Yields:
+        Opcode and content of each wanted record.
+
+    Raises:
+        TornError: the bytes end before the closing magic, or cannot be records.
+        TooLargeError: a wanted record above 64 MiB.
+    """
+    stream.seek(len(MAGIC))
+    position = len(MAGIC)
+    while True:
+        head = stream.read(_HEAD.size)
+        if len(head) < _HEAD.size:
+            raise TornError("the file ends without its end mark")
+        opcode, length = _HEAD.unpack(head)
+        position += _HEAD.size + length
+        if opcode == 0 or position > size:
+            raise TornError("the file ends within a record")
+        if opcode == Opcode.FOOTER:
+            stream.seek(position)
+            if position + len(MAGIC) > size or stream.read(len(MAGIC)) != MAGIC:
+                raise TornError("the file ends within its end mark")
+            return
+        if opcode not in wanted:
+            stream.seek(position)
+            continue
+        if length > MAX_RECORD:
+            raise TooLargeError(f"a record of {length} bytes is above the limit of {MAX_RECORD}")
+        content = stream.read(length)
+        if len(content) < length:
+            raise TornError("the file ends within a record")
+        yield opcode, content
+
+
+def contents(stream: IO[bytes], size: int) -> Iterator[bytes]:
+    """Every chunk, expanded and checked, as one run of records; a record outside of chunks is a run of its own.
+
+    Raises:
+        TornError: as `records`, or a chunk that is damaged.
+        TooLargeError: as `records`, or a chunk that expands beyond 64 MiB.
+    """
+    for opcode, content in records(stream, size, _CONTENTS):
+        yield expand(content) if opcode == Opcode.CHUNK else _HEAD.pack(opcode, len(content)) + content
+
+
+def expand(content: bytes) -> bytes:
+    """A chunk record's content, decompressed; checked against its size and, where it has one, its CRC."""
+    chunk: Chunk = _parse(Chunk, content)
+    size = chunk.uncompressed_size
+    if size > MAX_RECORD:
+        raise TooLargeError(f"a chunk expands to {size} bytes, above the limit of {MAX_RECORD}")
+    try:
+        if chunk.compression == "zstd":
+            # A frame that names its size is expanded to it no matter what limit is given, so that is looked at first.
+            if zstandard.frame_content_size(chunk.data) > size:
+                raise TornError("a chunk expands beyond the size it declares")
+            data = zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=size)
+        elif chunk.compression == "lz4":
+            data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+        elif not chunk.compression:
+            data = chunk.data
+        else:
+            raise TooLargeError(f"chunks compressed with {chunk.compression!r} cannot be read, only zstd and lz4")
+    except (zstandard.ZstdError, RuntimeError, EOFError) as error:
+        raise TornError(f"a chunk does not decompress: {error}") from error
+    if len(data) != size or (chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc):
+        raise TornError("a chunk is damaged: its size or checksum is wrong")
+    return bytes(data)
+
+
+def messages(run: bytes, directory: Directory) -> Iterator[Message]:
+    """The messages in a run of records; channels and schemas go into `directory`.
+
+    Yields:
+        Channel id, log time [ns], payload.
+
+    Raises:
+        TornError: the bytes cannot be records.
+    """
+    position, end = 0, len(run)
+    try:
+        while position < end:
+            if run[position] == Opcode.MESSAGE:
+                _, length, channel, _, log_time, _ = _MESSAGE.unpack_from(run, position)
+                start = position + _MESSAGE.size
+                position += _HEAD.size + length
+                if length < _MESSAGE_FIELDS or position > end:
+                    raise TornError("a chunk ends within a message")
+                yield channel, log_time, run[start:position]
+                continue
+            opcode, length = _HEAD.unpack_from(run, position)
+            start = position + _HEAD.size
+            position = start + length
+            if position > end:
+                raise TornError("a chunk ends within a record")
+            if opcode == Opcode.CHANNEL:
+                found: Channel = _parse(Channel, run[start:position])
+                directory.channels[found.id] = found
+            elif opcode == Opcode.SCHEMA:
+                schema: Schema = _parse(Schema, run[start:position])
+                directory.schemas[schema.id] = schema.name
+    except struct.error as error:
+        raise TornError("a chunk ends within a record") from error
+
+
+def metadata(content: bytes) -> Metadata:
+    """A metadata record's content."""
+    parsed: Metadata = _parse(Metadata, content)
+    return parsed
+
+
+def attachment(content: bytes) -> Attachment:
+    """An attachment record's content."""
+    parsed: Attachment = _parse(Attachment, content)
+    return parsed
+
+
+def _parse(kind: Any, content: bytes) -> Any:
+    try:
+        return kind.read(ReadDataStream(BytesIO(content)))
+    except (McapError, struct.error, UnicodeDecodeError, OverflowError) as error:
+        raise TornError(f"a {kind.__name__.lower()} record is damaged") from error

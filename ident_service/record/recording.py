@@ -1,0 +1,65 @@
+"""What a recording is to the rooms above: a name, a hash, joints, and blocks of samples in order of time.
+
+A block is what passes the door; how it lies in a file is `mcap_file.py`'s and `csv_file.py`'s business.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Matrix = NDArray[np.float64]
+Stamps = NDArray[np.int64]
+
+BLOCK_SAMPLES = 4096
+
+
+@dataclass(frozen=True)
+class Block:
+    """Consecutive samples.
+
+    Attributes:
+        stamp_ns: times [ns], strictly increasing, shape (samples,).
+        position: [rad or m], shape (samples, joints).
+        torque: [N m or N], shape (samples, joints).
+        velocity: [rad/s or m/s], shape (samples, joints), or None where the recording has none.
+    """
+
+    stamp_ns: Stamps
+    position: Matrix
+    torque: Matrix
+    velocity: Matrix | None = None
+
+
+class Recording(Protocol):
+    """A file of samples that can be read through any number of times, one block at a time.
+
+    Attributes:
+        path: the file.
+        sha256: of the file's bytes.
+        joint_names: in the order of the block's columns; empty where the file names none (CSV `q1..qN`).
+        joints: number of joints.
+        torque_held: True when the torque of a sample acts from its stamp until the next stamp (our own recordings:
+            a zero-order hold), False when it was sampled at its stamp.
+        torn: True when the file ended in the middle of a record and was read up to there.
+    """
+
+    path: Path
+    sha256: str
+    joint_names: tuple[str, ...]
+    joints: int
+    torque_held: bool
+    torn: bool
+
+    def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
+        """Read the samples in order, `samples` at a time (the last block is shorter).
+
+        Raises:
+            RecordingError: NaN or infinite values, stamps that repeat or run backwards, a torn row in a CSV file;
+                the message names the first place.
+        """

@@ -1,0 +1,1 @@
+"""Results: the parameter file, exports and the run folder."""

@@ -1,0 +1,60 @@
+"""Files appear whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from ident_service.errors import UsageError
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Write UTF-8 text under its final name only when all of it is on the disk.
+
+    Raises:
+        UsageError: the folder does not exist or cannot be written.
+    """
+    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
+    try:
+        with partial.open("x", encoding="utf-8") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
+        partial.replace(path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+@contextmanager
+def appearing_folder(folder: Path) -> Iterator[Path]:
+    """A place to build a folder's content in; it appears under its name when the block ends without an error.
+
+    A folder that exists keeps its other files; files of the same name are replaced one by one.
+
+    Raises:
+        UsageError: the folder's place cannot be written, or is a file.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"{folder}: is a file, not a folder")
+    staging = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}.partial")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        staging.mkdir()
+    except OSError as error:
+        raise UsageError(f"{folder}: cannot be written: {error.strerror}") from None
+    try:
+        yield staging
+        if folder.exists():
+            for path in sorted(staging.iterdir()):
+                path.replace(folder / path.name)
+            staging.rmdir()
+        else:
+            staging.rename(folder)
+    except BaseException:
+        shutil.rmtree(staging, ignore_errors=True)
+        raise

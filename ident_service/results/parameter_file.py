@@ -1,0 +1,210 @@
+"""`parameters.json`: written from an estimate, read from anywhere, always held against its schema (conventions).
+
+Only the expressions and their values are required to read one, so that any paper's table can be tested.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, NoReturn
+
+import jsonschema
+import numpy as np
+
+from ident_service import __version__
+from ident_service.errors import ParameterError, UsageError
+from ident_service.estimation.feasible_set import SetName
+from ident_service.estimation.identify import Estimate
+from ident_service.estimation.least_squares import TorqueError
+from ident_service.model.base import BaseParameters, base_from_expressions
+from ident_service.model.chain import Array
+from ident_service.model.expressions import parse_expression
+from ident_service.model.layout import INERTIAL
+from ident_service.results.files import write_atomically
+
+MAX_BYTES = 64 * 2**20
+
+
+@dataclass(frozen=True)
+class ParameterFile:
+    """A parameter file that has been read.
+
+    Attributes:
+        base: the grouping its expressions define; link parameters that no expression names are free.
+        values: base parameters in SI units, shape (base,).
+        feasible_set: the set it claims, or None.
+        content: everything in it.
+    """
+
+    base: BaseParameters
+    values: Array
+    feasible_set: SetName | None
+    content: dict[str, Any]
+
+
+@cache
+def _validator() -> jsonschema.Draft202012Validator:
+    schema = json.loads(files("ident_service.results").joinpath("parameters.schema.json").read_text(encoding="utf-8"))
+    return jsonschema.Draft202012Validator(schema)
+
+
+def read_parameters(path: Path, names: tuple[str, ...] | None = None) -> ParameterFile:
+    """Read a parameter file.
+
+    Args:
+        path: the file.
+        names: the link parameters of an arm; without them, the ten of every link up to the highest number that the
+            expressions mention, and the joint terms that they mention.
+
+    Raises:
+        UsageError: no such file.
+        ParameterError: not JSON, not of the schema, or expressions that do not parse or depend on each other.
+    """
+    if not path.is_file():
+        raise UsageError(f"no such file: {path}")
+    if path.stat().st_size > MAX_BYTES:
+        raise ParameterError(f"{path}: larger than {MAX_BYTES} bytes")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
+    except (ValueError, RecursionError) as error:
+        raise ParameterError(f"{path}: not JSON: {error}") from None
+    _validate(content, str(path))
+    table = content["base_parameters"]
+    expressions, values = tuple(table["expressions"]), np.array(table["values"], dtype=float)
+    for key, column in table.items():
+        if len(column) != len(expressions):
+            raise ParameterError(f"{path}: {len(expressions)} expressions but {len(column)} {key}")
+    try:
+        base = base_from_expressions(expressions, names if names is not None else _names_in(expressions))
+    except ParameterError as error:
+        raise ParameterError(f"{path}: {error}") from None
+    return ParameterFile(base, values, content.get("feasible_set"), content)
+
+
+def parameters_document(estimate: Estimate) -> dict[str, Any]:
+    """The content of `parameters.json` for an estimate."""
+    model, base = estimate.model, estimate.base
+    own = estimate.candidates[estimate.chosen]
+    document: dict[str, Any] = {
+        "format": "ident-parameters",
+        "version": 1,
+        "arm": {"name": model.config.name, "joints": list(model.chain.names), "sha256": model.config.sha256},
+        "method": estimate.method,
+        "feasible_set": estimate.conditions.kind if estimate.constrained else "none",
+    }
+    if estimate.delta is not None:
+        document["link_parameters"] = {
+            "names": list(model.layout.names),
+            "units": list(model.layout.units),
+            "values": estimate.delta.tolist(),
+        }
+    document |= {
+        "base_parameters": {
+            "expressions": list(base.expressions),
+            "units": list(base.units),
+            "values": estimate.beta.tolist(),
+            "standard_deviations": _perhaps(estimate.standard_deviations),
+            "white_standard_deviations": _perhaps(estimate.white_standard_deviations),
+            "covariance": [_perhaps(row) for row in estimate.covariance],
+            "verdicts": list(estimate.verdicts),
+        },
+        "feasibility": {
+            "feasible": estimate.feasible,
+            "margin": estimate.margin,
+            "tight": list(estimate.tight),
+            "certificate": {"kind": "witness" if estimate.delta is not None else "none", "set": estimate.conditions.kind},
+        },
+        "fit": {
+            "samples": estimate.samples,
+            "condition_number": estimate.fit.condition_number if np.isfinite(estimate.fit.condition_number) else None,
+            **_errors(own.identification, model.chain.names),
+        },
+        "validation": [
+            {"recording": s.recording, "sha256": s.sha256, **_errors(s.error, model.chain.names)} for s in own.validation
+        ],
+        "provenance": {
+            "recordings": [{"name": name, "sha256": digest} for name, digest in estimate.recordings],
+            "software": f"ident-service {__version__}",
+            "created": datetime.now(UTC).isoformat(timespec="seconds"),
+            "git": _commit(),
+        },
+    }
+    return document
+
+
+def write_parameters(path: Path, document: dict[str, Any]) -> None:
+    """Write a parameter document after holding it against the schema; floats round-trip.
+
+    Raises:
+        ParameterError: the document does not fit the schema.
+        UsageError: the file cannot be written.
+    """
+    _validate(document, str(path))
+    write_atomically(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
+
+
+def _validate(content: Any, where: str) -> None:
+    mistakes = sorted(_validator().iter_errors(content), key=lambda mistake: mistake.json_path)
+    if mistakes:
+        listed = "; ".join(f"{mistake.json_path}: {mistake.message[:200]}" for mistake in mistakes[:10])
+        raise ParameterError(f"{where}: not a parameter file: {listed}")
+
+
+def _refuse(constant: str) -> NoReturn:
+    raise ValueError(f"{constant} is not a number that JSON knows")
+
+
+def _names_in(expressions: tuple[str, ...]) -> tuple[str, ...]:
+    mentioned = {name for expression in expressions for name in parse_expression(expression)}
+    links, extra = 0, set()
+    for name in mentioned:
+        symbol = name.rstrip("0123456789")
+        number = name[len(symbol) :]
+        if not number or int(number) < 1 or int(number) > 1000:
+            raise ParameterError(f"{name!r} has no link number; parameters are called Lxx1 ... m1, Ia1, fv1, fc1, fo1")
+        links = max(links, int(number))
+        if symbol not in INERTIAL:
+            extra.add((int(number), symbol))
+    names: list[str] = []
+    for link in range(1, links + 1):
+        names += [f"{symbol}{link}" for symbol in INERTIAL]
+        names += [f"{symbol}{link}" for number, symbol in sorted(extra) if number == link]
+    return tuple(names)
+
+
+def _perhaps(values: Array) -> list[float | None]:
+    return [float(value) if np.isfinite(value) else None for value in values]
+
+
+def _errors(error: TorqueError, names: tuple[str, ...]) -> dict[str, Any]:
+    rows = zip(names, error.joint_relative_percent, error.joint_rms, strict=True)
+    return {
+        "relative_error_percent": error.relative_percent,
+        "per_joint": [
+            {"joint": name, "relative_error_percent": float(relative), "rms": float(rms)} for name, relative, rms in rows
+        ],
+    }
+
+
+def _commit() -> str | None:
+    """Commit of the source this runs from, where it runs from a checkout."""
+    root = Path(__file__).parent.parent.parent
+    if not (root / ".git").exists():
+        return None
+    try:
+        done = subprocess.run(  # noqa: S603
+            ["git", "-C", str(root), "rev-parse", "HEAD"],  # noqa: S607
+            capture_output=True,
+            text=True,
+            timeout=5,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()

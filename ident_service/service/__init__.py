@@ -1,0 +1,1 @@
+"""Service: the jobs that the command line and, later, the daemon run."""

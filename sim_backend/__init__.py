@@ -1,0 +1,1 @@
+"""A simulated arm: a plant that knows the truth, behind the same contract as a real one."""

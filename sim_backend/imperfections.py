@@ -1,0 +1,67 @@
+"""What stands between a true state and a sample: encoder steps, torque steps and limits, torque noise.
+
+Boundary: pure computation; when a sample is taken is `arm.py`, what breaks is `faults.py`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from functools import cached_property
+
+import numpy as np
+
+from drivers.arm import Vector
+from ident_service.errors import DriverError
+
+
+@dataclass(frozen=True)
+class Imperfections:
+    """Per joint, all of shape (joints,).
+
+    Attributes:
+        encoder_resolution: step of the position [rad or m]; 0 where continuous.
+        torque_resolution: step of the torque [N m or N]; 0 where continuous.
+        torque_noise: standard deviation per cycle of what acts besides the torque [N m or N].
+        torque_limit: clip of the driver [N m or N]; infinite where there is none.
+    """
+
+    encoder_resolution: Vector
+    torque_resolution: Vector
+    torque_noise: Vector
+    torque_limit: Vector
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = np.array(getattr(self, field.name), dtype=float)
+            if value.shape != self.torque_limit.shape or not (value >= 0.0).all():
+                raise DriverError(
+                    f"{field.name} must be {self.torque_limit.shape[0]} numbers, none negative, is {value}"
+                )
+            value.setflags(write=False)
+            object.__setattr__(self, field.name, value)
+
+    @classmethod
+    def none(cls, joints: int) -> Imperfections:
+        """A perfect arm: continuous, silent, unlimited."""
+        return cls(np.zeros(joints), np.zeros(joints), np.zeros(joints), np.full(joints, np.inf))
+
+    def encode(self, position: Vector) -> Vector:
+        """The position an encoder shows, a new array of shape (joints,)."""
+        return _in_steps(position, self.encoder_resolution)
+
+    def drive(self, torque: Vector) -> Vector:
+        """The torque a drive can make of a request, a new array of shape (joints,)."""
+        return np.asarray(np.minimum(np.maximum(_in_steps(torque, self.torque_resolution), -self._reach), self._reach))
+
+    @cached_property
+    def _reach(self) -> Vector:
+        """The largest whole step inside the limit, because rounding could lead out of it again."""
+        step, limit = self.torque_resolution, self.torque_limit
+        whole = np.where(step > 0.0, step, 1.0)
+        # A limit that is a whole number of steps must stay one when their quotient is rounded down.
+        return np.where(step > 0.0, np.floor(limit / whole * (1.0 + 1e-12)) * whole, limit)
+
+
+def _in_steps(value: Vector, step: Vector) -> Vector:
+    whole = np.where(step > 0.0, step, 1.0)
+    return np.where(step > 0.0, np.rint(value / whole) * whole, value)

@@ -1,0 +1,137 @@
+"""The simulated arm's body: rigid links, drive inertia, viscous and dry friction, stepped at a fixed period.
+
+`M(q) ddq + c(q, dq) + g(q) + fo + fv dq + lambda = tau` with `lambda_i` in `fc_i Sgn(dq_i)` (eqs. 1, 27). One step
+takes a constant torque (zero-order hold) and everything smooth at the predicted midpoint, viscous friction
+implicitly, and dry friction at the end of the step (Moreau-Jean time stepping): second order where no joint changes
+direction, and unconditionally sticking where one comes to rest::
+
+    q_m = q + h/2 v,  v_m = v + h/2 a_previous
+    (M(q_m) + h/2 fv) (v+ - v)/h = tau - c(q_m, v_m) - g(q_m) - fo - fv v - lambda,  lambda_i in fc_i Sgn(v+_i)
+    q+ = q + h/2 (v + v+)
+
+Boundary: the only file of this room that knows pinocchio; no clock, no encoder, no noise.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+
+from ident_service.errors import DriverError, ModelError
+from ident_service.model.chain import Array, Chain
+from ident_service.model.layout import Layout
+from ident_service.model.rigid_body import InverseDynamics, pinocchio_model
+from sim_backend.friction import stick_slip_velocity
+
+
+class Plant:
+    """A chain with true parameters, moved one period at a time by constant torques."""
+
+    def __init__(self, chain: Chain, layout: Layout, delta: Array, position: Array, period: float) -> None:
+        """Put the arm at rest.
+
+        Args:
+            chain: the mechanism, gravity included.
+            layout: order of the parameters.
+            delta: true parameters [SI], shape (layout.size,).
+            position: where it starts [rad or m], shape (joints,).
+            period: what `step` advances [s].
+
+        Raises:
+            ModelError: shapes that do not fit, a link without mass, negative friction, or a mass matrix that is not
+                positive definite.
+        """
+        if position.shape != (chain.joints,):
+            raise ModelError(f"{position.shape=} but the chain has {chain.joints} joints")
+        self._chain = chain
+        self._period = period
+        self._half = 0.5 * period
+        self._inverse = InverseDynamics(chain, layout, delta)
+        self._viscous = layout.term_values("viscous", delta)
+        self._coulomb = layout.term_values("coulomb", delta)
+        self._offset = layout.term_values("offset", delta)
+        if (self._viscous < 0.0).any() or (self._coulomb < 0.0).any():
+            raise ModelError("negative friction would drive the arm; fv and fc must not be negative")
+        # Implicit viscous friction acts like more drive inertia, so that it costs nothing to solve for.
+        self._model = pinocchio_model(chain, layout, delta)
+        self._model.armature = np.asarray(self._model.armature) + self._half * self._viscous
+        self._data = self._model.createData()
+        # What a velocity times its old sign must exceed for a joint to go on sliding; frictionless joints always do.
+        self._keeps_on = np.where(self._coulomb > 0.0, 0.0, -np.inf)
+        self._set(np.array(position, dtype=float), np.zeros(chain.joints), np.zeros(chain.joints))
+        if not np.linalg.eigvalsh(self._inverse.mass_matrix(self._position)).min() > 0.0:
+            raise ModelError("the mass matrix is not positive definite: no real body has these parameters")
+
+    @property
+    def chain(self) -> Chain:
+        """The mechanism."""
+        return self._chain
+
+    @property
+    def period(self) -> float:
+        """What `step` advances [s]."""
+        return self._period
+
+    @property
+    def position(self) -> Array:
+        """[rad or m], shape (joints,), read-only."""
+        return self._position
+
+    @property
+    def velocity(self) -> Array:
+        """[rad/s or m/s], shape (joints,), read-only; exactly 0 where a joint sticks."""
+        return self._velocity
+
+    @property
+    def acceleration(self) -> Array:
+        """Mean over the last step [rad/s^2 or m/s^2], shape (joints,), read-only."""
+        return self._acceleration
+
+    def step(self, torque: Array) -> None:
+        """Advance by one period under a constant torque.
+
+        Args:
+            torque: [N m or N], shape (joints,).
+
+        Raises:
+            DriverError: the state is no longer finite; it stays what it was before the step.
+        """
+        v = self._velocity
+        sign = np.sign(v)
+        q_m = self._position + self._half * v
+        # A joint at rest is predicted to stay there: its last mean acceleration is the impact that stopped it.
+        v_m = v + self._half * (self._acceleration * np.abs(sign))
+        smooth = torque - self._offset - self._viscous * v
+        a = pin.aba(self._model, self._data, q_m, v_m, smooth - self._coulomb * sign)
+        v_next = v + self._period * a
+        if not (v_next * sign > self._keeps_on).all():
+            v_next = self._stick_or_slip(q_m, v_m, smooth)
+        self._set(self._position + self._half * (v + v_next), v_next, (v_next - v) / self._period)
+
+    def inverse_dynamics(self, position: Array, velocity: Array, acceleration: Array) -> Array:
+        """The torque the true parameters ask for at one state, free of noise: the truth to score against.
+
+        Args:
+            position: [rad or m], shape (joints,).
+            velocity: [rad/s or m/s], shape (joints,); its sign is dry friction's, which counts as 0 at rest.
+            acceleration: [rad/s^2 or m/s^2], shape (joints,).
+
+        Returns:
+            [N m or N], shape (joints,).
+        """
+        friction = self._viscous * velocity + self._coulomb * np.sign(velocity) + self._offset
+        return np.asarray(self._inverse.torque(position, velocity, acceleration) + friction)
+
+    def _stick_or_slip(self, q_m: Array, v_m: Array, smooth: Array) -> Array:
+        A = np.array(pin.crba(self._model, self._data, q_m))
+        rest = pin.nonLinearEffects(self._model, self._data, q_m, v_m)
+        b = A @ self._velocity + self._period * (smooth - rest)
+        if not np.isfinite(b).all():
+            raise DriverError("the simulated arm ran away: its state is no longer finite")
+        return stick_slip_velocity(A, b, self._period * self._coulomb, self._velocity)
+
+    def _set(self, position: Array, velocity: Array, acceleration: Array) -> None:
+        # Replaced, never written into, so that whoever holds an old state keeps it.
+        for array in (position, velocity, acceleration):
+            array.setflags(write=False)
+        self._position, self._velocity, self._acceleration = position, velocity, acceleration

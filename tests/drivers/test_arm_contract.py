@@ -1,0 +1,267 @@
+"""What every Arm keeps to, whatever stands behind it.
+
+A backend joins by a function in BACKENDS that builds a two-joint arm in virtual time, not yet open, with an eye on the
+true state of what moves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.arm import Arm, StopKind
+from ident_service.config.schema import ArmConfig
+from ident_service.errors import DriverError
+
+PERIOD_NS = 2_000_000
+LIMIT = np.array([10.0, 5.0])
+NONE = np.zeros(2)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """An arm of two weightless, frictionless joints of 1 kg m^2 and 1 kg, and the truth about it."""
+
+    arm: Arm
+    velocity: Callable[[], np.ndarray]
+    position: Callable[[], np.ndarray]
+
+
+def bench_config(**driver: Any) -> ArmConfig:
+    truth = {"m1": 0.5, "Lxx1": 0.1, "Lyy1": 0.1, "Lzz1": 1.0, "m2": 1.0}
+    options = {"encoder_resolution": 1e-4, "torque_resolution": [0.25, 0.0]} | driver
+    return ArmConfig.model_validate(
+        {
+            "format": "ident-arm",
+            "version": 1,
+            "name": "bench",
+            # The second joint slides along the first one's axis, so that neither moves the other.
+            "kinematics": {"dh": {"convention": "standard", "joints": {"turn": {}, "slide": {"type": "prismatic"}}}},
+            "gravity": (0.0, 0.0, 0.0),
+            "joints": {"turn": {"torque": 10.0, "home": 0.5}, "slide": {"torque": 5.0, "position": (0.1, 1.0)}},
+            "control": {"rate": 500.0},
+            "driver": {"kind": "simulated", "truth": truth, **options},
+        }
+    )
+
+
+def simulated() -> Bench:
+    from sim_backend.arm import from_config
+
+    arm = from_config(bench_config())
+    return Bench(arm, lambda: arm.plant.velocity, lambda: arm.plant.position)
+
+
+BACKENDS: dict[str, Callable[[], Bench]] = {"simulated": simulated}
+
+
+@pytest.fixture(params=sorted(BACKENDS))
+def bench(request):
+    bench = BACKENDS[request.param]()
+    yield bench
+    bench.arm.close()
+
+
+@pytest.fixture
+def running(bench):
+    bench.arm.open()
+    bench.arm.enable()
+    return bench
+
+
+def test_opening_twice_is_refused_and_reopening_is_not(bench):
+    bench.arm.open()
+    with pytest.raises(DriverError):
+        bench.arm.open()
+    bench.arm.close()
+    bench.arm.open()
+    assert bench.arm.exchange(None).cycle == 0
+
+
+def test_a_closed_arm_does_nothing(bench):
+    for act in (bench.arm.describe, bench.arm.enable, lambda: bench.arm.exchange(None)):
+        with pytest.raises(DriverError):
+            act()
+
+
+def test_describes_itself_in_the_shape_of_its_joints(bench):
+    with bench.arm as arm:
+        says = arm.describe()
+    assert says.joint_names == ("turn", "slide")
+    assert says.rate == 1e9 / PERIOD_NS
+    assert len(says.identities) == 2
+    assert says.software
+    np.testing.assert_array_equal(says.torque_limit, LIMIT)
+    for vector in (says.torque_resolution, says.position_resolution):
+        assert vector.shape == (2,)
+        assert (vector >= 0.0).all()
+
+
+def test_samples_have_the_shape_of_the_joints(running):
+    for cycle in range(3):
+        sample = running.arm.exchange(NONE)
+        assert sample.cycle == cycle
+        assert sample.position.shape == sample.torque.shape == sample.valid.shape == sample.age.shape == (2,)
+        assert sample.velocity is None or sample.velocity.shape == (2,)
+        assert sample.valid.all()
+        assert not sample.age.any()
+        assert sample.lost == 0
+
+
+def test_stamps_are_exactly_one_period_apart_and_on_the_clock(running):
+    stamps = []
+    for _ in range(50):
+        stamps.append(running.arm.exchange(NONE).stamp_ns)
+        assert running.arm.clock.now_ns() == stamps[-1]
+    np.testing.assert_array_equal(np.diff(stamps), PERIOD_NS)
+
+
+def test_looking_needs_no_enabling_and_moves_nothing(bench):
+    with bench.arm as arm:
+        first = arm.exchange(None)
+        for _ in range(10):
+            sample = arm.exchange(None)
+        np.testing.assert_array_equal(sample.torque, 0.0)
+        np.testing.assert_array_equal(sample.position, first.position)
+
+
+def test_a_torque_needs_enabling(bench):
+    with bench.arm as arm:
+        arm.exchange(None)
+        with pytest.raises(DriverError):
+            arm.exchange(NONE)
+        np.testing.assert_array_equal(arm.exchange(None).torque, 0.0)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [np.array([np.nan, 0.0]), np.array([0.0, np.inf]), np.zeros(3), np.zeros((2, 1)), np.float64(1.0)],
+    ids=["nan", "inf", "too long", "matrix", "scalar"],
+)
+def test_a_torque_that_raises_has_not_been_sent(running, bad):
+    before = running.arm.exchange(np.array([1.0, 1.0]))
+    with pytest.raises(DriverError):
+        running.arm.exchange(bad)
+    after = running.arm.exchange(None)
+    np.testing.assert_array_equal(after.torque, before.torque)
+    assert after.cycle == before.cycle + 1
+    assert after.stamp_ns == before.stamp_ns + PERIOD_NS
+
+
+def test_enabling_starts_from_zero_torque(running):
+    running.arm.exchange(np.array([1.0, 1.0]))
+    running.arm.enable()
+    np.testing.assert_array_equal(running.arm.exchange(None).torque, 0.0)
+
+
+def test_the_torque_of_a_sample_acts_from_its_stamp_to_the_next(running):
+    velocity = []
+    for cycle in range(6):
+        sample = running.arm.exchange(np.array([2.0, -3.0]) if cycle == 3 else NONE)
+        np.testing.assert_array_equal(sample.torque, [2.0, -3.0] if cycle == 3 else 0.0)
+        velocity.append(running.velocity())
+    seconds = PERIOD_NS * 1e-9
+    # At stamps 0 to 3 nothing has acted yet; at 4 the pulse has, for exactly one period, and nothing after it.
+    np.testing.assert_array_equal(velocity[:4], np.zeros((4, 2)))
+    np.testing.assert_allclose(velocity[4], [2.0 * seconds, -3.0 * seconds], rtol=1e-9)
+    np.testing.assert_allclose(velocity[5], velocity[4], rtol=1e-9)
+
+
+def test_positions_are_those_of_the_stamp(running):
+    resolution = running.arm.describe().position_resolution
+    for _ in range(20):
+        sample = running.arm.exchange(np.array([2.0, -3.0]))
+        assert (np.abs(sample.position - running.position()) <= 0.5 * resolution + 1e-12).all()
+
+
+def test_positions_come_in_whole_encoder_steps(running):
+    resolution = running.arm.describe().position_resolution
+    for _ in range(20):
+        steps = running.arm.exchange(np.array([5.0, -5.0])).position / np.where(resolution > 0.0, resolution, 1.0)
+        np.testing.assert_allclose(steps, np.rint(steps), atol=1e-6)
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_torques_are_clipped_to_what_the_arm_says(running, side):
+    limit = running.arm.describe().torque_limit
+    np.testing.assert_allclose(running.arm.exchange(side * 100.0 * limit).torque, side * limit, rtol=1e-12)
+
+
+def test_torques_come_in_whole_steps_and_a_sample_says_so(running):
+    resolution = running.arm.describe().torque_resolution
+    asked = np.array([1.1, 1.1])
+    given = running.arm.exchange(asked).torque
+    assert (np.abs(given - asked) <= 0.5 * resolution + 1e-12).all()
+    stepped = resolution > 0.0
+    steps = given[stepped] / resolution[stepped]
+    np.testing.assert_allclose(steps, np.rint(steps), atol=1e-9)
+
+
+def test_samples_stay_what_they_were(running):
+    torque = np.array([1.0, 1.0])
+    first = running.arm.exchange(torque)
+    kept = [np.array(array) for array in (first.position, first.torque, first.valid, first.age)]
+    torque[:] = 4.0
+    for _ in range(5):
+        running.arm.exchange(torque)
+    for array, copy in zip((first.position, first.torque, first.valid, first.age), kept, strict=True):
+        np.testing.assert_array_equal(array, copy)
+
+
+@pytest.mark.parametrize("kind", list(StopKind))
+def test_stopping_takes_the_torque_and_the_enabling(running, kind):
+    running.arm.exchange(np.array([1.0, 1.0]))
+    running.arm.stop(kind)
+    np.testing.assert_array_equal(running.arm.exchange(None).torque, 0.0)
+    with pytest.raises(DriverError):
+        running.arm.exchange(NONE)
+    running.arm.enable()
+    running.arm.exchange(NONE)
+
+
+@pytest.mark.parametrize("kind", list(StopKind))
+def test_stopping_never_raises(bench, kind):
+    def stop_twice():
+        bench.arm.stop(kind)
+        bench.arm.stop(kind)
+
+    stop_twice()
+    bench.arm.open()
+    stop_twice()
+    bench.arm.enable()
+    stop_twice()
+    bench.arm.enable()
+    bench.arm.exchange(np.ones(2))
+    stop_twice()
+    bench.arm.close()
+    stop_twice()
+
+
+def test_closing_is_safe_from_any_state(bench):
+    bench.arm.close()
+    bench.arm.open()
+    bench.arm.enable()
+    bench.arm.exchange(np.ones(2))
+    bench.arm.close()
+    bench.arm.close()
+    with pytest.raises(DriverError):
+        bench.arm.exchange(None)
+
+
+def test_leaving_closes_whatever_happened(bench):
+    def fail():
+        with bench.arm as arm:
+            arm.enable()
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    with pytest.raises(DriverError):
+        bench.arm.exchange(None)
+    bench.arm.open()
+    with pytest.raises(DriverError):
+        bench.arm.exchange(NONE)

@@ -1,0 +1,157 @@
+"""CSV recordings: numbers survive, and every mistake is named with its line."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from record_samples import read_all
+
+from ident_service.errors import RecordingError, UsageError
+from ident_service.record import csv_file
+from ident_service.record.csv_file import CsvRecording
+from ident_service.record.open import open_recording
+
+HEADER = "t,q1,q2,tau1,tau2\n"
+NUMBER = st.floats(allow_nan=False, allow_infinity=False)
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_bytes(text.encode())
+    return path
+
+
+def rows(count: int) -> str:
+    return "".join(f"{k * 0.004!r},{k},{-k},{k}.5,1e-3\n" for k in range(count))
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.lists(st.tuples(NUMBER, NUMBER, NUMBER), min_size=1, max_size=40),
+    st.permutations(["t", "q1", "dq1", "tau1"]),
+    st.booleans(),
+    st.sampled_from(["\n", "\r\n"]),
+    st.integers(1, 50),
+)
+def test_numbers_round_trip(tmp_path: Path, values, header, compressed, end, samples) -> None:
+    lines = [",".join(header)]
+    for k, (q, dq, tau) in enumerate(values):
+        fields = {"t": f"1700000000.{k:09d}", "q1": repr(q), "dq1": repr(dq), "tau1": repr(tau)}
+        lines.append(",".join(fields[name] for name in header))
+    data = (end.join(lines) + end).encode()
+    path = tmp_path / "run"
+    path.write_bytes(gzip.compress(data) if compressed else data)
+    recording = open_recording(path, ["only"])
+    block = read_all(recording, samples)
+    assert block.stamp_ns.tolist() == [1_700_000_000_000_000_000 + k for k in range(len(values))]
+    assert np.array_equal(block.position[:, 0], [q for q, _, _ in values])
+    assert block.velocity is not None
+    assert np.array_equal(block.velocity[:, 0], [dq for _, dq, _ in values])
+    assert np.array_equal(block.torque[:, 0], [tau for _, _, tau in values])
+
+
+def test_door(tmp_path: Path) -> None:
+    recording = CsvRecording(write(tmp_path / "run.csv", HEADER + rows(10)))
+    assert (recording.joints, recording.joint_names, recording.torque_held, recording.torn) == (2, (), False, False)
+    assert read_all(recording, 3).velocity is None
+    assert read_all(recording).stamp_ns.tolist() == [k * 4_000_000 for k in range(10)]
+
+
+def test_many_rows_in_small_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(csv_file, "_STEP", 97)
+    recording = CsvRecording(write(tmp_path / "run.csv", HEADER + rows(9000)))
+    assert np.array_equal(read_all(recording, 1000).position[:, 0], np.arange(9000))
+
+
+def test_ends_that_are_no_mistake(tmp_path: Path) -> None:
+    assert len(read_all(CsvRecording(write(tmp_path / "a", HEADER + rows(5) + "\n \n"))).stamp_ns) == 5
+    assert len(read_all(CsvRecording(write(tmp_path / "b", HEADER + rows(5)[:-1]))).stamp_ns) == 5
+    assert len(read_all(CsvRecording(write(tmp_path / "c", "\ufeff" + HEADER + rows(5)))).stamp_ns) == 5
+    assert len(read_all(CsvRecording(write(tmp_path / "d", HEADER))).stamp_ns) == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (rows(7) + "0.028,1,2", "line 9: has 3 fields but the header has 5; the row is torn"),
+        (rows(7) + "0.028,1,2,3,4,5\n", "line 9: has 6 fields"),
+        (rows(7) + "\n" + rows(1), "line 9: is empty"),
+        (rows(2) + "0.008,1,zwei,3,4\n", "line 4: q2 is 'zwei', not a number"),
+        (rows(2) + "0.008,1,1_0,3,4\n", "line 4: q2 is '1_0', not a number"),
+        (rows(2) + "0.008,1,,3,4\n", "line 4: q2 is '', not a number"),
+        (rows(2) + "0.008,1,\u0662,3,4\n", "line 4: q2 is '.*', not a number"),
+        (rows(2) + "0.008,1,nan,3,4\n", r"line 4, 0\.008000 s after the first: position of joint 2 is nan"),
+        (rows(2) + "0.008,1,1,3,-inf\n", r"line 4, 0\.008000 s after the first: torque of joint 2 is -inf"),
+        (rows(2) + "0.004,1,1,3,4\n", "line 4, .* the stamp does not increase"),
+        (rows(2) + "-1,1,1,3,4\n", "line 4, .* the stamp does not increase"),
+        (rows(2) + "nan,1,1,3,4\n", "line 4: time t is nan"),
+        (rows(2) + "1700000000000,1,1,3,4\n", "line 4: time t is 1700000000000; not in seconds"),
+        ("1e-99999999999999999999,1,1,3,4\n", "time t is beyond"),
+    ],
+)
+def test_mistakes_name_their_line(tmp_path: Path, text: str, message: str) -> None:
+    recording = CsvRecording(write(tmp_path / "run.csv", HEADER + text))
+    for samples in (1, 3, 4096):
+        with pytest.raises(RecordingError, match=message):
+            list(recording.blocks(samples))
+
+
+def test_a_header_lists_all_its_problems(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError) as caught:
+        CsvRecording(write(tmp_path / "run.csv", "time,q1,q2,q3,q3,tau1,dq2\n"))
+    for problem in (
+        "column 'q3' appears twice",
+        "unknown column 'time'",
+        "no column 't'",
+        "missing tau2, tau3",
+        "missing dq1, dq3",
+    ):
+        assert problem in str(caught.value)
+    for header in ("", "\n", "t,q9999\n", "t;q1;tau1\n", "t\n", "t,q0,tau0\n"):
+        with pytest.raises(RecordingError):
+            CsvRecording(write(tmp_path / "run.csv", header))
+
+
+def test_other_headers_by_column_map(tmp_path: Path) -> None:
+    path = write(tmp_path / "run.csv", "stamp,current,angle,torque\n0.5,9,1,2\n0.6,9,3,4\n")
+    columns = {"t": "stamp", "q1": "angle", "tau1": "torque"}
+    block = read_all(open_recording(path, ["a"], columns=columns))
+    assert block.position.tolist() == [[1.0], [3.0]]
+    assert block.torque.tolist() == [[2.0], [4.0]]
+    with pytest.raises(RecordingError, match="no column 'moment' for tau1"):
+        open_recording(path, columns={**columns, "tau1": "moment"})
+
+
+def test_number_of_joints(tmp_path: Path) -> None:
+    path = write(tmp_path / "run.csv", HEADER + rows(2))
+    with pytest.raises(RecordingError, match="has 2 joints but the arm has 3"):
+        open_recording(path, ["a", "b", "c"])
+    with pytest.raises(UsageError):
+        CsvRecording(tmp_path / "missing.csv")
+
+
+def test_damaged_gzip(tmp_path: Path) -> None:
+    data = gzip.compress((HEADER + rows(3000)).encode())
+    path = tmp_path / "run.csv.gz"
+    for cut in (len(data) // 2, len(data) - 1, 12, 3):
+        path.write_bytes(data[:cut])
+        with pytest.raises(RecordingError):
+            list(CsvRecording(path).blocks())
+    path.write_bytes(data[:500] + bytes(20) + data[520:])
+    with pytest.raises(RecordingError):
+        list(CsvRecording(path).blocks())
+
+
+def test_gzip_bomb_and_endless_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(csv_file, "_RATIO_FROM", 1 << 20)
+    path = tmp_path / "bomb.csv.gz"
+    path.write_bytes(gzip.compress(HEADER.encode() + b"0,0,0,0,0\n" * 500_000))
+    with pytest.raises(RecordingError, match="refused"):
+        list(CsvRecording(path)._lines())
+    path.write_bytes(bytes([32]) * (3 << 20))
+    with pytest.raises(RecordingError, match="no CSV file"):
+        CsvRecording(path)

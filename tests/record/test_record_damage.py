@@ -1,0 +1,181 @@
+"""What becomes of a recording whose writer was killed, or that was cut off, damaged or made to do harm."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import lz4.frame
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.writer import CompressionType, Writer
+from record_samples import (
+    START_NS,
+    STEP_NS,
+    URDF,
+    position,
+    read_all,
+    write_recording,
+)
+
+from ident_service.errors import RecordingError
+from ident_service.record.cdr import JointStateEncoder
+from ident_service.record.joint_state import JointStateDecoder, PayloadError
+from ident_service.record.mcap_file import McapRecording
+from ident_service.record.messages import JOINT_STATE
+
+ROOT = Path(__file__).parents[2]
+
+
+KILLED = """
+import os, signal, sys, time
+sys.path[:0] = [{here!r}]
+from ident_service.record.writer import RecordingWriter
+from ident_service.record.recorder import Recorder
+from record_samples import JOINTS, URDF, OFFSET_NS, write_samples
+class Counting(RecordingWriter):
+    written = 0
+    def sample(self, *arguments):
+        super().sample(*arguments)
+        self.written += 1
+writer = Counting({path!r}, JOINTS, URDF, OFFSET_NS)
+class Through:
+    joint_names = JOINTS
+    def __init__(self, recorder): self.recorder = recorder
+    def sample(self, *arguments): self.recorder.put(*arguments)
+if {threaded}:
+    recorder = Recorder(writer, lock_step=False)
+    recorder.__enter__()
+    write_samples(Through(recorder), {count})
+    # A recorder that keeps up has at most one batch in hand.
+    while writer.written < {count} - 41: time.sleep(0.001)
+else:
+    writer.__enter__()
+    write_samples(writer, {count})
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.parametrize("threaded", [False, True])
+def test_a_killed_process_loses_less_than_200_ms(tmp_path: Path, threaded: bool) -> None:
+    path, count = tmp_path / "run.mcap", 1237
+    code = KILLED.format(here=str(Path(__file__).parent), path=str(path), threaded=threaded, count=count)
+    killed = subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False, env={**os.environ})
+    assert killed.returncode == -signal.SIGKILL
+    assert not path.exists()
+    recording = McapRecording(tmp_path / "run.mcap.partial")
+    block = read_all(recording)
+    assert recording.torn
+    assert recording.torque_held
+    assert recording.metadata["complete"] == "false"
+    assert np.array_equal(block.position, [position(k, 3) for k in range(len(block.stamp_ns))])
+    assert START_NS + (count - 1) * STEP_NS - block.stamp_ns[-1] <= 200_000_000
+    assert recording.read_extras().robot_description == URDF
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_recording(tmp_path_factory.mktemp("whole") / "run.mcap", 300)
+
+
+def test_torn_at_any_place_a_prefix_is_read(whole: Path, tmp_path: Path) -> None:
+    content = whole.read_bytes()
+    complete = read_all(McapRecording(whole))
+    places = np.random.default_rng(1).integers(0, len(content), 150).tolist()
+    lengths = []
+    for cut in [*places, 0, 8, 9, len(content) - 1, len(content) - 8]:
+        torn = tmp_path / "torn.mcap"
+        torn.write_bytes(content[:cut])
+        try:
+            recording = McapRecording(torn)
+            block = read_all(recording)
+        except RecordingError:
+            continue
+        n = len(block.stamp_ns)
+        assert recording.torn
+        assert np.array_equal(block.stamp_ns, complete.stamp_ns[:n])
+        assert np.array_equal(block.torque, complete.torque[:n])
+        recording.read_extras()
+        lengths.append(n)
+    assert max(lengths) == 300
+    assert min(lengths) < 150
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_damage_never_passes_for_samples(whole: Path, tmp_path: Path, data: st.DataObject) -> None:
+    content = bytearray(whole.read_bytes())
+    place = data.draw(st.integers(0, len(content) - 1))
+    content[place] ^= data.draw(st.integers(1, 255))
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(content)
+    try:
+        recording = McapRecording(damaged)
+        block = read_all(recording)
+        recording.read_extras()
+    except RecordingError:
+        return
+    complete = read_all(McapRecording(whole))
+    n = len(block.stamp_ns)
+    # A flipped digit in the metadata may move the clock, as nothing protects it; the samples themselves are covered.
+    assert np.array_equal(np.diff(block.stamp_ns), np.diff(complete.stamp_ns[:n]))
+    assert np.array_equal(block.position, complete.position[:n])
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+@pytest.mark.parametrize("declared", [1000, 1 << 40])
+def test_bombs_are_not_expanded(tmp_path: Path, compression: str, declared: int) -> None:
+    from mcap.data_stream import RecordBuilder
+    from mcap.records import Chunk
+
+    data = zstandard.compress(bytes(1 << 24)) if compression == "zstd" else lz4.frame.compress(bytes(1 << 24))
+    builder = RecordBuilder()
+    Chunk(compression, data, 0, 0, 0, declared).write(builder)
+    path = tmp_path / "bomb.mcap"
+    path.write_bytes(b"\x89MCAP0\r\n" + builder.end())
+    with pytest.raises(RecordingError, match=r"no message|above the limit"):
+        McapRecording(path)
+
+
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_damage_without_checksums_is_a_recording_error_at_worst(tmp_path: Path, data: st.DataObject) -> None:
+    path = tmp_path / "bag.mcap"
+    encoder = JointStateEncoder(["a", "bc"])
+    with path.open("wb") as stream:
+        writer = Writer(stream, compression=CompressionType.NONE, enable_crcs=False)
+        writer.start(profile="ros2")
+        schema = writer.register_schema(JOINT_STATE, "ros2msg", b"")
+        channel = writer.register_channel("/joint_states", "cdr", schema)
+        for k in range(1, 4):
+            writer.add_message(channel, k, encoder.encode(k, [k, 1], [k, 2], [k, 3]), k)
+        writer.add_metadata("ident", {"utc_offset_ns": "1"})
+        writer.finish()
+    content = bytearray(path.read_bytes())
+    for _ in range(data.draw(st.integers(1, 3))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(content)
+    try:
+        recording = McapRecording(path)
+        recording.read_extras()
+        read_all(recording, 2)
+    except RecordingError:
+        pass
+
+
+@given(st.binary(max_size=120))
+def test_any_payload_is_a_joint_state_or_refused(noise: bytes) -> None:
+    decoder = JointStateDecoder(["a"], others=True, velocity=False)
+    good = JointStateEncoder(["a"]).encode(1, [1.0], None, [2.0])
+    for payload in (noise, b"\x00\x01\x00\x00" + noise, good[: len(noise)], good[:24] + noise):
+        try:
+            block = decoder.decode([good, payload, good], [1, 2, 3])
+        except PayloadError:
+            continue
+        assert len(block.stamp_ns) in (2, 3)
