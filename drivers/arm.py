@@ -107,7 +107,7 @@ class Arm(ABC):
 
         Args:
             torque: to act from this cycle's stamp on [N m or N], shape (joints,); None only looks, and is the
-                only value an arm that is not enabled accepts.
+                only value an arm that is not enabled accepts; on an enabled arm it lets the last torque act on.
 
         Returns:
             The sample of this cycle.
@@ -119,7 +119,7 @@ class Arm(ABC):
 
     @abstractmethod
     def stop(self, kind: StopKind) -> None:
-        """Stop from any state, any number of times; never raises."""
+        """Stop from any state, any number of times; never raises. The torque of the last sample ends with its period."""
 
     @abstractmethod
     def close(self) -> None:

@@ -92,6 +92,7 @@ class SimulatedArm(Arm):
         self._delay_cycles = delay_cycles
         self._noise = np.random.default_rng(seed)
         self._open = self._enabled = False
+        self._supported = True
         self._restart()
 
     def open(self) -> None:
@@ -133,12 +134,14 @@ class SimulatedArm(Arm):
         cycle, faults = self._cycle, active_faults(self.faults, self._cycle)
         self._wait(sum(fault.size for fault in faults if fault.kind is FaultKind.LATE_CYCLE))
         self._cycle += 1
-        if cycle > 0:
+        if cycle > 0 and not self._supported:
             self.plant.step(self._drives.output())
         if any(fault.kind is FaultKind.BUS_GONE for fault in faults):
             raise DriverError(f"cycle {cycle}: no axis answers, the bus is gone")
         position, valid, age = self._feedback.receive(self.imperfections.encode(self.plant.position), faults)
         acting = self._drives.latch(command, faults, self._enabled)
+        if command is not None:
+            self._supported = False
         if self.observer is not None:
             plant = self.plant
             self.observer(Truth(self._stamp_ns, plant.position, plant.velocity, plant.acceleration, acting))

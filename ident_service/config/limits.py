@@ -50,10 +50,15 @@ def motion_limits(config: ArmConfig) -> MotionLimits:
         MotionRefused: the description leaves out something that a safe motion needs; all gaps are named.
     """
     missing = [
-        f"joints.{name}.{key}" for name, joint in config.joints.items() for key in _NEEDED if getattr(joint, key) is None
+        f"joints.{name}.{key}"
+        for name, joint in config.joints.items()
+        for key in _NEEDED
+        if getattr(joint, key) is None
     ]
     if missing or not config.joints:
-        raise MotionRefused(f"{config.name}: a motion needs {', '.join(missing) or 'limits for every joint under joints'}")
+        raise MotionRefused(
+            f"{config.name}: a motion needs {', '.join(missing) or 'limits for every joint under joints'}"
+        )
     joints = list(config.joints.values())
 
     def column(key: str) -> Vector:

@@ -90,7 +90,11 @@ def _where(loc: tuple[int | str, ...], value: Any) -> KeyPath:
 def _disagreements(config: ArmConfig) -> Iterator[tuple[KeyPath, str]]:
     """Mistakes that only show when two sections are held together."""
     names = _joint_names(config.kinematics.dh, config)
-    if config.kinematics.dh is not None and config.joints and tuple(config.joints) != tuple(config.kinematics.dh.joints):
+    if (
+        config.kinematics.dh is not None
+        and config.joints
+        and tuple(config.joints) != tuple(config.kinematics.dh.joints)
+    ):
         yield ("joints",), f"joints: {', '.join(config.joints)} are not those of kinematics.dh: {', '.join(names)}"
     for label, motion in (("identification", config.motions.identification), ("validation", config.motions.validation)):
         if isinstance(motion, FourierMotion) and names and tuple(motion.joints) != names:

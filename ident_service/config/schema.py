@@ -69,7 +69,9 @@ class Box(Section):
     def _ordered(self) -> Box:
         for axis, lower, upper in zip("xyz", self.lower, self.upper, strict=True):
             if not lower < upper:
-                raise ValueError(f"{axis}: lower bound {lower:g} is not below upper bound {upper:g}; check order and units")
+                raise ValueError(
+                    f"{axis}: lower bound {lower:g} is not below upper bound {upper:g}; check order and units"
+                )
         return self
 
 
@@ -96,7 +98,11 @@ class Joint(Section):
 
     @model_validator(mode="after")
     def _home_inside(self) -> Joint:
-        if self.home is not None and self.position is not None and not self.position[0] <= self.home <= self.position[1]:
+        if (
+            self.home is not None
+            and self.position is not None
+            and not self.position[0] <= self.home <= self.position[1]
+        ):
             raise ValueError(f"home {self.home:g} lies outside position [{self.position[0]:g}, {self.position[1]:g}]")
         return self
 

@@ -68,7 +68,11 @@ def read_tree(path: Path, _chain: tuple[Path, ...] = ()) -> Tree:
 
 def _merge(base: Any, over: Any) -> Any:
     # A different kind of thing (another driver, another motion) replaces the old one instead of inheriting its keys.
-    if not isinstance(base, dict) or not isinstance(over, dict) or ("kind" in over and over["kind"] != base.get("kind")):
+    if (
+        not isinstance(base, dict)
+        or not isinstance(over, dict)
+        or ("kind" in over and over["kind"] != base.get("kind"))
+    ):
         return over
     return base | {key: _merge(base[key], value) if key in base else value for key, value in over.items()}
 
@@ -152,5 +156,7 @@ def _scalar(node: yaml.ScalarNode, path: Path, problems: list[Problem]) -> Any:
     if text.lower() in constants:
         return constants[text.lower()]
     if not node.tag.startswith("tag:yaml.org,2002:"):
-        problems.append(Problem(path, node.start_mark.line + 1, node.start_mark.column + 1, f"tag {node.tag!r} is refused"))
+        problems.append(
+            Problem(path, node.start_mark.line + 1, node.start_mark.column + 1, f"tag {node.tag!r} is refused")
+        )
     return LocatedStr(text, path.parent)

@@ -91,7 +91,9 @@ class ConicProblem:
         if result.status != clarabel.SolverStatus.Solved:
             raise SolverError(name, str(result.status))
         ends = np.cumsum([len(f) for f in self._offsets])[:-1]
-        duals = tuple(dual / scale for dual, scale in zip(np.split(np.array(result.z), ends), self._scales, strict=True))
+        duals = tuple(
+            dual / scale for dual, scale in zip(np.split(np.array(result.z), ends), self._scales, strict=True)
+        )
         return Solution(np.array(result.x), duals, float(result.obj_val), result.iterations, result.solve_time)
 
 

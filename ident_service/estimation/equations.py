@@ -79,7 +79,8 @@ def equations(recording: Recording, model: ArmModel, base: BaseParameters) -> Eq
     still = [name for name, rows in zip(model.chain.names, result.total.rows, strict=True) if rows == 0]
     if still:
         raise RecordingError(
-            recording.path, f"{', '.join(still)}: never faster than identification.reversal.speed, nothing to identify from"
+            recording.path,
+            f"{', '.join(still)}: never faster than identification.reversal.speed, nothing to identify from",
         )
     return result
 

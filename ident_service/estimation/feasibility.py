@@ -6,18 +6,20 @@ second-order cones: the Schur complements of eqs. 54 and 73 say the same with ma
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ident_service.errors import ParameterError
-from ident_service.estimation.conic import ConicProblem, Solution
+from ident_service.estimation.conic import ConicProblem
 from ident_service.estimation.feasible_set import Block, FeasibleSet
 from ident_service.estimation.least_squares import LeastSquares
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 
 EPSILON = 1e-6  # eq. 21, the paper's margin
+_MULTIPLIER = 1e-6  # smaller ones are the interior-point method's own distance from the boundary
 _LARGEST_MARGIN = 1e3  # where nothing in the table bounds the margin, any larger one says no more
 
 
@@ -47,6 +49,7 @@ class FeasibleEstimate:
         delta: link parameters with K delta = beta, shape (parameters,).
         objective: what was minimised (a distance in the space of beta, or a residual norm).
         margin: smallest eigenvalue of all blocks at delta.
+        tight: names of the blocks that keep the objective from being smaller, the most decisive first.
         iterations: of the solver.
         solver_seconds: inside the solver.
     """
@@ -55,6 +58,7 @@ class FeasibleEstimate:
     delta: Array
     objective: float
     margin: float
+    tight: tuple[str, ...]
     iterations: int
     solver_seconds: float
 
@@ -99,7 +103,7 @@ def feasibility_test(beta: Array, base: BaseParameters, conditions: FeasibleSet)
     solution = problem.minimise(np.append(np.zeros(dependents), -1.0), "feasibility test")
     delta = lift.delta(beta, solution.x[:dependents])
     margin, _ = conditions.margin(delta)
-    return FeasibilityTest(margin > 0.0, margin, delta, _tight(conditions, solution))
+    return FeasibilityTest(margin > 0.0, margin, delta, _tight(conditions, solution.duals))
 
 
 def feasibility_correction(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> FeasibleEstimate:
@@ -146,7 +150,13 @@ def _nearest(
     delta = lift.delta(beta, solution.x[n:-1])
     margin, _ = conditions.margin(delta)
     return FeasibleEstimate(
-        beta, delta, float(np.linalg.norm(metric @ beta - target)), margin, solution.iterations, solution.seconds
+        beta=beta,
+        delta=delta,
+        objective=float(np.linalg.norm(metric @ beta - target)),
+        margin=margin,
+        tight=_tight(conditions, solution.duals[1:]),
+        iterations=solution.iterations,
+        solver_seconds=solution.seconds,
     )
 
 
@@ -157,11 +167,12 @@ def _constrain(problem: ConicProblem, block: Block, F: Array, f: Array) -> None:
     problem.semidefinite(F, f, block.size)
 
 
-def _tight(conditions: FeasibleSet, solution: Solution) -> tuple[str, ...]:
-    weights = [float(np.abs(dual).max()) for dual in solution.duals[: len(conditions.blocks)]]
-    largest = max(weights)
-    order = np.argsort(weights)[::-1]
-    return tuple(conditions.blocks[i].name for i in order if weights[i] > 1e-3 * largest)
+def _tight(conditions: FeasibleSet, duals: Sequence[Array]) -> tuple[str, ...]:
+    """Blocks with a multiplier that counts: relaxing them would let the optimum improve."""
+    weights = [float(np.abs(dual).max()) for dual in duals[: len(conditions.blocks)]]
+    order = sorted(range(len(weights)), key=lambda i: -weights[i])
+    floor = max(_MULTIPLIER, 1e-3 * max(weights))
+    return tuple(conditions.blocks[i].name for i in order if weights[i] > floor)
 
 
 def _check(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> None:

@@ -152,9 +152,13 @@ def _masses(config: ArmConfig, links: Sequence[int], index: dict[str, int]) -> l
             blocks.append(_linear(f"link {link}: mass within {lower:g}..{upper:g} kg", rows, index))
     total = config.constraints.total_mass
     if total.lower > 0.0:
-        blocks.append(_linear(f"total mass at least {total.lower:g} kg", [({f"m{k}": 1.0 for k in links}, -total.lower)], index))
+        blocks.append(
+            _linear(f"total mass at least {total.lower:g} kg", [({f"m{k}": 1.0 for k in links}, -total.lower)], index)
+        )
     if total.upper is not None:
-        blocks.append(_linear(f"total mass at most {total.upper:g} kg", [({f"m{k}": -1.0 for k in links}, total.upper)], index))
+        blocks.append(
+            _linear(f"total mass at most {total.upper:g} kg", [({f"m{k}": -1.0 for k in links}, total.upper)], index)
+        )
     return blocks
 
 

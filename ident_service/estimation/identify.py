@@ -157,14 +157,16 @@ def identify(
     candidates = (
         candidate("OLS", fit.beta, test.margin),
         candidate("BPFC", corrected.beta, corrected.margin),
-        candidate("FBPE-OLS inertia", constrained["inertia"].beta, _margin(constrained["inertia"].beta, base, conditions)),
+        candidate(
+            "FBPE-OLS inertia", constrained["inertia"].beta, _margin(constrained["inertia"].beta, base, conditions)
+        ),
         candidate("FBPE-OLS pseudo_inertia", constrained["pseudo_inertia"].beta, constrained["pseudo_inertia"].margin),
     )
     free = set_name == "none"
     chosen = 0 if free else ("inertia", "pseudo_inertia").index(kind) + 2
     beta = candidates[chosen].beta
     delta: Array | None = constrained[kind].delta
-    margin, tight = constrained[kind].margin, _pressed(constrained[kind].delta, conditions)
+    margin, tight = constrained[kind].margin, constrained[kind].tight
     if free:
         delta, margin, tight = _of_test(test)
     return Estimate(
@@ -195,8 +197,3 @@ def _margin(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> float
 
 def _of_test(test: FeasibilityTest) -> tuple[Array | None, float, tuple[str, ...]]:
     return (test.delta, test.margin, ()) if test.feasible else (None, test.margin, test.tight)
-
-
-def _pressed(delta: Array, conditions: FeasibleSet) -> tuple[str, ...]:
-    """Blocks at which a constrained estimate sits: within ten times the inset of their boundary."""
-    return tuple(block.name for block in conditions.blocks if block.smallest(delta) < 1e-5)

@@ -80,7 +80,8 @@ def smoothed(recording: Recording, options: Identification) -> Iterator[Motion]:
     if count * period < 2.0 * options.edge + 1.0 or count < 2 * margin:
         shortest = max(2.0 * options.edge + 1.0, 2 * margin * period)
         raise RecordingError(
-            recording.path, f"{count * period:.3g} s of samples are too few to smooth; at least {shortest:.3g} s are needed"
+            recording.path,
+            f"{count * period:.3g} s of samples are too few to smooth; at least {shortest:.3g} s are needed",
         )
 
 
@@ -139,7 +140,8 @@ def _smooth(window: Block, options: Identification, sos: Array, period: float, h
     near[1:] |= np.diff(np.signbit(velocity), axis=0)
     reach = int(round(options.reversal.window / period))
     keep = ~scipy.ndimage.binary_dilation(near, np.ones((2 * reach + 1, 1), dtype=bool)) if reach else ~near
-    return Motion(np.arange(length) * period, position, velocity, acceleration, torque, keep)
+    time = np.arange(length, dtype=np.float64) * period
+    return Motion(time, position, velocity, acceleration, torque, keep)
 
 
 def _differenced(values: Array, period: float) -> Array:

@@ -59,7 +59,8 @@ class BaseParameters:
     def expressions(self) -> tuple[str, ...]:
         """Each base parameter as a sum of link parameters (table 3)."""
         return tuple(
-            format_expression([(float(row[column]), self.names[column]) for column in np.flatnonzero(row)]) for row in self.K
+            format_expression([(float(row[column]), self.names[column]) for column in np.flatnonzero(row)])
+            for row in self.K
         )
 
 
@@ -110,7 +111,9 @@ def base_from_expressions(expressions: tuple[str, ...], names: tuple[str, ...]) 
     _, R, order = scipy.linalg.qr(K.T, mode="economic", pivoting=True)
     rank = int(np.sum(np.abs(np.diag(R)) > _RANK_TOLERANCE * max(1.0, abs(R[0, 0]))))
     if rank < len(expressions):
-        raise ParameterError(f"expression {int(order[rank]) + 1} is a combination of the others: {expressions[order[rank]]!r}")
+        raise ParameterError(
+            f"expression {int(order[rank]) + 1} is a combination of the others: {expressions[order[rank]]!r}"
+        )
     base = _independent_columns(K)
     return BaseParameters(names, K, base, ("",) * len(expressions))
 

@@ -51,7 +51,14 @@ class Chain:
         for k, parent in enumerate(self.parents):
             if not WORLD <= parent < k:
                 raise ModelError(f"joint {k} has parent {parent}; parents must come first")
-        for array in (self.axes, self.rotation, self.translation, self.link_rotation, self.link_translation, self.gravity):
+        for array in (
+            self.axes,
+            self.rotation,
+            self.translation,
+            self.link_rotation,
+            self.link_translation,
+            self.gravity,
+        ):
             array.setflags(write=False)
 
     @property

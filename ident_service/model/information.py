@@ -48,7 +48,9 @@ class Information:
             ModelError: the two belong to different models.
         """
         if self.base != other.base or self.joints != other.joints:
-            raise ModelError(f"{self.base} base parameters of {self.joints} joints against {other.base} of {other.joints}")
+            raise ModelError(
+                f"{self.base} base parameters of {self.joints} joints against {other.base} of {other.joints}"
+            )
         factors = tuple(triangle(np.vstack(pair)) for pair in zip(self.factors, other.factors, strict=True))
         return Information(self.supports, factors, self.rows + other.rows, self.base)
 

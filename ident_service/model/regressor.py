@@ -104,7 +104,10 @@ class _Forward:
             # Acceleration of the joint frame's origin carried along by the parent, then everything in the joint frame.
             a = _add(a, _add(_cross(e, arm), _cross(w, _cross(w, arm))))
             screws = {
-                i: (None if u is None else _rotate(rotation, u), _rotate(rotation, v if u is None else _add(v, _cross(u, arm))))
+                i: (
+                    None if u is None else _rotate(rotation, u),
+                    _rotate(rotation, v if u is None else _add(v, _cross(u, arm))),
+                )
                 for i, (u, v) in ({} if parent == WORLD else joint_screws[parent]).items()
             }
             w, e, a = _rotate(rotation, w), _rotate(rotation, e), _rotate(rotation, a)
@@ -123,7 +126,13 @@ class _Forward:
             self._to_link(chain, k, w, e, a, screws)
 
     def _to_link(
-        self, chain: Chain, k: int, w: _Vectors, e: _Vectors, a: _Vectors, screws: dict[int, tuple[_Vectors | None, _Vectors]]
+        self,
+        chain: Chain,
+        k: int,
+        w: _Vectors,
+        e: _Vectors,
+        a: _Vectors,
+        screws: dict[int, tuple[_Vectors | None, _Vectors]],
     ) -> None:
         offset, rotation = chain.link_translation[k], chain.link_rotation[k].T
         if offset.any():
@@ -132,7 +141,9 @@ class _Forward:
             screws = {i: (u, v if u is None else _add(v, _cross(u, arm))) for i, (u, v) in screws.items()}
         if not np.array_equal(rotation, np.eye(3)):
             w, e, a = _rotate(rotation, w), _rotate(rotation, e), _rotate(rotation, a)
-            screws = {i: (None if u is None else _rotate(rotation, u), _rotate(rotation, v)) for i, (u, v) in screws.items()}
+            screws = {
+                i: (None if u is None else _rotate(rotation, u), _rotate(rotation, v)) for i, (u, v) in screws.items()
+            }
         self.motion.append((w, e, a))
         self.screws.append(screws)
 

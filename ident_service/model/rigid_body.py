@@ -72,7 +72,9 @@ def _chain(model: pin.Model, gravity: tuple[float, float, float], name: str) -> 
     for k in range(1, n + 1):
         kind = model.joints[k].shortname()
         if not kind.startswith(_SUPPORTED) or kind in _UNSUPPORTED:
-            raise ModelError(f"{name}: joint {model.names[k]!r} is a {kind}; only revolute and prismatic joints are supported")
+            raise ModelError(
+                f"{name}: joint {model.names[k]!r} is a {kind}; only revolute and prismatic joints are supported"
+            )
         screw = np.asarray(data.joints[k].S).reshape(6)
         turns = bool(np.any(screw[3:]))
         revolute.append(turns)
@@ -121,9 +123,7 @@ def joint_frame_inertias(chain: Chain, layout: Layout, delta: Array) -> list[pin
     Raises:
         ModelError: a link without positive mass.
     """
-    return [
-        inertia_from_delta(delta[layout.inertial(k)]).se3Action(link_frame(chain, k)) for k in range(chain.joints)
-    ]
+    return [inertia_from_delta(delta[layout.inertial(k)]).se3Action(link_frame(chain, k)) for k in range(chain.joints)]
 
 
 def pinocchio_model(chain: Chain, layout: Layout, delta: Array) -> pin.Model:

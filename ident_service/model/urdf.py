@@ -47,7 +47,9 @@ def urdf_text(model: ArmModel, delta: Array | None) -> str:
         parent = chain.parents[k]
         ET.SubElement(joint, "parent", link=BASE_LINK if parent == WORLD else _link_name(model, parent))
         ET.SubElement(joint, "child", link=_link_name(model, k))
-        ET.SubElement(joint, "origin", xyz=_numbers(chain.translation[k]), rpy=_numbers(_roll_pitch_yaw(chain.rotation[k])))
+        ET.SubElement(
+            joint, "origin", xyz=_numbers(chain.translation[k]), rpy=_numbers(_roll_pitch_yaw(chain.rotation[k]))
+        )
         ET.SubElement(joint, "axis", xyz=_numbers(chain.axes[k]))
         if bounded:
             lower, upper = settings.position or (-1.0, 1.0)
@@ -91,7 +93,5 @@ def _roll_pitch_yaw(rotation: Array) -> Array:
     flat = float(np.hypot(rotation[0, 0], rotation[1, 0]))
     pitch = np.arctan2(-rotation[2, 0], flat)
     if flat > 1e-12:
-        return np.array(
-            [np.arctan2(rotation[2, 1], rotation[2, 2]), pitch, np.arctan2(rotation[1, 0], rotation[0, 0])]
-        )
+        return np.array([np.arctan2(rotation[2, 1], rotation[2, 2]), pitch, np.arctan2(rotation[1, 0], rotation[0, 0])])
     return np.array([np.arctan2(-rotation[1, 2], rotation[1, 1]), pitch, 0.0])

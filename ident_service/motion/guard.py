@@ -128,10 +128,14 @@ class Guard:
         """
         limit = self._limits.torque
         if not np.isfinite(wanted).all():
-            return np.zeros_like(limit), self._fault("torque_not_finite", ~np.isfinite(wanted), "torque is not a number")
+            return np.zeros_like(limit), self._fault(
+                "torque_not_finite", ~np.isfinite(wanted), "torque is not a number"
+            )
         size = np.abs(wanted)
         if (absurd := size > ABSURD * limit).any():
-            return np.zeros_like(limit), self._fault("torque_absurd", absurd, f"more than {ABSURD:g} times the torque limit")
+            return np.zeros_like(limit), self._fault(
+                "torque_absurd", absurd, f"more than {ABSURD:g} times the torque limit"
+            )
         if (over := size > limit).any():
             return np.clip(wanted, -limit, limit), self._fault("torque_saturated", over, "limited to the torque limit")
         return wanted, None

@@ -118,7 +118,10 @@ def parameters_document(estimate: Estimate) -> dict[str, Any]:
             "feasible": estimate.feasible,
             "margin": estimate.margin,
             "tight": list(estimate.tight),
-            "certificate": {"kind": "witness" if estimate.delta is not None else "none", "set": estimate.conditions.kind},
+            "certificate": {
+                "kind": "witness" if estimate.delta is not None else "none",
+                "set": estimate.conditions.kind,
+            },
         },
         "fit": {
             "samples": estimate.samples,
@@ -126,7 +129,8 @@ def parameters_document(estimate: Estimate) -> dict[str, Any]:
             **_errors(own.identification, model.chain.names),
         },
         "validation": [
-            {"recording": s.recording, "sha256": s.sha256, **_errors(s.error, model.chain.names)} for s in own.validation
+            {"recording": s.recording, "sha256": s.sha256, **_errors(s.error, model.chain.names)}
+            for s in own.validation
         ],
         "provenance": {
             "recordings": [{"name": name, "sha256": digest} for name, digest in estimate.recordings],
@@ -187,7 +191,8 @@ def _errors(error: TorqueError, names: tuple[str, ...]) -> dict[str, Any]:
     return {
         "relative_error_percent": error.relative_percent,
         "per_joint": [
-            {"joint": name, "relative_error_percent": float(relative), "rms": float(rms)} for name, relative, rms in rows
+            {"joint": name, "relative_error_percent": float(relative), "rms": float(rms)}
+            for name, relative, rms in rows
         ],
     }
 

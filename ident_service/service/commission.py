@@ -1,0 +1,153 @@
+"""The whole job: move the arm twice, identify from one motion, validate on the other, keep everything in one folder."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from drivers.arm import Arm
+from drivers.clock import Clock
+from ident_service.config.schema import ArmConfig
+from ident_service.errors import UsageError
+from ident_service.estimation.equations import equations
+from ident_service.estimation.feasible_set import SetName
+from ident_service.estimation.identify import Estimate, identify
+from ident_service.excitation.fourier import Excitation
+from ident_service.excitation.plan import excitation
+from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.model.urdf import urdf_text
+from ident_service.motion.factory import make_arm
+from ident_service.motion.run import RunReport, run
+from ident_service.record.open import open_recording
+from ident_service.record.recorder import Recorder
+from ident_service.record.writer import RecordingWriter
+from ident_service.results.files import appearing_folder, write_atomically
+from ident_service.results.run_folder import write_manifest, write_results
+from ident_service.service.score import Score, score, true_parameters
+from sim_backend.arm import SimulatedArm, Truth
+
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Commissioning:
+    """What came out of the whole job.
+
+    Attributes:
+        folder: where everything is.
+        estimate: what was identified.
+        runs: how the two motions went.
+        score: against the truth.
+    """
+
+    folder: Path
+    estimate: Estimate
+    runs: tuple[RunReport, RunReport]
+    score: Score
+
+
+def record_motion(
+    arm: Arm,
+    model: ArmModel,
+    motion: Excitation,
+    path: Path,
+    stop_requested: Callable[[], bool] = lambda: False,
+) -> RunReport:
+    """Run one motion on an arm and record it.
+
+    Args:
+        arm: not yet open.
+        model: of the arm.
+        motion: to run.
+        path: of the MCAP file; it must not exist.
+        stop_requested: asked every cycle.
+
+    Raises:
+        MotionRefused, ArmFault, DriverError: from the motion; what was recorded until then is kept.
+        RecordingError: the file cannot be written.
+    """
+    attachments = {
+        "arm.json": model.config.model_dump_json(indent=1).encode(),
+        "excitation.json": motion.to_json().encode(),
+    }
+    metadata = {"arm": model.config.name, "arm_sha256": model.config.sha256, "motion": motion.name}
+    description = urdf_text(model, model.prior)
+    writer = RecordingWriter(path, model.chain.names, description, arm.clock.utc_offset_ns, attachments, metadata)
+    with arm, Recorder(writer, lock_step=arm.clock.lock_step) as recorder:
+        return run(arm, model, motion, recorder, stop_requested)
+
+
+def simulate(
+    config: ArmConfig,
+    folder: Path,
+    *,
+    set_name: SetName | None = None,
+    clock: Clock | None = None,
+    tell: Tell = lambda _: None,
+    stop_requested: Callable[[], bool] = lambda: False,
+) -> Commissioning:
+    """Commission the simulated arm of a configuration and score the result against its truth.
+
+    Args:
+        config: with a simulated driver.
+        folder: the run folder; it appears when everything is in it, and must not exist.
+        set_name: feasible set, the configuration's when None.
+        clock: the loop's, what the driver section asks for when None.
+        tell: called with a line at each step.
+        stop_requested: asked every cycle.
+
+    Raises:
+        UsageError: the folder exists, or the arm is not simulated.
+        IdentError: anything the steps raise; no folder is left behind.
+    """
+    if folder.exists():
+        raise UsageError(f"{folder}: exists already; give a folder that does not")
+    model = arm_model(config)
+    truth = true_parameters(config, model)
+    if truth is None:
+        raise UsageError(f"{config.name} has no simulated driver; use a description that has one")
+    motions = [excitation(model, "identification"), excitation(model, "validation")]
+    reports, observed = [], list[Truth]()
+    with appearing_folder(folder) as staging:
+        paths = [staging / f"{motion.name}.mcap" for motion in motions]
+        for motion, path in zip(motions, paths, strict=True):
+            tell(f"{motion.name} motion: {motion.duration:g} s at {config.control.rate:g} Hz")
+            observed = []
+            arm = make_arm(config, clock)
+            if isinstance(arm, SimulatedArm):
+                arm.observer = observed.append
+            reports.append(record_motion(arm, model, motion, path, stop_requested))
+            write_atomically(staging / f"{motion.name}.excitation.json", motion.to_json() + "\n")
+        tell("identifying")
+        recordings = [open_recording(path, model.chain.names) for path in paths]
+        estimate = identify(model, recordings[:1], recordings[1:], set_name=set_name)
+        scored = score(estimate, truth, observed, equations(recordings[1], model, estimate.base))
+        write_results(staging, estimate)
+        write_atomically(staging / "arm.json", config.model_dump_json(indent=1) + "\n")
+        write_atomically(staging / "score.json", json.dumps(score_document(scored), indent=1) + "\n")
+        write_manifest(staging)
+    return Commissioning(folder, estimate, (reports[0], reports[1]), scored)
+
+
+def score_document(scored: Score) -> dict[str, object]:
+    """A score as JSON values."""
+    return {
+        "worst_identified_sigma": scored.worst_identified,
+        "worst_identified_parameter": scored.worst_expression,
+        "noise_free_torque_error_percent": scored.noise_free_percent,
+        "validation_residual_ratio": scored.residual_ratio,
+        "deviations_sigma": scored.deviations.tolist(),
+    }
+
+
+def new_run_folder(state: Path, arm: str) -> Path:
+    """A folder name under the state folder that no earlier run has."""
+    stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+    folder, count = state / "runs" / f"{stamp}-{arm}", 1
+    while folder.exists():
+        count += 1
+        folder = state / "runs" / f"{stamp}-{arm}-{count}"
+    return folder

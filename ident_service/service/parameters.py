@@ -1,0 +1,96 @@
+"""Feasibility test and correction of parameter files, with or without an arm."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+
+from ident_service.config.load import load_arm
+from ident_service.config.schema import FeasibleSetName
+from ident_service.errors import ParameterError
+from ident_service.estimation.feasibility import (
+    FeasibilityTest,
+    FeasibleEstimate,
+    feasibility_correction,
+    feasibility_test,
+)
+from ident_service.estimation.feasible_set import FeasibleSet, feasible_set
+from ident_service.model.arm_model import arm_model
+from ident_service.results.parameter_file import ParameterFile, read_parameters, write_parameters
+
+
+@dataclass(frozen=True)
+class CheckedFile:
+    """A parameter file against a feasible set."""
+
+    kind: FeasibleSetName
+    result: FeasibilityTest
+
+
+@dataclass(frozen=True)
+class CorrectedFile:
+    """The nearest feasible parameters to a file's."""
+
+    kind: FeasibleSetName
+    result: FeasibleEstimate
+
+
+def check_file(path: Path, kind: FeasibleSetName | None = None, arm: str | None = None) -> CheckedFile:
+    """Feasibility test of a parameter file (BPFT, eq. 51).
+
+    Args:
+        path: the file.
+        kind: feasible set; the file's own when None, or else `pseudo_inertia`.
+        arm: a description whose physical constraints are added.
+
+    Raises:
+        UsageError, ConfigError, ParameterError: the file or the arm cannot be used.
+        SolverError: the solver stopped without an optimum.
+    """
+    file, conditions = _read(path, kind, arm)
+    return CheckedFile(conditions.kind, feasibility_test(file.values, file.base, conditions))
+
+
+def correct_file(path: Path, out: Path, kind: FeasibleSetName | None = None, arm: str | None = None) -> CorrectedFile:
+    """Write the nearest feasible parameters of a file (BPFC, eq. 55) into another; everything else stays as it was.
+
+    What no longer holds for the new values is left out: covariances, verdicts, fit and validation.
+
+    Raises:
+        UsageError, ConfigError, ParameterError: the file or the arm cannot be used, or `out` not written.
+        SolverError: the solver stopped without an optimum.
+    """
+    file, conditions = _read(path, kind, arm)
+    result = feasibility_correction(file.values, file.base, conditions)
+    content = deepcopy(file.content)
+    for stale in ("fit", "validation"):
+        content.pop(stale, None)
+    table = content["base_parameters"]
+    for stale in ("standard_deviations", "white_standard_deviations", "covariance", "verdicts"):
+        table.pop(stale, None)
+    table["values"] = result.beta.tolist()
+    content["method"] = "correction"
+    content["feasible_set"] = conditions.kind
+    content["link_parameters"] = {"names": list(file.base.names), "values": result.delta.tolist()}
+    content["feasibility"] = {
+        "feasible": result.margin > 0.0,
+        "margin": result.margin,
+        "certificate": {"kind": "witness", "set": conditions.kind},
+    }
+    write_parameters(out, content)
+    return CorrectedFile(conditions.kind, result)
+
+
+def _read(path: Path, kind: FeasibleSetName | None, arm: str | None) -> tuple[ParameterFile, FeasibleSet]:
+    config, names = None, None
+    if arm is not None:
+        model = arm_model(load_arm(arm))
+        config, names = model.config, model.layout.names
+    file = read_parameters(path, names)
+    if config is not None and (claimed := file.content.get("arm")) is not None and claimed["name"] != config.name:
+        joints = list(model.chain.names)
+        if claimed["joints"] != joints:
+            raise ParameterError(f"{path}: is about the arm {claimed['name']} with other joints than {config.name}")
+    claimed_set: FeasibleSetName = "inertia" if file.feasible_set == "inertia" else "pseudo_inertia"
+    return file, feasible_set(kind or claimed_set, file.base.names, config)
