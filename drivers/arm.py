@@ -119,7 +119,10 @@ class Arm(ABC):
 
     @abstractmethod
     def stop(self, kind: StopKind) -> None:
-        """Stop from any state, any number of times; never raises. The torque of the last sample ends with its period."""
+        """Stop from any state, any number of times; never raises.
+
+        The torque of the last sample ends with its period.
+        """
 
     @abstractmethod
     def close(self) -> None:

@@ -163,7 +163,7 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
         "score against the truth, which the estimate never saw",
         f"  predicted torque against noise-free torque (validation): {scored.noise_free_percent:.3f} %",
         f"  validation residual over what the true parameters leave: {scored.residual_ratio:.4f}",
-        f"  worst identified parameter: {scored.worst_identified:.2f} standard deviations off ({scored.worst_expression})",
+        f"  worst identified parameter: {scored.worst_identified:.2f} deviations off, {scored.worst_expression}",
         "",
         f"files: {result.folder}",
         *(f"  {path.name}" for path in sorted(result.folder.iterdir())),
@@ -263,7 +263,7 @@ def _config_check(arguments: argparse.Namespace) -> Answer:
     from ident_service.model.arm_model import arm_model
 
     model = arm_model(load_arm(arguments.file))
-    text = f"{arguments.file}: {model.config.name}, {model.chain.joints} joints, {model.layout.size} link parameters: good\n"
+    text = f"{arguments.file}: {model.config.name}, {model.chain.joints} joints, {model.layout.size} parameters: good\n"
     return DONE, text, {"file": arguments.file, "arm": model.config.name, "sha256": model.config.sha256, "problems": []}
 
 

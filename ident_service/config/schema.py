@@ -238,7 +238,7 @@ class ArmConfig(Section):
     kinematics: Kinematics
     gravity: Vector3 = (0.0, 0.0, -9.81)
     terms: tuple[JointTerm, ...] = ("drive_inertia", "viscous", "coulomb", "offset")
-    joints: dict[str, Joint] = {}
+    joints: dict[str, Joint] = Field(default_factory=dict)
     constraints: Constraints = Constraints()
     prior: ParameterTable | None = None
     feasible_set: FeasibleSetName = "pseudo_inertia"

@@ -18,7 +18,7 @@ from ident_service.model.chain import Array
 
 Verdict = Literal["identified", "weak", "unidentified"]
 
-# Below a reference, a parameter is as good as zero, and its share of itself says nothing. Rounded from arms of table size.
+# Below a reference a parameter is as good as zero, and its share of itself says nothing; from arms of table size.
 REFERENCE = {"kg m^2": 0.01, "kg m": 0.01, "kg": 0.1, "N m s/rad": 0.1, "N m": 0.1, "N s/m": 0.1, "N": 0.1}
 IDENTIFIED_BELOW = 0.10
 WEAK_BELOW = 0.50

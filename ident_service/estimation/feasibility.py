@@ -80,7 +80,7 @@ class _Lift:
 
 
 def feasibility_test(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> FeasibilityTest:
-    """Could a real body have these base parameters? (BPFT, eq. 51, as a largest margin)
+    """Could a real body have these base parameters? (BPFT, eq. 51, as a largest margin).
 
     Args:
         beta: base parameters in SI units, shape (base,).

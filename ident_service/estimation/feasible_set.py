@@ -105,7 +105,7 @@ def _matrix_block(name: str, rows: list[list[dict[str, float]]], index: dict[str
 
 def _inertia(link: int, index: dict[str, int]) -> Block:
     xx, xy, xz, yy, yz, zz, lx, ly, lz, m = ({f"{symbol}{link}": 1.0} for symbol in INERTIAL)
-    neg = {key: {name: -1.0 for name in value} for key, value in (("x", lx), ("y", ly), ("z", lz))}
+    neg = {key: dict.fromkeys(value, -1.0) for key, value in (("x", lx), ("y", ly), ("z", lz))}
     o: dict[str, float] = {}
     rows = [
         [xx, xy, xz, o, neg["z"], ly],

@@ -86,7 +86,7 @@ def smoothed(recording: Recording, options: Identification) -> Iterator[Motion]:
 
 
 def _windows(recording: Recording, margin: int, period: float) -> Iterator[tuple[Block, int, int, int, bool]]:
-    """Windows with `margin` samples of overlap on both sides: block, inner start and stop, index of its first sample."""
+    """Windows with `margin` samples of overlap: block, inner start and stop, its first sample's index, whether last."""
     held: list[Block] = []
     length, begin, left = 0, 0, 0
     for block in _checked(recording, period):
@@ -113,7 +113,8 @@ def _checked(recording: Recording, period: float) -> Iterator[Block]:
             worst = int(np.abs(steps - period).argmax())
             raise RecordingError(
                 recording.path,
-                f"irregular stamps: {steps[worst] * 1e3:.3f} ms after sample {index + worst} where {period * 1e3:.3f} ms are usual",
+                f"irregular stamps: {steps[worst] * 1e3:.3f} ms at sample {index + worst}, "
+                f"where {period * 1e3:.3f} ms are usual; resample the recording to a fixed rate",
             )
         index += len(block.stamp_ns)
         last = int(block.stamp_ns[-1])
@@ -138,7 +139,7 @@ def _smooth(window: Block, options: Identification, sos: Array, period: float, h
         torque = low_pass(torque)
     near = np.abs(velocity) <= options.reversal.speed
     near[1:] |= np.diff(np.signbit(velocity), axis=0)
-    reach = int(round(options.reversal.window / period))
+    reach = round(options.reversal.window / period)
     keep = ~scipy.ndimage.binary_dilation(near, np.ones((2 * reach + 1, 1), dtype=bool)) if reach else ~near
     time = np.arange(length, dtype=np.float64) * period
     return Motion(time, position, velocity, acceleration, torque, keep)

@@ -62,6 +62,6 @@ def _seeded(motion: SeededMotion, model: ArmModel, limits: MotionLimits) -> Four
             return series
         series = series.scaled(0.8)
     raise MotionRefused(
-        f"{model.config.name}: gravity alone asks for more than {motion.use:.0%} of a torque limit around the middle of the "
-        "position limits; give a Fourier motion of your own under motions"
+        f"{model.config.name}: gravity alone asks for more than {motion.use:.0%} of a torque limit around the middle "
+        "of the position limits; give a Fourier motion of your own under motions"
     )

@@ -85,17 +85,17 @@ class _Parser:
     def __init__(self, text: str) -> None:
         self._text = text
         self._position = 0
-        self._kind, self._token = "", ""
+        self._kind, self._word = "", ""
         self._next()
 
     def _next(self) -> None:
         if not self._text[self._position :].strip():
-            self._kind, self._token = "end", ""
+            self._kind, self._word = "end", ""
             return
         match = _TOKEN.match(self._text, self._position)
         if match is None:
             raise self._error("unexpected character")
-        self._kind, self._token = str(match.lastgroup), match.group(match.lastgroup or 0)
+        self._kind, self._word = str(match.lastgroup), match.group(match.lastgroup or 0)
         self._position = match.end()
 
     def _error(self, what: str) -> ParameterError:
@@ -103,7 +103,7 @@ class _Parser:
 
     def expect_end(self) -> None:
         if self._kind != "end":
-            raise self._error(f"unexpected {self._token!r}")
+            raise self._error(f"unexpected {self._word!r}")
 
     def sum(self, depth: int) -> dict[str, float]:
         if depth > MAX_DEPTH:
@@ -113,13 +113,13 @@ class _Parser:
         while True:
             for name, coefficient in self._term(depth).items():
                 total[name] = total.get(name, 0.0) + sign * coefficient
-            if self._token not in ("+", "-"):
+            if self._word not in ("+", "-"):
                 return {name: coefficient for name, coefficient in total.items() if coefficient != 0.0}
             sign = self._sign(optional=False)
 
     def _sign(self, *, optional: bool) -> float:
-        if self._token in ("+", "-"):
-            sign = -1.0 if self._token == "-" else 1.0
+        if self._word in ("+", "-"):
+            sign = -1.0 if self._word == "-" else 1.0
             self._next()
             return sign
         if not optional:
@@ -129,19 +129,19 @@ class _Parser:
     def _term(self, depth: int) -> Mapping[str, float]:
         factor = 1.0
         if self._kind == "number":
-            factor = float(self._token)
+            factor = float(self._word)
             self._next()
-            if self._token != "*":
+            if self._word != "*":
                 raise self._error("expected * after a number")
             self._next()
         if self._kind == "name":
-            name = self._token
+            name = self._word
             self._next()
             return {name: factor}
-        if self._token == "(":
+        if self._word == "(":
             self._next()
             inner = self.sum(depth + 1)
-            if self._token != ")":
+            if self._word != ")":
                 raise self._error("expected )")
             self._next()
             return {name: factor * coefficient for name, coefficient in inner.items()}

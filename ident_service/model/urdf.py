@@ -6,7 +6,7 @@ in the parameter file.
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ET  # noqa: S405  # only writes here; reading goes through pinocchio after a check
+import xml.etree.ElementTree as ET  # only writes here; reading goes through pinocchio after a check
 
 import numpy as np
 

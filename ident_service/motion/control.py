@@ -12,8 +12,8 @@ import numpy as np
 
 from drivers.arm import Flags, Vector
 from ident_service.config.limits import MotionLimits
-from ident_service.motion.reference import Setpoint
 from ident_service.model.rigid_body import InverseDynamics
+from ident_service.motion.reference import Setpoint
 
 
 class ComputedTorque:

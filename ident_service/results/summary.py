@@ -11,8 +11,8 @@ def summary(estimate: Estimate) -> str:
     names = estimate.model.chain.names
     own = estimate.candidates[estimate.chosen]
     lines = [
-        f"{estimate.model.config.name}: {estimate.base.size} base parameters of {len(estimate.base.names)} link parameters, "
-        f"from {estimate.samples} samples",
+        f"{estimate.model.config.name}: {estimate.base.size} base parameters of {len(estimate.base.names)} link "
+        f"parameters, from {estimate.samples} samples",
         f"condition number of the regressor: {estimate.fit.condition_number:.1f}",
         "",
         _feasibility(estimate),
