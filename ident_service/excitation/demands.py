@@ -1,8 +1,8 @@
 """What a Fourier motion asks of the arm, against what the arm may do.
 
-Peaks of position, velocity, acceleration and jerk come from a grid fine enough that the trigonometric polynomial
-cannot rise between its points by more than a stated share (Bernstein: |p'| <= harmonics * w * max |p|); torque is
-checked with the prior (CAD) model and a margin for what that model does not know.
+Position, velocity, acceleration and jerk are trigonometric polynomials of degree L, whose second derivative is at most
+(L w)^2 times their largest size (Bernstein): between the points of a grid they rise by no more than a known share of
+it, which is added to the peaks found there. Torque is the prior (CAD) model's at the points of the grid.
 """
 
 from __future__ import annotations
@@ -54,16 +54,17 @@ def demands(series: FourierSeries, model: ArmModel) -> Demands:
     points = _POINTS_PER_HARMONIC * harmonics
     grid = np.arange(points) * series.period / points
     q, dq, ddq, jerk = series.at(grid)
-    # Half a grid step from the nearest point, p'' of a degree-L polynomial is at most (L w)^2 times its peak.
+    # The peak is at most half a grid step, pi / _POINTS_PER_HARMONIC of the highest harmonic's phase, from a point.
     rise = 1.0 / (1.0 - 0.5 * (np.pi / _POINTS_PER_HARMONIC) ** 2)
-    middle = series.q0
+    swing = q - series.q0
+    slack = (rise - 1.0) * np.abs(swing).max(axis=0)
     torque: Array | None = None
     if model.prior is not None:
         rows = joint_regressor(model.chain, model.layout, q, dq, ddq)
         torque = np.abs(np.einsum("jps,p->sj", rows, model.prior)).max(axis=0)
     return Demands(
-        lowest=middle + rise * (q - middle).min(axis=0),
-        highest=middle + rise * (q - middle).max(axis=0),
+        lowest=series.q0 + swing.min(axis=0) - slack,
+        highest=series.q0 + swing.max(axis=0) + slack,
         velocity=rise * np.abs(dq).max(axis=0),
         acceleration=rise * np.abs(ddq).max(axis=0),
         jerk=rise * np.abs(jerk).max(axis=0),
