@@ -43,9 +43,10 @@ def _model(model: ArmModel) -> list[Row]:
     q, dq, ddq, _ = series.at(np.arange(SAMPLES) * 1e-3)
 
     def batched() -> None:
+        H = None
         for start in range(0, SAMPLES, 4096):
             part = slice(start, start + 4096)
-            joint_regressor(chain, layout, q[part], dq[part], ddq[part], base.base)
+            H = joint_regressor(chain, layout, q[part], dq[part], ddq[part], base.base, H)
 
     assert model.prior is not None  # noqa: S101  # the shipped WAM has one
     pinocchio = pinocchio_model(chain, layout, model.prior)
@@ -65,7 +66,7 @@ def _model(model: ArmModel) -> list[Row]:
             "< 2",
         ),
         Row(f"batched base regressor, {SAMPLES} samples", ours, "s"),
-        Row("pinocchio called per sample and kept, over batched", theirs / ours, "ratio"),
+        Row("pinocchio called per sample and kept, over batched", theirs / ours, "ratio", ">= 4"),
     ]
 
 

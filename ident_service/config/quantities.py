@@ -57,7 +57,8 @@ def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
 
 
 Number = Annotated[float, Field(strict=True)]
-Angle = Annotated[float, BeforeValidator(_angle)]
+Angle = Annotated[float, Field(strict=True), BeforeValidator(_angle)]
+Count = Annotated[int, Field(strict=True, ge=1)]
 Positive = Annotated[float, Field(gt=0, strict=True)]
 NonNegative = Annotated[float, Field(ge=0, strict=True)]
 Interval = Annotated[tuple[Angle, Angle], AfterValidator(_ordered)]
@@ -104,7 +105,7 @@ class ParameterTable(Section):
             try:
                 content = json.loads(value["text"])
                 return {"names": tuple(content["names"]), "values": tuple(float(v) for v in content["values"])}
-            except (ValueError, KeyError, TypeError) as error:
+            except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
                 raise ValueError(f"{value['name']} is not a JSON object with names and values: {error}") from None
         if isinstance(value, dict) and set(value) != {"names", "values"}:
             return {"names": tuple(value), "values": tuple(value.values())}

@@ -9,10 +9,11 @@ from __future__ import annotations
 import hashlib
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Discriminator, Field, Tag, model_validator
 
 from ident_service.config.quantities import (
     Angle,
+    Count,
     Interval,
     NonNegative,
     Number,
@@ -25,6 +26,7 @@ from ident_service.config.quantities import (
 
 JointTerm = Literal["drive_inertia", "viscous", "coulomb", "offset"]
 FeasibleSetName = Literal["pseudo_inertia", "inertia"]
+Seed = Annotated[int, Field(strict=True, ge=0)]
 PerJoint = NonNegative | tuple[NonNegative, ...]
 
 
@@ -131,7 +133,7 @@ class Control(Section):
 class Smoothing(Section):
     """Zero-phase Butterworth low-pass and central differences (5.2.2)."""
 
-    order: Annotated[int, Field(ge=1, le=8)] = 3
+    order: Annotated[Count, Field(le=8)] = 3
     cutoff: Positive = 8.0
     filter_torque: bool = False
 
@@ -171,7 +173,7 @@ class FourierMotion(Section):
 
     kind: Literal["fourier"]
     base_frequency: Positive
-    periods: Annotated[int, Field(ge=1)] = 3
+    periods: Count = 3
     joints: dict[str, FourierJoint]
 
     @model_validator(mode="after")
@@ -185,10 +187,10 @@ class SeededMotion(Section):
     """A random Fourier motion, the same for the same seed, scaled into the arm's limits with a share left over."""
 
     kind: Literal["seeded"]
-    seed: Annotated[int, Field(ge=0)]
+    seed: Seed
     base_frequency: Positive = 0.05
-    harmonics: Annotated[int, Field(ge=1, le=50)] = 5
-    periods: Annotated[int, Field(ge=1)] = 3
+    harmonics: Annotated[Count, Field(le=50)] = 5
+    periods: Count = 3
     use: Annotated[float, Field(gt=0, le=1)] = 0.7
 
 
@@ -207,12 +209,12 @@ class SimulatedDriver(Section):
 
     kind: Literal["simulated"]
     time: Literal["virtual", "real"] = "virtual"
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Seed = 0
     truth: ParameterTable | None = None
     encoder_resolution: PerJoint = 0.0
     torque_resolution: PerJoint = 0.0
     torque_noise: PerJoint = 0.0
-    delay_cycles: Annotated[int, Field(ge=1, le=100)] = 1
+    delay_cycles: Annotated[Count, Field(le=100)] = 1
 
 
 class PluginDriver(Section):
@@ -226,6 +228,12 @@ class PluginDriver(Section):
 def _driver_kind(value: Any) -> str:
     kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
     return "simulated" if kind == "simulated" else "plugin"
+
+
+# A simulated driver with a mistake must not pass for somebody else's.
+Driver = Annotated[
+    Annotated[SimulatedDriver, Tag("simulated")] | Annotated[PluginDriver, Tag("plugin")], Discriminator(_driver_kind)
+]
 
 
 class ArmConfig(Section):
@@ -245,7 +253,7 @@ class ArmConfig(Section):
     control: Control = Control()
     identification: Identification = Identification()
     motions: Motions = Motions()
-    driver: SimulatedDriver | PluginDriver | None = None
+    driver: Driver | None = None
 
     @property
     def sha256(self) -> str:

@@ -87,7 +87,7 @@ def _parse(path: Path) -> Tree:
     except UnicodeDecodeError:
         raise ConfigError([Problem(path, 1, 1, "not UTF-8 text")]) from None
     try:
-        _refuse_aliases(path, text)
+        _refuse_unplain(path, text)
         node = yaml.compose(text, Loader=yaml.SafeLoader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
@@ -104,12 +104,15 @@ def _parse(path: Path) -> Tree:
     return tree
 
 
-def _refuse_aliases(path: Path, text: str) -> None:
+def _refuse_unplain(path: Path, text: str) -> None:
+    """Anchors, aliases, tags and deep nesting, seen in the stream of events before anything expands."""
     problems, depth = [], 0
     for event in yaml.parse(text, Loader=yaml.SafeLoader):
         place = (event.start_mark.line + 1, event.start_mark.column + 1) if event.start_mark else (1, 1)
         if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
             problems.append(Problem(path, *place, "anchors and aliases are refused; write the value out"))
+        if tag := getattr(event, "tag", None):
+            problems.append(Problem(path, *place, f"tag {tag!r} is refused"))
         if isinstance(event, yaml.CollectionStartEvent):
             depth += 1
             if depth > MAX_DEPTH:
@@ -141,10 +144,10 @@ def _build(node: yaml.Node, where: KeyPath, path: Path, tree: Tree, problems: li
         return result
     if isinstance(node, yaml.SequenceNode):
         return tuple(_build(item, (*where, index), path, tree, problems) for index, item in enumerate(node.value))
-    return _scalar(cast(yaml.ScalarNode, node), path, problems)
+    return _scalar(cast(yaml.ScalarNode, node), path)
 
 
-def _scalar(node: yaml.ScalarNode, path: Path, problems: list[Problem]) -> Any:
+def _scalar(node: yaml.ScalarNode, path: Path) -> Any:
     text = str(node.value)
     if node.style in ("'", '"', "|", ">"):
         return LocatedStr(text, path.parent)
@@ -155,8 +158,4 @@ def _scalar(node: yaml.ScalarNode, path: Path, problems: list[Problem]) -> Any:
     constants = {"true": True, "false": False, "null": None, "~": None, "": None}
     if text.lower() in constants:
         return constants[text.lower()]
-    if not node.tag.startswith("tag:yaml.org,2002:"):
-        problems.append(
-            Problem(path, node.start_mark.line + 1, node.start_mark.column + 1, f"tag {node.tag!r} is refused")
-        )
     return LocatedStr(text, path.parent)

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 WORLD = -1
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # identity is what a chain is compared and hashed by
 class Chain:
     """A kinematic tree with joints numbered so that parents come first.
 

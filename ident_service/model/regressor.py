@@ -7,7 +7,9 @@ taken as an upward acceleration of the base), all in the link frame,
 
 and joint i feels `u . n + v . f`, where (u, v) is its unit screw seen from the link frame: u the axis (zero for a
 sliding joint), v the velocity of the link's origin per unit of joint speed. Both are linear in delta, so each joint's
-row is ten products of vectors, computed here for whole blocks with the samples along the last, contiguous axis.
+row is ten products of vectors, computed for whole blocks with the samples along the last, contiguous axis.
+
+The formulas are traced once per chain (`tape.py`), which drops everything that the geometry makes zero or one.
 
 Boundary: numpy only; no samples are looped over in Python.
 """
@@ -15,6 +17,7 @@ Boundary: numpy only; no samples are looped over in Python.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +25,13 @@ from numpy.typing import NDArray
 from ident_service.errors import ModelError
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.layout import INERTIAL, Layout
+from ident_service.model.tape import Program, Symbol, Tape, Value
 
-_Vectors = list[NDArray[np.float64]]  # three components, each of shape (samples,)
+_Vector = list[Value]
+_Rotation = list[list[Value]]
+_Screw = tuple[_Vector, _Vector]
+_ZERO: _Vector = [0.0, 0.0, 0.0]
+_ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def joint_regressor(
@@ -33,6 +41,7 @@ def joint_regressor(
     velocity: Array,
     acceleration: Array,
     columns: Sequence[int] | NDArray[np.intp] | None = None,
+    out: Array | None = None,
 ) -> Array:
     """The rows of H for every joint and sample.
 
@@ -43,6 +52,8 @@ def joint_regressor(
         velocity: [rad/s or m/s], shape (samples, joints); its sign is the friction's.
         acceleration: [rad/s^2 or m/s^2], shape (samples, joints).
         columns: which parameters, all when None.
+        out: what an earlier call for the same chain and columns and as many samples or more returned; it is written
+            over, which saves the time of fresh memory.
 
     Returns:
         H, shape (joints, columns, samples): joint i's equations are `H[i].T @ delta`.
@@ -54,146 +65,172 @@ def joint_regressor(
     for name, array in (("position", position), ("velocity", velocity), ("acceleration", acceleration)):
         if array.ndim != 2 or array.shape != (position.shape[0], n):
             raise ModelError(f"{name}.shape={array.shape} but expected ({position.shape[0]}, {n})")
-    wanted = np.arange(layout.size) if columns is None else np.asarray(columns, dtype=np.intp)
-    place = {int(column): row for row, column in enumerate(wanted)}
-    q, dq, ddq = (np.ascontiguousarray(array.T, dtype=float) for array in (position, velocity, acceleration))
-    H = np.zeros((n, len(wanted), q.shape[1]))
-    _joint_terms(H, layout, place, dq, ddq)
-    states = _Forward(chain, q, dq, ddq)
-    for link in range(n):
-        offset = layout.inertial(link).start
-        rows = [(place[offset + p], p) for p in range(len(INERTIAL)) if offset + p in place]
-        if rows:
-            _link_rows(H, states, link, rows)
+    wanted = tuple(range(layout.size)) if columns is None else tuple(int(column) for column in columns)
+    samples = position.shape[0]
+    shape = (n, len(wanted), samples)
+    H = np.zeros(shape) if out is None else out[:, :, :samples]
+    if H.shape != shape:
+        raise ModelError(f"{H.shape=} but expected {shape}")
+    program, places = _program(chain, layout, wanted)
+    inputs = [
+        np.ascontiguousarray(array[:, k], dtype=float) for array in (position, velocity, acceleration) for k in range(n)
+    ]
+    program.run(inputs, [H[joint, row] for joint, row in places])
     return H
 
 
-def _joint_terms(H: Array, layout: Layout, place: dict[int, int], dq: Array, ddq: Array) -> None:
-    """Drive inertia and eq. 27: each joint's own column in its own row."""
-    values = {"drive_inertia": ddq, "viscous": dq, "coulomb": np.sign(dq), "offset": np.ones_like(dq)}
+@lru_cache(maxsize=32)
+def _program(chain: Chain, layout: Layout, columns: tuple[int, ...]) -> tuple[Program, list[tuple[int, int]]]:
+    """The traced formulas, and the (joint, column) that each of its outputs belongs to; the others are zero."""
+    tape = Tape()
+    q, dq, ddq = ([tape.input() for _ in range(chain.joints)] for _ in range(3))
+    entries = _joint_terms(tape, layout, dq, ddq)
+    states = _Forward(tape, chain, q, dq, ddq)
+    for link in range(chain.joints):
+        for (joint, parameter), value in _link_entries(states, link).items():
+            entries[joint, layout.inertial(link).start + parameter] = value
+    chosen = {column: row for row, column in enumerate(columns)}
+    kept = {
+        (joint, chosen[column]): value
+        for (joint, column), value in entries.items()
+        if column in chosen and (isinstance(value, Symbol) or value != 0.0)
+    }
+    return Program(tape, list(kept.values())), list(kept)
+
+
+def _joint_terms(tape: Tape, layout: Layout, dq: list[Symbol], ddq: list[Symbol]) -> dict[tuple[int, int], Value]:
+    """Drive inertia and eq. 27: each joint's own columns in its own row."""
+    entries: dict[tuple[int, int], Value] = {}
     for term in layout.terms:
         for joint, column in enumerate(layout.term_columns(term)):
-            if int(column) in place:
-                H[joint, place[int(column)]] = values[term][joint]
+            value: Value = 1.0
+            if term == "drive_inertia":
+                value = ddq[joint]
+            elif term == "viscous":
+                value = dq[joint]
+            elif term == "coulomb":
+                value = tape.apply("sign", dq[joint])
+            entries[joint, int(column)] = value
+    return entries
 
 
 class _Forward:
     """Motion of every link frame, and the unit screws of its ancestors seen from it."""
 
-    def __init__(self, chain: Chain, q: Array, dq: Array, ddq: Array) -> None:
-        self.screws: list[dict[int, tuple[_Vectors | None, _Vectors]]] = []
-        self.motion: list[tuple[_Vectors, _Vectors, _Vectors]] = []
-        samples = q.shape[1]
-        zero, one = np.zeros(samples), np.ones(samples)
-        base = [-float(g) * one for g in chain.gravity]
-        in_joint: list[tuple[_Vectors, _Vectors, _Vectors]] = []
-        joint_screws: list[dict[int, tuple[_Vectors | None, _Vectors]]] = []
+    def __init__(self, tape: Tape, chain: Chain, q: list[Symbol], dq: list[Symbol], ddq: list[Symbol]) -> None:
+        self.screws: list[dict[int, _Screw]] = []
+        self.motion: list[tuple[_Vector, _Vector, _Vector]] = []
+        base: _Vector = [-float(g) for g in chain.gravity]
+        in_joint: list[tuple[_Vector, _Vector, _Vector]] = []
+        joint_screws: list[dict[int, _Screw]] = []
         for k in range(chain.joints):
             parent = chain.parents[k]
-            w, e, a = ([zero] * 3, [zero] * 3, base) if parent == WORLD else in_joint[parent]
-            axis = chain.axes[k]
-            turn = chain.rotation[k]
-            shift = chain.translation[k]
-            rotation: list[list[NDArray[np.float64]]] | Array = turn.T
+            w, e, a = (_ZERO, _ZERO, base) if parent == WORLD else in_joint[parent]
+            axis = _constant(chain.axes[k])
+            arm = _constant(chain.translation[k])
             if chain.revolute[k]:
-                rotation = _turned(turn, axis, q[k])
-                arm: _Vectors = [float(shift[i]) * one for i in range(3)]
+                rotation = _turned(chain.rotation[k], chain.axes[k], tape.apply("cos", q[k]), tape.apply("sin", q[k]))
             else:
-                slide = turn @ axis
-                arm = [float(shift[i]) + float(slide[i]) * q[k] for i in range(3)]
-            # Acceleration of the joint frame's origin carried along by the parent, then everything in the joint frame.
-            a = _add(a, _add(_cross(e, arm), _cross(w, _cross(w, arm))))
-            screws = {
-                i: (
-                    None if u is None else _rotate(rotation, u),
-                    _rotate(rotation, v if u is None else _add(v, _cross(u, arm))),
-                )
-                for i, (u, v) in ({} if parent == WORLD else joint_screws[parent]).items()
-            }
-            w, e, a = _rotate(rotation, w), _rotate(rotation, e), _rotate(rotation, a)
-            z = [float(axis[i]) * one for i in range(3)]
-            zdq, zddq = [c * dq[k] for c in z], [c * ddq[k] for c in z]
+                rotation = [_constant(row) for row in chain.rotation[k].T]
+                arm = _add(arm, _scaled(_constant(chain.rotation[k] @ chain.axes[k]), q[k]))
+            # Carried along by the parent to the joint frame's origin, then everything in the joint frame.
+            a = _rotate(rotation, _add(a, _add(_cross(e, arm), _cross(w, _cross(w, arm)))))
+            screws = _carried({} if parent == WORLD else joint_screws[parent], arm, rotation)
+            w, e = _rotate(rotation, w), _rotate(rotation, e)
+            along, rate = _scaled(axis, ddq[k]), _scaled(axis, dq[k])
             if chain.revolute[k]:
-                e = _add(_add(e, zddq), _cross(w, zdq))
-                w = _add(w, zdq)
-                screws[k] = (z, [zero] * 3)
+                e = _add(_add(e, along), _cross(w, rate))
+                w = _add(w, rate)
+                screws[k] = (axis, _ZERO)
             else:
-                coriolis = _cross(w, zdq)
-                a = _add(_add(a, zddq), [2.0 * c for c in coriolis])
-                screws[k] = (None, z)
+                a = _add(_add(a, along), _scaled(_cross(w, rate), 2.0))
+                screws[k] = (_ZERO, axis)
             in_joint.append((w, e, a))
             joint_screws.append(screws)
-            self._to_link(chain, k, w, e, a, screws)
+            self._to_link(chain, k, (w, e, a), screws)
 
     def _to_link(
-        self,
-        chain: Chain,
-        k: int,
-        w: _Vectors,
-        e: _Vectors,
-        a: _Vectors,
-        screws: dict[int, tuple[_Vectors | None, _Vectors]],
+        self, chain: Chain, k: int, motion: tuple[_Vector, _Vector, _Vector], screws: dict[int, _Screw]
     ) -> None:
-        offset, rotation = chain.link_translation[k], chain.link_rotation[k].T
-        if offset.any():
-            arm = [np.full_like(w[0], float(c)) for c in offset]
-            a = _add(a, _add(_cross(e, arm), _cross(w, _cross(w, arm))))
-            screws = {i: (u, v if u is None else _add(v, _cross(u, arm))) for i, (u, v) in screws.items()}
-        if not np.array_equal(rotation, np.eye(3)):
-            w, e, a = _rotate(rotation, w), _rotate(rotation, e), _rotate(rotation, a)
-            screws = {
-                i: (None if u is None else _rotate(rotation, u), _rotate(rotation, v)) for i, (u, v) in screws.items()
-            }
-        self.motion.append((w, e, a))
-        self.screws.append(screws)
+        w, e, a = motion
+        arm = _constant(chain.link_translation[k])
+        rotation = [_constant(row) for row in chain.link_rotation[k].T]
+        a = _add(a, _add(_cross(e, arm), _cross(w, _cross(w, arm))))
+        self.motion.append((_rotate(rotation, w), _rotate(rotation, e), _rotate(rotation, a)))
+        self.screws.append(_carried(screws, arm, rotation))
 
 
-def _link_rows(H: Array, states: _Forward, link: int, rows: list[tuple[int, int]]) -> None:
-    """The ten columns of one link in the rows of all joints that carry it."""
+def _carried(screws: dict[int, _Screw], arm: _Vector, rotation: _Rotation) -> dict[int, _Screw]:
+    """The same screws seen from a frame whose origin is `arm` further and which is turned by `rotation`."""
+    return {i: (_rotate(rotation, u), _rotate(rotation, _add(v, _cross(u, arm)))) for i, (u, v) in screws.items()}
+
+
+def _link_entries(states: _Forward, link: int) -> dict[tuple[int, int], Value]:
+    """The ten columns of one link in the rows of all joints that carry it, by (joint, parameter of eq. 13)."""
     w, e, a = states.motion[link]
+    entries: dict[tuple[int, int], Value] = {}
+    # What only depends on the link is shared by all joints: e~ + w~ w~ of the first moment, and L's factors.
+    W = [[w[i] * w[j] for j in range(3)] for i in range(3)]
+    spin = [
+        [-W[1][1] - W[2][2], W[0][1] - e[2], W[0][2] + e[1]],
+        [W[0][1] + e[2], -W[0][0] - W[2][2], W[1][2] - e[0]],
+        [W[0][2] - e[1], W[1][2] + e[0], -W[0][0] - W[1][1]],
+    ]
+    moments = _inertia_columns(W, e)
     for joint, (u, v) in states.screws[link].items():
-        first: _Vectors = []
-        inertia: _Vectors = []
-        kinds = {p for _, p in rows}
-        if kinds & {6, 7, 8}:
-            first = _add(_cross(v, e), _cross(_cross(v, w), w))
-            if u is not None:
-                first = _add(first, _cross(a, u))
-        if kinds & {0, 1, 2, 3, 4, 5} and u is not None:
-            p = _cross(u, w)
-            inertia = [
-                u[0] * e[0] + p[0] * w[0],
-                u[0] * e[1] + u[1] * e[0] + p[0] * w[1] + p[1] * w[0],
-                u[0] * e[2] + u[2] * e[0] + p[0] * w[2] + p[2] * w[0],
-                u[1] * e[1] + p[1] * w[1],
-                u[1] * e[2] + u[2] * e[1] + p[1] * w[2] + p[2] * w[1],
-                u[2] * e[2] + p[2] * w[2],
-            ]
-        for row, parameter in rows:
-            if parameter == 9:
-                H[joint, row] = v[0] * a[0] + v[1] * a[1] + v[2] * a[2]
-            elif parameter >= 6:
-                H[joint, row] = first[parameter - 6]
-            elif u is not None:
-                H[joint, row] = inertia[parameter]
+        lever = _cross(a, u)
+        for axis in range(3):
+            entries[joint, 6 + axis] = _dot(v, [spin[i][axis] for i in range(3)]) + lever[axis]
+        for parameter in range(6):
+            entries[joint, parameter] = _dot(u, moments[parameter])
+        entries[joint, len(INERTIAL) - 1] = _dot(v, a)
+    return entries
 
 
-def _turned(placement: Array, axis: Array, angle: NDArray[np.float64]) -> list[list[NDArray[np.float64]]]:
+def _inertia_columns(W: list[list[Value]], e: _Vector) -> list[_Vector]:
+    """Per entry of L (eq. 13), the moment `L e + w x (L w)` of a unit entry; W is w w^T."""
+    columns: list[_Vector] = []
+    for i, j in _ENTRIES:
+        # L w has w_j at i and w_i at j; w x (L w) multiplies them with w again, which are entries of W.
+        product: list[_Vector] = [[0.0, 0.0, 0.0] for _ in range(3)]  # rows: component of L w, columns: times w_c
+        along: _Vector = [0.0, 0.0, 0.0]
+        along[i], product[i] = e[j], list(W[j])
+        if i != j:
+            along[j], product[j] = e[i], list(W[i])
+        across: _Vector = [product[2][1] - product[1][2], product[0][2] - product[2][0], product[1][0] - product[0][1]]
+        columns.append(_add(along, across))
+    return columns
+
+
+def _constant(values: Array) -> _Vector:
+    return [float(value) for value in values]
+
+
+def _turned(placement: Array, axis: Array, c: Symbol, s: Symbol) -> _Rotation:
     """Rows of the rotation from the parent's frame into the turned joint frame (Rodrigues' formula, transposed)."""
-    c, s = np.cos(angle), np.sin(angle)
     x, y, z = (float(component) for component in axis)
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    constant, sine, cosine = placement @ (np.eye(3) + K @ K), placement @ K, -(placement @ (K @ K))
-    return [[constant[j, i] + sine[j, i] * s + cosine[j, i] * c for j in range(3)] for i in range(3)]
+    still, sine, cosine = placement @ (np.eye(3) + K @ K), placement @ K, -(placement @ (K @ K))
+    return [
+        [float(still[j, i]) + (float(sine[j, i]) * s + float(cosine[j, i]) * c) for j in range(3)] for i in range(3)
+    ]
 
 
-def _rotate(rotation: list[list[NDArray[np.float64]]] | Array, vector: _Vectors) -> _Vectors:
-    return [rotation[i][0] * vector[0] + rotation[i][1] * vector[1] + rotation[i][2] * vector[2] for i in range(3)]
+def _dot(a: _Vector, b: _Vector) -> Value:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _cross(a: _Vectors, b: _Vectors) -> _Vectors:
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+def _rotate(rotation: _Rotation, vector: _Vector) -> _Vector:
+    return [_dot(row, vector) for row in rotation]
 
 
-def _add(a: _Vectors, b: _Vectors) -> _Vectors:
-    return [a[0] + b[0], a[1] + b[1], a[2] + b[2]]
+def _scaled(vector: _Vector, factor: Value) -> _Vector:
+    return [component * factor for component in vector]
+
+
+def _cross(a: _Vector, b: _Vector) -> _Vector:
+    return [a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))]
+
+
+def _add(a: _Vector, b: _Vector) -> _Vector:
+    return [a[i] + b[i] for i in range(3)]
