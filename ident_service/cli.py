@@ -98,7 +98,14 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument(
         "--validate", action="append", default=[], type=Path, metavar="RECORDING", help="judge on this one too"
     )
-    sub.add_argument("--method", choices=["ols"], default="ols")
+    sub.add_argument("--columns", type=Path, metavar="FILE", help="YAML that says how the recordings are laid out")
+    sub.add_argument("--method", choices=["ols", "wls", "huber", "iv"], help="default: the arm's")
+    sub.add_argument("--prior", choices=["none", "euclidean", "entropic"], help="draw the estimate to the arm's prior")
+    sub.add_argument("--prior-weight", type=_share, metavar="W", help="default: chosen on held-out data")
+    sub.add_argument("--delay", type=_delay, metavar="SECONDS", help="of the torque's stamps, or 'estimate'")
+    sub.add_argument("--bootstrap", type=_seed, default=0, metavar="N", help="replicates, for the constrained estimate")
+    sub.add_argument("--essential", action="store_true", help="also the smallest model that predicts as well")
+    sub.add_argument("--sdpa", action="store_true", help="also the problems in SDPA format, for other solvers")
     sub.add_argument("--feasible-set", choices=[*_SETS, "none"], help="default: the arm's; none: unconstrained")
     sub.add_argument("--out", type=Path, metavar="DIR", help="where results go (default: below the state folder)")
 
@@ -116,6 +123,9 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--feasible-set", choices=_SETS)
     sub.add_argument("--arm", metavar="ARM", help="adds the arm's mass, centre-of-mass and sign conditions")
 
+    sub = verb("verify", _verify, "check a certificate in exact arithmetic (exit code 3: not proven feasible)")
+    sub.add_argument("file", type=Path, metavar="FILE")
+
     config = verbs.add_parser("config", help="arm descriptions").add_subparsers(required=True, metavar="VERB")
     check = config.add_parser("check", parents=[common], help="every mistake with file, line and column")
     check.add_argument("file", metavar="FILE")
@@ -127,6 +137,28 @@ def _seed(text: str) -> int:
     if not text.isdigit():
         raise argparse.ArgumentTypeError("a seed is a whole number, 0 or more")
     return int(text)
+
+
+def _share(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0.0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError("a weight is a number, 0 or more")
+    return value
+
+
+def _delay(text: str) -> float | str:
+    if text == "estimate":
+        return text
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not abs(value) < 1.0:
+        raise argparse.ArgumentTypeError("a delay is a number of seconds below 1, or 'estimate'")
+    return value
 
 
 def _state_folder(arguments: argparse.Namespace) -> Path:
@@ -175,29 +207,32 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
 
 def _identify(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
-    from ident_service.estimation.identify import identify
-    from ident_service.model.arm_model import arm_model
-    from ident_service.record.open import open_recording
-    from ident_service.results.files import appearing_folder
-    from ident_service.results.run_folder import write_manifest, write_results
     from ident_service.results.summary import summary
     from ident_service.service.commission import new_run_folder
+    from ident_service.service.identification import Request, identify_files
 
-    config = load_arm(arguments.arm)
-    model = arm_model(config)
-    recordings = [open_recording(path, model.chain.names) for path in arguments.recordings]
-    unseen = [open_recording(path, model.chain.names) for path in arguments.validate]
-    for recording in [*recordings, *unseen]:
-        if recording.torn:
-            sys.stderr.write(f"ident: {recording.path}: torn; read up to the tear\n")
-    estimate = identify(model, recordings, unseen, method=arguments.method, set_name=arguments.feasible_set)
-    folder = arguments.out or new_run_folder(_state_folder(arguments), config.name)
-    with appearing_folder(folder) as staging:
-        files = write_results(staging, estimate)
-        write_manifest(staging)
-    text = summary(estimate) + f"\nfiles: {folder}\n" + "".join(f"  {name}\n" for name in files)
+    request = Request(
+        arm=arguments.arm,
+        recordings=tuple(arguments.recordings),
+        validation=tuple(arguments.validate),
+        columns=arguments.columns,
+        method=arguments.method,
+        set_name=arguments.feasible_set,
+        prior=arguments.prior,
+        prior_weight=arguments.prior_weight,
+        delay=arguments.delay,
+        replicates=arguments.bootstrap,
+        essential=arguments.essential,
+        sdpa=arguments.sdpa,
+    )
+    folder = arguments.out or new_run_folder(_state_folder(arguments), load_arm(arguments.arm).name)
+    result = identify_files(request, folder, lambda line: _tell(arguments, line))
+    estimate = result.estimate
+    text = "".join(f"warning: {line}\n" for line in result.warnings) + summary(estimate)
+    text += f"\nfiles: {folder}\n" + "".join(f"  {name}\n" for name in result.files)
     code = DONE if estimate.feasible or not estimate.constrained else VERDICT_NO
-    return code, text, {"folder": str(folder), "files": files, **_estimate_document(estimate)}
+    document = {"folder": str(folder), "files": list(result.files), "warnings": list(result.warnings)}
+    return code, text, document | _estimate_document(estimate)
 
 
 def _base(arguments: argparse.Namespace) -> Answer:
@@ -256,6 +291,15 @@ def _correct(arguments: argparse.Namespace) -> Answer:
         "values": result.beta.tolist(),
     }
     return DONE, text, document
+
+
+def _verify(arguments: argparse.Namespace) -> Answer:
+    from ident_service.service.verify import verify_file
+
+    result = verify_file(arguments.file)
+    text = f"{arguments.file}: {result.verdict}: {result.message}\n" + "".join(f"  {line}\n" for line in result.checked)
+    document = {"file": str(arguments.file), "verdict": result.verdict, "message": result.message}
+    return (DONE if result.verdict == "feasible" else VERDICT_NO), text, document | {"checked": list(result.checked)}
 
 
 def _config_check(arguments: argparse.Namespace) -> Answer:

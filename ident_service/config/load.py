@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
+from ident_service.config.quantities import Section
+from ident_service.config.recording import RecordingFormat, disagreements
 from ident_service.config.schema import ArmConfig, DHTable, FourierMotion, SimulatedDriver
 from ident_service.config.source import KeyPath, Tree, read_tree
 from ident_service.errors import ConfigError, Problem, UsageError
 
 # In a wheel the descriptions lie inside the package, in a checkout beside it.
 _SHIPPED = (Path(__file__).parent.parent / "configs", Path(__file__).parent.parent.parent / "configs")
+_Described = TypeVar("_Described", bound=Section)
 _PER_JOINT = ("encoder_resolution", "torque_resolution", "torque_noise")
 
 
@@ -49,14 +52,31 @@ def load_arm(arm: str | Path) -> ArmConfig:
     """
     path = find_arm(str(arm))
     tree = read_tree(path)
-    try:
-        config = ArmConfig.model_validate(tree.value)
-    except ValidationError as error:
-        raise ConfigError(list(_problems(error, tree, path))) from None
+    config = _validated(ArmConfig, tree, path)
     problems = [tree.problem(where, message, path) for where, message in _disagreements(config)]
     if problems:
         raise ConfigError(problems)
     return config
+
+
+def load_recording_format(path: str | Path) -> RecordingFormat:
+    """Read and check a YAML file that has the keys of an arm description's `recording` and nothing else.
+
+    Raises:
+        UsageError: no such file.
+        ConfigError: every mistake in it, each with file, line and column.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UsageError(f"{path}: no such file; expected a YAML file that says how a recording is to be read")
+    return _validated(RecordingFormat, read_tree(path), path)
+
+
+def _validated(kind: type[_Described], tree: Tree, path: Path) -> _Described:
+    try:
+        return kind.model_validate(tree.value)
+    except ValidationError as error:
+        raise ConfigError(list(_problems(error, tree, path))) from None
 
 
 def _problems(error: ValidationError, tree: Tree, path: Path) -> Iterator[Problem]:
@@ -104,6 +124,7 @@ def _disagreements(config: ArmConfig) -> Iterator[tuple[KeyPath, str]]:
             given = getattr(config.driver, key)
             if isinstance(given, tuple) and len(given) != len(names):
                 yield ("driver", key), f"driver.{key}: {len(given)} values for {len(names)} joints"
+    yield from disagreements(config.recording, config.transmission, names)
 
 
 def _joint_names(table: DHTable | None, config: ArmConfig) -> tuple[str, ...]:

@@ -23,9 +23,11 @@ from ident_service.config.quantities import (
     TextBeside,
     Vector3,
 )
+from ident_service.config.recording import RecordingFormat, Transmission
 
-JointTerm = Literal["drive_inertia", "viscous", "coulomb", "offset"]
+JointTerm = Literal["drive_inertia", "viscous", "coulomb", "offset", "stribeck", "quadratic", "viscous_asymmetry"]
 FeasibleSetName = Literal["pseudo_inertia", "inertia"]
+Method = Literal["ols", "wls", "huber", "iv"]
 Seed = Annotated[int, Field(strict=True, ge=0)]
 PerJoint = NonNegative | tuple[NonNegative, ...]
 
@@ -77,11 +79,37 @@ class Box(Section):
         return self
 
 
+class Ellipsoid(Section):
+    """An ellipsoid in a link frame that no mass of the link lies outside of: centre and half-axes [m].
+
+    The rows of `axes` are unit vectors along the half-axes; those of the frame when left out.
+    """
+
+    center: Vector3
+    semi_axes: tuple[Positive, Positive, Positive]
+    axes: tuple[Vector3, Vector3, Vector3] | None = None
+
+    @model_validator(mode="after")
+    def _orthonormal(self) -> Ellipsoid:
+        for i, one in enumerate(self.axes or ()):
+            for j, other in enumerate(self.axes or ()):
+                if abs(sum(a * b for a, b in zip(one, other, strict=True)) - float(i == j)) > 1e-6:
+                    raise ValueError("axes are not three perpendicular unit vectors")
+        return self
+
+
 class Body(Section):
-    """What is known beforehand about the link a joint moves (eqs. 25, 26)."""
+    """What is known beforehand about the link a joint moves (eqs. 25, 26).
+
+    Its mass, a box and a convex hull of points that its centre of mass lies in, an ellipsoid that all its mass lies in,
+    and the coordinate planes of its frame that it is symmetric about.
+    """
 
     mass: Interval | None = None
     center_of_mass: Box | None = None
+    hull: Annotated[tuple[Vector3, ...], Field(min_length=4)] | None = None
+    ellipsoid: Ellipsoid | None = None
+    symmetry: tuple[Literal["xy", "yz", "xz"], ...] = ()
 
 
 class Joint(Section):
@@ -117,10 +145,23 @@ class Mass(Section):
 
 
 class Constraints(Section):
-    """Physical knowledge about the whole arm (eqs. 25, 28)."""
+    """Physical knowledge about the whole arm (eqs. 25, 28).
+
+    `torque_constant` bounds, per joint, what its measured torque must be multiplied by to be true; 1 elsewhere.
+    """
 
     total_mass: Mass = Mass()
     positive: tuple[Literal["drive_inertia", "viscous", "coulomb"], ...] = ("drive_inertia", "viscous", "coulomb")
+    torque_constant: dict[str, tuple[Positive, Positive]] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Constraints:
+        for joint, (lower, upper) in self.torque_constant.items():
+            if not lower < upper:
+                raise ValueError(
+                    f"torque_constant of {joint}: lower bound {lower:g} is not below upper bound {upper:g}"
+                )
+        return self
 
 
 class Control(Section):
@@ -131,11 +172,19 @@ class Control(Section):
 
 
 class Smoothing(Section):
-    """Zero-phase Butterworth low-pass and central differences (5.2.2)."""
+    """Zero-phase low-pass and derivatives (5.2.2).
 
+    `butterworth` of `order`, or `savitzky_golay` polynomials of that degree over a window of about the same cut-off
+    [Hz]. `filter_torque` sends the torque through the Butterworth filter too. `regressor_cutoff` [Hz] filters both
+    sides of eq. 59 alike. `decimate` keeps every so many-th sample, after all filters.
+    """
+
+    method: Literal["butterworth", "savitzky_golay"] = "butterworth"
     order: Annotated[Count, Field(le=8)] = 3
     cutoff: Positive = 8.0
     filter_torque: bool = False
+    regressor_cutoff: Positive | None = None
+    decimate: Count = 1
 
 
 class Reversal(Section):
@@ -145,13 +194,45 @@ class Reversal(Section):
     window: NonNegative = 0.2
 
 
-class Identification(Section):
-    """How a recording becomes equations."""
+class FrictionShape(Section):
+    """What in the friction is not linear, per joint or one number for all, given or fitted (`fit`).
 
+    `presliding` is the way [rad or m] over which friction turns round with the velocity (Dahl 1968), 0 for at once;
+    `stribeck_velocity` [rad/s or m/s] is v_s of the term `stribeck`.
+    """
+
+    presliding: NonNegative | tuple[NonNegative, ...] | Literal["fit"] = 0.0
+    stribeck_velocity: Positive | tuple[Positive, ...] | Literal["fit"] = 0.1
+
+
+class PriorPull(Section):
+    """How strongly constrained estimates are drawn towards the prior (CAD) parameters, and in which sense.
+
+    `weight` is that of one unit of divergence against one residual variance, or `held_out`: the one that explains best
+    the last third of the recordings, fitted to the rest.
+    """
+
+    kind: Literal["none", "euclidean", "entropic"] = "none"
+    weight: NonNegative | Literal["held_out"] = "held_out"
+
+
+class Identification(Section):
+    """How a recording becomes equations, and equations an estimate.
+
+    `method` is the estimator; `edge` [s] is left out at both ends of every recording; `block` [s] is what doubt is
+    computed from; `delay` [s] is how much later the torque's stamps are than the position's; `period` [s] averages a
+    periodic motion over its periods.
+    """
+
+    method: Method = "ols"
     smoothing: Smoothing = Smoothing()
     reversal: Reversal = Reversal()
+    friction: FrictionShape = FrictionShape()
+    prior: PriorPull = PriorPull()
     edge: NonNegative = 0.5
     block: Positive = 1.0
+    delay: Number | Literal["estimate"] = 0.0
+    period: Positive | None = None
 
 
 class FourierJoint(Section):
@@ -252,6 +333,8 @@ class ArmConfig(Section):
     feasible_set: FeasibleSetName = "pseudo_inertia"
     control: Control = Control()
     identification: Identification = Identification()
+    recording: RecordingFormat = RecordingFormat()
+    transmission: Transmission | None = None
     motions: Motions = Motions()
     driver: Driver | None = None
 

@@ -1,7 +1,12 @@
-"""The door to Clarabel: minimise a linear objective over affine maps into cones.
+"""The door to Clarabel: minimise a linear or convex quadratic objective over affine maps into cones.
 
-Every problem of this package is written as `F x + f in K` with K the non-negative numbers, a second-order cone or the
-positive semidefinite matrices, the latter by the entries of their upper triangle, column by column.
+Every problem of this package is written as `F x + f in K` with K zero, the non-negative numbers, a second-order cone,
+the exponential cone or the positive semidefinite matrices, the latter by the entries of their upper triangle, column by
+column.
+
+Interior points lose digits where an optimum is not unique or lies far out, which is common here: a link that no motion
+feels may weigh anything. So a solve that stops early is posed again in the fixed order of `_POSES`, then at the next
+of `_TOLERANCES`; what it ends with is an optimum to a stated tolerance, or an error with the solver's own word.
 """
 
 from __future__ import annotations
@@ -13,6 +18,7 @@ import numpy as np
 import scipy.sparse
 
 from ident_service.errors import SolverError
+from ident_service.estimation.restate import Columns, Pose, Rows, restated
 from ident_service.model.chain import Array
 
 
@@ -23,9 +29,11 @@ class Solution:
     Attributes:
         x: the variables, shape (variables,).
         duals: per constraint in the order they were added, its multiplier; matrices by upper triangle as above.
-        objective: value of the linear objective.
-        iterations: of the interior-point method.
-        seconds: inside the solver.
+        objective: value of the objective.
+        iterations: of the interior-point method, over all attempts.
+        seconds: inside the solver, over all attempts.
+        tolerance: of gap and feasibility, relative, that the solver was asked for and reached.
+        attempts: how many times the problem was posed, 1 unless the solver stopped early.
     """
 
     x: Array
@@ -33,6 +41,24 @@ class Solution:
     objective: float
     iterations: int
     seconds: float
+    tolerance: float = 1e-9
+    attempts: int = 1
+
+
+@dataclass(frozen=True)
+class _Pose:
+    """One way to pose a problem: share of the way to the boundary per step, scaling passes, coordinates."""
+
+    step: float
+    equilibrations: int
+    around: Columns | None = None
+
+
+# Distances of a thousandth and margins of a millionth are results here: 1e-9 first, in every pose. The looser ones are
+# for problems whose last digits the solver cannot separate from rounding, in the poses that came close.
+_TOLERANCES = (1e-9, 1e-8, 1e-7)
+_POSES = (_Pose(0.99, 10), _Pose(0.95, 30, "unit"), _Pose(0.9, 50), _Pose(0.9, 10, "orthonormal"))
+_FINAL = (clarabel.SolverStatus.PrimalInfeasible, clarabel.SolverStatus.DualInfeasible)
 
 
 @dataclass
@@ -44,57 +70,108 @@ class ConicProblem:
     """
 
     variables: int
-    _rows: list[Array] = field(default_factory=list)
-    _offsets: list[Array] = field(default_factory=list)
-    _cones: list[object] = field(default_factory=list)
+    _rows: list[Rows] = field(default_factory=list)
     _scales: list[Array] = field(default_factory=list)
+
+    def zero(self, F: Array, f: Array) -> None:
+        """`F x + f = 0` entry by entry; F of shape (rows, variables)."""
+        self._add(Rows("zero", F, f), np.ones(len(f)))
 
     def nonnegative(self, F: Array, f: Array) -> None:
         """`F x + f >= 0` entry by entry; F of shape (rows, variables)."""
-        self._add(F, f, clarabel.NonnegativeConeT(len(f)), np.ones(len(f)))
+        self._add(Rows("nonnegative", F, f), np.ones(len(f)))
 
     def second_order(self, F: Array, f: Array) -> None:
         """The first entry of `F x + f` is at least the norm of the others."""
-        self._add(F, f, clarabel.SecondOrderConeT(len(f)), np.ones(len(f)))
+        self._add(Rows("second_order", F, f), np.ones(len(f)))
+
+    def exponential(self, F: Array, f: Array) -> None:
+        """The three entries (a, b, c) of `F x + f` satisfy b exp(a / b) <= c."""
+        self._add(Rows("exponential", F, f), np.ones(len(f)))
 
     def semidefinite(self, F: Array, f: Array, size: int) -> None:
         """`F x + f` is the upper triangle of a positive semidefinite matrix of `size` rows."""
         scale = np.array([1.0 if i == j else np.sqrt(2.0) for i, j in triangle_entries(size)])
-        self._add(F * scale[:, None], f * scale, clarabel.PSDTriangleConeT(size), scale)
+        self._add(Rows("semidefinite", F * scale[:, None], f * scale, size), scale)
 
-    def _add(self, F: Array, f: Array, cone: object, scale: Array) -> None:
-        self._rows.append(F)
-        self._offsets.append(f)
-        self._cones.append(cone)
+    def copy(self) -> ConicProblem:
+        """The same problem, to be given further constraints."""
+        return ConicProblem(self.variables, list(self._rows), list(self._scales))
+
+    def _add(self, rows: Rows, scale: Array) -> None:
+        self._rows.append(rows)
         self._scales.append(scale)
 
-    def minimise(self, objective: Array, name: str) -> Solution:
+    def minimise(self, objective: Array, name: str, quadratic: Array | None = None) -> Solution:
         """Solve.
 
         Args:
-            objective: coefficients, shape (variables,).
+            objective: linear coefficients, shape (variables,).
             name: what to call the problem in an error.
+            quadratic: non-negative diagonal of the Hessian, shape (variables,); the objective is
+                `objective^T x + x^T diag(quadratic) x / 2`.
 
         Raises:
-            SolverError: the solver stopped anywhere but at an optimum.
+            SolverError: the solver stopped anywhere but at an optimum, in every pose; with the first pose's status.
         """
-        A = scipy.sparse.csc_matrix(-np.vstack(self._rows))
-        b = np.concatenate(self._offsets)
-        P = scipy.sparse.csc_matrix((self.variables, self.variables))
-        settings = clarabel.DefaultSettings()
-        settings.verbose = False
-        settings.max_iter = 200
-        settings.max_threads = 1
-        # Distances of a thousandth and margins of a millionth are results here.
-        settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-9
-        result = clarabel.DefaultSolver(P, objective, A, b, self._cones, settings).solve()
-        if result.status != clarabel.SolverStatus.Solved:
-            raise SolverError(name, str(result.status))
-        ends = np.cumsum([len(f) for f in self._offsets])[:-1]
-        duals = tuple(
-            dual / scale for dual, scale in zip(np.split(np.array(result.z), ends), self._scales, strict=True)
-        )
-        return Solution(np.array(result.x), duals, float(result.obj_val), result.iterations, result.solve_time)
+        hessian = np.zeros(self.variables) if quadratic is None else quadratic
+        around = np.zeros(self.variables)
+        status, attempts, iterations, seconds = "", 0, 0, 0.0
+        close = list(_POSES)
+        for tolerance in _TOLERANCES:
+            for way in tuple(close):
+                pose = restated(self._rows, objective, hessian, around, way.around)
+                result = _solve(pose, way, tolerance)
+                attempts, iterations = attempts + 1, iterations + result.iterations
+                seconds += result.solve_time
+                x = pose.point(np.array(result.x))
+                if result.status == clarabel.SolverStatus.Solved:
+                    value = float(objective @ x + 0.5 * hessian @ x**2)
+                    duals = self._duals(pose, np.array(result.z))
+                    return Solution(x, duals, value, iterations, seconds, tolerance, attempts)
+                status = status or str(result.status)
+                if result.status in _FINAL and way.around is None:
+                    raise SolverError(name, str(result.status))
+                if result.status != clarabel.SolverStatus.AlmostSolved:
+                    close.remove(way)
+                if way.around is None and np.all(np.isfinite(x)):
+                    around = x
+        raise SolverError(name, status)
+
+    def _duals(self, pose: Pose, z: Array) -> tuple[Array, ...]:
+        ends = np.cumsum([len(rows.f) for rows in self._rows])[:-1]
+        return tuple(dual / scale for dual, scale in zip(pose.duals(np.split(z, ends)), self._scales, strict=True))
+
+
+def _solve(pose: Pose, way: _Pose, tolerance: float) -> clarabel.DefaultSolution:
+    A = scipy.sparse.csc_matrix(-np.vstack([block.F for block in pose.rows]))
+    b = np.concatenate([block.f for block in pose.rows])
+    hessian = np.diag(pose.hessian) if pose.hessian.ndim == 1 else np.triu(pose.hessian)
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.max_iter = 200
+    settings.max_threads = 1
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
+    # `AlmostSolved` then means that the loosest tolerance was reached.
+    settings.reduced_tol_gap_abs = settings.reduced_tol_gap_rel = settings.reduced_tol_feas = _TOLERANCES[-1]
+    settings.max_step_fraction = way.step
+    settings.equilibrate_max_iter = way.equilibrations
+    cones = [_cone(block) for block in pose.rows]
+    return clarabel.DefaultSolver(scipy.sparse.csc_matrix(hessian), pose.objective, A, b, cones, settings).solve()
+
+
+def _cone(rows: Rows) -> object:
+    match rows.cone:
+        case "zero":
+            return clarabel.ZeroConeT(len(rows.f))
+        case "nonnegative":
+            return clarabel.NonnegativeConeT(len(rows.f))
+        case "second_order":
+            return clarabel.SecondOrderConeT(len(rows.f))
+        case "exponential":
+            return clarabel.ExponentialConeT()
+        case "semidefinite":
+            return clarabel.PSDTriangleConeT(rows.size)
 
 
 def triangle_entries(size: int) -> list[tuple[int, int]]:

@@ -15,6 +15,7 @@ import numpy as np
 from ident_service.estimation.equations import Equations
 from ident_service.estimation.least_squares import LeastSquares
 from ident_service.model.chain import Array
+from ident_service.model.threads import one_blas_thread
 
 Verdict = Literal["identified", "weak", "unidentified"]
 
@@ -24,6 +25,7 @@ IDENTIFIED_BELOW = 0.10
 WEAK_BELOW = 0.50
 
 
+@one_blas_thread()
 def block_covariance(equations: Equations, fit: LeastSquares) -> Array:
     """Covariance of the unconstrained estimate, shape (base, base), SI units.
 
@@ -33,8 +35,8 @@ def block_covariance(equations: Equations, fit: LeastSquares) -> Array:
     meat = np.zeros((size, size))
     bread = fit.inverse @ fit.inverse.T
     for block in equations.blocks:
-        score = block.scores(fit.beta)
-        W = block.stacked()[:-1, :-1]
+        score = block.scores(fit.beta, fit.weights)
+        W = block.stacked(fit.weights)[:-1, :-1]
         # Leave-one-block-out: the score times (1 - leverage)^-1, solved in the block's own small space.
         leverage = W @ bread @ W.T
         correction = np.linalg.lstsq(np.eye(size) - leverage, W @ (bread @ score), rcond=None)[0]

@@ -6,21 +6,49 @@ bounded: when there are too many, neighbours merge in pairs and blocks become lo
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import reduce
 
 import numpy as np
+import scipy.signal
+from numpy.typing import NDArray
 
 from ident_service.config.schema import Identification
 from ident_service.errors import RecordingError
-from ident_service.estimation.smoothing import Motion, smoothed
+from ident_service.estimation.periodic import averaged
+from ident_service.estimation.smoothing import Motion, smoothed, windows
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters
+from ident_service.model.chain import Array
 from ident_service.model.information import Information, information_of, supports
 from ident_service.model.regressor import joint_regressor
+from ident_service.model.threads import one_blas_thread
 from ident_service.record.recording import Recording
 
 MAX_BLOCKS = 256
+_CHUNK = 4096  # samples whose regressor is computed at once
+_DECAY = 28.0  # -ln(1e-12)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Equations of consecutive samples.
+
+    Attributes:
+        time: [s] since the recording's first sample, shape (samples,).
+        H_b: base regressor, shape (joints, base, samples).
+        torque: [N m or N], shape (samples, joints).
+        keep: which of them an estimate is fitted to, shape (samples, joints).
+    """
+
+    time: Array
+    H_b: Array
+    torque: Array
+    keep: NDArray[np.bool_]
+
+
+RowWeights = Callable[[Rows], Array]
 
 
 @dataclass(frozen=True)
@@ -28,61 +56,147 @@ class Equations:
     """What recordings say about the base parameters.
 
     Attributes:
-        blocks: information of consecutive stretches of time.
+        blocks: information of consecutive stretches of time, rows near a velocity reversal left out.
         samples: smoothed samples that went in.
+        left_out: information of the rows that the blocks leave out; eq. 84 is about all rows.
     """
 
     blocks: tuple[Information, ...]
     samples: int
+    left_out: Information | None = None
 
     @property
     def total(self) -> Information:
-        """All blocks together."""
+        """All blocks together: what an estimate is fitted to."""
         return reduce(Information.merged, self.blocks)
+
+    @property
+    def everything(self) -> Information:
+        """All rows, also those that no estimate is fitted to: what an estimate is judged on."""
+        return self.total if self.left_out is None else self.total.merged(self.left_out)
+
+    def with_torques_times(self, scales: Array) -> Equations:
+        """The same equations with each joint's torque multiplied, `scales` of shape (joints,)."""
+        left_out = None if self.left_out is None else self.left_out.with_torques_times(scales)
+        return Equations(tuple(block.with_torques_times(scales) for block in self.blocks), self.samples, left_out)
 
     def joined(self, other: Equations) -> Equations:
         """The equations of both."""
-        return Equations(_bounded([*self.blocks, *other.blocks]), self.samples + other.samples)
+        parts = [part for part in (self.left_out, other.left_out) if part is not None]
+        return Equations(
+            _bounded([*self.blocks, *other.blocks]),
+            self.samples + other.samples,
+            reduce(Information.merged, parts) if parts else None,
+        )
 
 
-def equations(recording: Recording, model: ArmModel, base: BaseParameters) -> Equations:
+@one_blas_thread()
+def equations(
+    recording: Recording, model: ArmModel, base: BaseParameters, row_weights: RowWeights | None = None
+) -> Equations:
     """Read a recording once and keep what it knows.
+
+    Args:
+        recording: to read.
+        model: its configuration says how to smooth.
+        base: grouping of the parameters.
+        row_weights: what each kept row is multiplied by, shape (samples, joints); ones when None.
 
     Raises:
         RecordingError: the recording does not fit the arm, or no joint moves enough to give an equation.
     """
-    if recording.joints != model.chain.joints:
-        raise RecordingError(
-            recording.path, f"has {recording.joints} joints but the arm {model.config.name} has {model.chain.joints}"
-        )
-    options: Identification = model.config.identification
     joint_supports = supports(model.chain, model.layout, base.base)
     blocks: list[Information] = []
-    samples = 0
-    for motion in smoothed(recording, options):
-        samples += len(motion.time)
-        length = len(motion.time)
-        step = max(1, round(options.block / float(np.median(np.diff(motion.time))))) if length > 1 else 1
-        count = max(1, round(length / step))
-        for part in np.array_split(np.arange(length), count):
-            H_b = joint_regressor(
-                model.chain,
-                model.layout,
-                motion.position[part],
-                motion.velocity[part],
-                motion.acceleration[part],
-                base.base,
-            )
-            blocks.append(information_of(H_b, motion.torque[part], motion.keep[part], joint_supports))
+    left_out: Information | None = None
+    samples, current, origin = 0, -1.0, 0.0
+    for rows in equation_rows(recording, model, base):
+        origin = rows.time[0] if samples == 0 else origin
+        samples += len(rows.time)
+        # Blocks are stretches of time, whatever the rate after decimation and wherever chunks meet.
+        number = np.floor((rows.time - origin) / model.config.identification.block + 1e-9)
+        starts = np.flatnonzero(np.diff(number)) + 1
+        weights = None if row_weights is None else row_weights(rows)
+        for begin, end in zip([0, *starts], [*starts, len(rows.time)], strict=True):
+            part = slice(begin, end)
+            weighted = None if weights is None else weights[part]
+            block = information_of(rows.H_b[:, :, part], rows.torque[part], rows.keep[part], joint_supports, weighted)
+            if number[begin] == current:
+                blocks[-1] = blocks[-1].merged(block)
+            else:
+                blocks.append(block)
+            current = number[begin]
+        rest = information_of(rows.H_b, rows.torque, ~rows.keep, joint_supports)
+        left_out = rest if left_out is None else left_out.merged(rest)
         blocks = list(_bounded(blocks))
-    result = Equations(tuple(blocks), samples)
-    still = [name for name, rows in zip(model.chain.names, result.total.rows, strict=True) if rows == 0]
+    result = Equations(tuple(blocks), samples, left_out)
+    still = [name for name, count in zip(model.chain.names, result.total.rows, strict=True) if count == 0]
     if still:
         raise RecordingError(
             recording.path,
             f"{', '.join(still)}: never faster than identification.reversal.speed, nothing to identify from",
         )
     return result
+
+
+def equation_rows(recording: Recording, model: ArmModel, base: BaseParameters) -> Iterator[Rows]:
+    """The equations themselves, in chunks, for what needs more than one pass.
+
+    Raises:
+        RecordingError: the recording does not fit the arm or cannot be smoothed.
+    """
+    if recording.joints != model.chain.joints:
+        raise RecordingError(
+            recording.path, f"has {recording.joints} joints but the arm {model.config.name} has {model.chain.joints}"
+        )
+    options = model.config.identification
+    if options.smoothing.regressor_cutoff is not None:
+        yield from _filtered_rows(recording, model, base, options.smoothing.regressor_cutoff)
+        return
+    H: Array | None = None
+    motions = smoothed(recording, options, model.chain.coupling, model.config.recording)
+    if options.period is not None:
+        mean = averaged(recording, options, options.period, model.chain.coupling, model.config.recording)
+        motions = iter([mean.motion])
+    for motion in motions:
+        for start in range(0, len(motion.time), _CHUNK):
+            part = motion[slice(start, start + _CHUNK)]
+            reuse = H if H is not None and H.shape[2] >= len(part.time) else None
+            regressor = _regressor(part, model, base, reuse)
+            H = regressor if reuse is None else H
+            yield Rows(part.time, regressor, part.torque, part.keep)
+
+
+def _regressor(motion: Motion, model: ArmModel, base: BaseParameters, out: Array | None = None) -> Array:
+    return joint_regressor(
+        model.chain,
+        model.layout,
+        motion.position,
+        motion.velocity,
+        motion.acceleration,
+        base.base,
+        out,
+        motion.direction,
+    )
+
+
+def _filtered_rows(recording: Recording, model: ArmModel, base: BaseParameters, cutoff: float) -> Iterator[Rows]:
+    """Both sides of eq. 59 through the same zero-phase low-pass, so that what it does to one it does to the other."""
+    options = model.config.identification
+    slowest = 2.0 * np.pi * cutoff * np.sin(np.pi / (2 * options.smoothing.order))
+    step, offset = options.smoothing.decimate, 0
+    memory = _DECAY / slowest
+    for window in windows(recording, options, model.chain.coupling, model.config.recording, memory):
+        motion = window.motion
+        rate = 1.0 / float(np.median(np.diff(motion.time)))
+        sos = scipy.signal.butter(options.smoothing.order, cutoff, fs=rate, output="sos")
+        inner = np.arange(len(motion.time))[window.inner][(-offset) % step :: step]
+        offset += len(range(len(motion.time))[window.inner])
+        H = _regressor(motion, model, base)
+        filtered = np.zeros((*H.shape[:2], len(inner)))
+        for joint, support in enumerate(supports(model.chain, model.layout, base.base)):
+            filtered[joint, support] = scipy.signal.sosfiltfilt(sos, H[joint, support], axis=-1)[:, inner]
+        torque = scipy.signal.sosfiltfilt(sos, motion.torque, axis=0)
+        yield Rows(motion.time[inner], filtered, torque[inner], motion.keep[inner])
 
 
 def _bounded(blocks: list[Information]) -> tuple[Information, ...]:
@@ -92,7 +206,7 @@ def _bounded(blocks: list[Information]) -> tuple[Information, ...]:
     return tuple(blocks)
 
 
-def kept_motion(recording: Recording, options: Identification) -> Motion:
+def kept_motion(recording: Recording, options: Identification, coupling: Array | None = None) -> Motion:
     """All smoothed samples of a recording at once, for scoring and drawing short recordings."""
-    parts = list(smoothed(recording, options))
+    parts = list(smoothed(recording, options, coupling))
     return Motion(*(np.concatenate([getattr(part, name) for part in parts]) for name in Motion.__dataclass_fields__))

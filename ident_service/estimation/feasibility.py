@@ -6,20 +6,34 @@ second-order cones: the Schur complements of eqs. 54 and 73 say the same with ma
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ident_service.errors import ParameterError
-from ident_service.estimation.conic import ConicProblem
-from ident_service.estimation.feasible_set import Block, FeasibleSet
+from ident_service.estimation.conic import ConicProblem, Solution
+from ident_service.estimation.consistency import ConditionsError
+from ident_service.estimation.feasible_set import FeasibleSet
 from ident_service.estimation.least_squares import LeastSquares
+from ident_service.estimation.metric import whitening
+from ident_service.estimation.nearest import FeasibleEstimate, nearest
+from ident_service.estimation.posing import EPSILON, Lift, check, constrain, minimise, pressing
+from ident_service.estimation.priors import Prior, towards_prior
+from ident_service.estimation.torque_scales import constrained_least_squares_with_scales
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 
-EPSILON = 1e-6  # eq. 21, the paper's margin
-_MULTIPLIER = 1e-6  # smaller ones are the interior-point method's own distance from the boundary
+__all__ = [
+    "EPSILON",
+    "ConditionsError",
+    "FeasibilityTest",
+    "FeasibleEstimate",
+    "constrained_least_squares",
+    "constrained_least_squares_with_scales",
+    "feasibility_correction",
+    "feasibility_test",
+]
+
+EQUALITY_TOLERANCE = 1e-6  # of an equality in a test, in units of its reference scale
 _LARGEST_MARGIN = 1e3  # where nothing in the table bounds the margin, any larger one says no more
 
 
@@ -29,54 +43,21 @@ class FeasibilityTest:
 
     Attributes:
         feasible: whether a real body could have these base parameters.
-        margin: largest t with D(beta, delta_d) - t 1 >= 0; its sign is the verdict.
+        margin: largest t with D(beta, delta_d) - t 1 >= 0 in SI units; its sign is the verdict. Where an equality
+            cannot hold, minus the amount by which it does not.
         delta: link parameters that attain it, shape (parameters,).
         tight: names of the blocks that keep the margin from being larger, the most decisive first.
+        scaled_margin: largest t with D - t S >= 0, S the reference scales of `blocks.py`; of the same sign.
+        shares: of the scaled margin: the blocks that keep it from being larger and the share of each, largest first.
+            A share is what the scaled margin would gain if that block alone asked for one unit less; they add up to 1.
     """
 
     feasible: bool
     margin: float
     delta: Array
     tight: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class FeasibleEstimate:
-    """A feasible point that is optimal for something.
-
-    Attributes:
-        beta: base parameters, shape (base,).
-        delta: link parameters with K delta = beta, shape (parameters,).
-        objective: what was minimised (a distance in the space of beta, or a residual norm).
-        margin: smallest eigenvalue of all blocks at delta.
-        tight: names of the blocks that keep the objective from being smaller, the most decisive first.
-        iterations: of the solver.
-        solver_seconds: inside the solver.
-    """
-
-    beta: Array
-    delta: Array
-    objective: float
-    margin: float
-    tight: tuple[str, ...]
-    iterations: int
-    solver_seconds: float
-
-
-class _Lift:
-    """The bijection (beta, delta_d) -> delta of eq. 49, for any grouping whose K has full row rank."""
-
-    def __init__(self, base: BaseParameters) -> None:
-        inverse = np.linalg.inv(base.K[:, base.base])
-        self.dependent = base.dependent
-        self.of_beta = np.zeros((len(base.names), base.size))
-        self.of_beta[base.base] = inverse
-        self.of_dependent = np.zeros((len(base.names), len(self.dependent)))
-        self.of_dependent[base.base] = -inverse @ base.K[:, self.dependent]
-        self.of_dependent[self.dependent, np.arange(len(self.dependent))] = 1.0
-
-    def delta(self, beta: Array, dependent: Array) -> Array:
-        return np.asarray(self.of_beta @ beta + self.of_dependent @ dependent)
+    scaled_margin: float = float("nan")
+    shares: tuple[tuple[str, float], ...] = ()
 
 
 def feasibility_test(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> FeasibilityTest:
@@ -91,92 +72,104 @@ def feasibility_test(beta: Array, base: BaseParameters, conditions: FeasibleSet)
         ParameterError: shapes or names do not fit.
         SolverError: the solver stopped without an optimum.
     """
-    _check(beta, base, conditions)
-    lift = _Lift(base)
+    check(beta, base, conditions)
+    lift = Lift(base)
     fixed = lift.of_beta @ beta
-    dependents = len(lift.dependent)
-    problem = ConicProblem(dependents + 1)
-    for block in conditions.blocks:
-        F = np.column_stack([block.F @ lift.of_dependent, -block.identity()])
-        _constrain(problem, block, F, block.f + block.F @ fixed)
-    problem.nonnegative(np.append(np.zeros(dependents), -1.0)[None], np.array([_LARGEST_MARGIN]))
-    solution = problem.minimise(np.append(np.zeros(dependents), -1.0), "feasibility test")
-    delta = lift.delta(beta, solution.x[:dependents])
-    margin, _ = conditions.margin(delta)
-    return FeasibilityTest(margin > 0.0, margin, delta, _tight(conditions, solution.duals))
-
-
-def feasibility_correction(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> FeasibleEstimate:
-    """The feasible base parameters nearest to `beta` in the Euclidean metric of its units (BPFC, eq. 55).
-
-    Raises:
-        ParameterError: shapes or names do not fit.
-        SolverError: the solver stopped without an optimum.
-    """
-    _check(beta, base, conditions)
-    return _nearest(np.eye(base.size), beta, base, conditions, "feasibility correction")
-
-
-def constrained_least_squares(fit: LeastSquares, base: BaseParameters, conditions: FeasibleSet) -> FeasibleEstimate:
-    """The feasible base parameters that explain the torques best (FBPE-OLS, eq. 74).
-
-    `objective` is |rho_1 - R_1 beta|, the part of the residual that beta can change (eq. 70).
-
-    Raises:
-        ParameterError: shapes or names do not fit.
-        SolverError: the solver stopped without an optimum.
-    """
-    _check(fit.beta, base, conditions)
-    return _nearest(fit.R1, fit.rho1, base, conditions, "constrained least squares")
-
-
-def _nearest(
-    metric: Array, target: Array, base: BaseParameters, conditions: FeasibleSet, name: str
-) -> FeasibleEstimate:
-    """Minimise |metric beta - target| over feasible beta."""
-    lift = _Lift(base)
-    n, dependents = base.size, len(lift.dependent)
-    problem = ConicProblem(n + dependents + 1)
-    scale = max(float(np.linalg.norm(metric, axis=0).max()), np.finfo(float).tiny)
-    distance = np.zeros((n + 1, n + dependents + 1))
-    distance[0, -1] = 1.0
-    distance[1:, :n] = metric / scale
-    problem.second_order(distance, np.concatenate([[0.0], -target / scale]))
-    for block in conditions.blocks:
-        F = np.column_stack([block.F @ lift.of_beta, block.F @ lift.of_dependent, np.zeros(len(block.f))])
-        _constrain(problem, block, F, block.f - EPSILON * block.identity())
-    solution = problem.minimise(np.append(np.zeros(n + dependents), 1.0), name)
-    beta = solution.x[:n]
-    delta = lift.delta(beta, solution.x[n:-1])
-    margin, _ = conditions.margin(delta)
-    return FeasibleEstimate(
-        beta=beta,
-        delta=delta,
-        objective=float(np.linalg.norm(metric @ beta - target)),
+    E, e = conditions.equality_rows()
+    E_d, e = E @ lift.of_dependent, e + E @ fixed
+    closest: Array = np.linalg.pinv(E_d) @ -e if len(e) else np.zeros(len(lift.dependent))
+    residual = E_d @ closest + e
+    if np.max(np.abs(residual), initial=0.0) > EQUALITY_TOLERANCE:
+        return _unequal(lift.delta(beta, closest), conditions)
+    plain, scaled = (_largest_margin(lift, fixed, (E_d, e - residual), conditions, scaled) for scaled in (False, True))
+    # Either point bounds both margins from below, so the two cannot disagree about the sign.
+    found = [lift.delta(beta, solution.x[:-1]) for solution in (plain, scaled)]
+    margin, first = max((conditions.margin(delta)[0], -i) for i, delta in enumerate(found))
+    return FeasibilityTest(
+        feasible=margin > 0.0,
         margin=margin,
-        tight=_tight(conditions, solution.duals[1:]),
-        iterations=solution.iterations,
-        solver_seconds=solution.seconds,
+        delta=found[-first],
+        tight=pressing(conditions, plain.duals),
+        scaled_margin=max(conditions.scaled_margin(delta)[0] for delta in found),
+        shares=_shares(conditions, scaled),
     )
 
 
-def _constrain(problem: ConicProblem, block: Block, F: Array, f: Array) -> None:
-    if block.size == 0:
-        problem.nonnegative(F, f)
-        return
-    problem.semidefinite(F, f, block.size)
+def _largest_margin(
+    lift: Lift, fixed: Array, equalities: tuple[Array, Array], conditions: FeasibleSet, scaled: bool
+) -> Solution:
+    dependents = len(lift.dependent)
+    problem = ConicProblem(dependents + 1)
+    for block in conditions.blocks:
+        unit = block.reference_identity() if scaled else block.identity()
+        constrain(problem, block, np.column_stack([block.times(lift.of_dependent), -unit]), block.f + block.F @ fixed)
+    problem.nonnegative(np.append(np.zeros(dependents), -1.0)[None], np.array([_LARGEST_MARGIN]))
+    E, e = equalities
+    if len(e):
+        problem.zero(np.column_stack([E, np.zeros(len(e))]), e)
+    to_delta = np.column_stack([lift.of_dependent, np.zeros(len(fixed))])
+    objective = np.append(np.zeros(dependents), -1.0)
+    size = float(np.max(np.abs(fixed), initial=0.0))
+    return minimise(problem, objective, "feasibility test", (to_delta, fixed), conditions, size=size)
 
 
-def _tight(conditions: FeasibleSet, duals: Sequence[Array]) -> tuple[str, ...]:
-    """Blocks with a multiplier that counts: relaxing them would let the optimum improve."""
-    weights = [float(np.abs(dual).max()) for dual in duals[: len(conditions.blocks)]]
+def _shares(conditions: FeasibleSet, solution: Solution) -> tuple[tuple[str, float], ...]:
+    """What each multiplier weighs against S: optimality of t makes the weights add up to 1."""
+    weights = [
+        max(float(np.sum(block.reference_identity() * dual)), 0.0)
+        for block, dual in zip(conditions.blocks, solution.duals, strict=False)
+    ]
+    total = max(sum(weights), np.finfo(float).tiny)
     order = sorted(range(len(weights)), key=lambda i: -weights[i])
-    floor = max(_MULTIPLIER, 1e-3 * max(weights))
-    return tuple(conditions.blocks[i].name for i in order if weights[i] > floor)
+    return tuple((conditions.blocks[i].name, weights[i] / total) for i in order if weights[i] > 1e-3 * total)
 
 
-def _check(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> None:
-    if beta.shape != (base.size,):
-        raise ParameterError(f"{beta.shape=} but there are {base.size} base parameters")
-    if conditions.names != base.names:
-        raise ParameterError("the feasible set and the base parameters are about different link parameters")
+def _unequal(delta: Array, conditions: FeasibleSet) -> FeasibilityTest:
+    off = {block.name: block.largest_scaled(delta) for block in conditions.equalities}
+    broken = sorted((name for name, value in off.items() if value > EQUALITY_TOLERANCE), key=lambda name: -off[name])
+    plain = max(float(np.max(np.abs(block.F @ delta + block.f))) for block in conditions.equalities)
+    total = sum(off[name] for name in broken)
+    shares = tuple((name, off[name] / total) for name in broken)
+    return FeasibilityTest(False, -plain, delta, tuple(broken), -max(off.values()), shares)
+
+
+def feasibility_correction(
+    beta: Array, base: BaseParameters, conditions: FeasibleSet, covariance: Array | None = None
+) -> FeasibleEstimate:
+    """The feasible base parameters nearest to `beta` (BPFC, eq. 55).
+
+    Args:
+        beta: base parameters in SI units, shape (base,).
+        base: their grouping.
+        conditions: the feasible set.
+        covariance: of `beta`, shape (base, base): distance then is the root of (b - beta)^T covariance^-1 (b - beta)
+            and the result does not depend on which columns are the base; the paper's Euclidean metric of the
+            parameters' units when None.
+
+    Raises:
+        ParameterError: shapes or names do not fit, or the covariance has no inverse.
+        ConditionsError: no parameters at all fulfil the conditions.
+        SolverError: the solver stopped without an optimum.
+    """
+    check(beta, base, conditions)
+    metric = np.eye(base.size) if covariance is None else whitening(covariance, base)
+    return nearest(metric, metric @ beta, beta, base, conditions, "feasibility correction")
+
+
+def constrained_least_squares(
+    fit: LeastSquares, base: BaseParameters, conditions: FeasibleSet, prior: Prior | None = None
+) -> FeasibleEstimate:
+    """The feasible base parameters that explain the torques best (FBPE-OLS, eq. 74).
+
+    `objective` is |rho_1 - R_1 beta|, the part of the residual that beta can change (eq. 70). With a prior, what is
+    minimised is |rho_1 - R_1 beta|^2 / sigma^2 + weight * divergence(delta, prior), see `priors.py`.
+
+    Raises:
+        ParameterError: shapes or names do not fit, or the prior is not one that a divergence can be measured from.
+        ConditionsError: no parameters at all fulfil the conditions.
+        SolverError: the solver stopped without an optimum.
+    """
+    check(fit.beta, base, conditions)
+    if prior is None or prior.weight == 0.0:
+        return nearest(fit.R1, fit.rho1, fit.beta, base, conditions, "constrained least squares")
+    return towards_prior(fit, base, conditions, prior)

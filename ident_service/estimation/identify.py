@@ -3,28 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
+from typing import get_args
 
 import numpy as np
 
+from ident_service.config.schema import FeasibleSetName, Method
 from ident_service.errors import UsageError
-from ident_service.estimation.doubt import Verdict, block_covariance, verdicts
+from ident_service.estimation.doubt import Verdict, verdicts
 from ident_service.estimation.equations import Equations, equations
 from ident_service.estimation.feasibility import (
     FeasibilityTest,
+    FeasibleEstimate,
     constrained_least_squares,
     feasibility_correction,
     feasibility_test,
 )
 from ident_service.estimation.feasible_set import FeasibleSet, SetName, feasible_set
-from ident_service.estimation.least_squares import LeastSquares, TorqueError, ordinary_least_squares, torque_error
+from ident_service.estimation.fit import Fit, Prepared, prepare, unconstrained
+from ident_service.estimation.least_squares import (
+    LeastSquares,
+    TorqueError,
+    ordinary_least_squares,
+    torque_error,
+)
+from ident_service.estimation.priors import Prior, choose_weight
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters, base_parameters
 from ident_service.model.chain import Array
+from ident_service.model.information import Information
+from ident_service.model.threads import one_blas_thread
 from ident_service.record.recording import Recording
 
-METHODS = ("ols",)
+_HELD_OUT = 1.0 / 3.0
+_WEIGHTS = (0.0, *(10.0**k for k in range(-3, 5)))
+_SETS: tuple[FeasibleSetName, ...] = ("inertia", "pseudo_inertia")
+METHODS: tuple[Method, ...] = get_args(Method)
 
 
 @dataclass(frozen=True)
@@ -44,7 +59,7 @@ class Candidate:
         name: for tables.
         beta: base parameters, shape (base,).
         margin: of the feasibility test under the arm's conditions; its sign is the verdict.
-        identification: error on the equations it was fitted to.
+        identification: error on all rows of the recordings it was fitted to.
         validation: errors on recordings that it never saw.
     """
 
@@ -60,9 +75,9 @@ class Estimate:
     """An identified parameter set with everything needed to doubt it.
 
     Attributes:
-        model: the arm.
+        model: the arm, with what the recordings said of its friction's shape.
         base: grouping of the parameters.
-        method: estimator.
+        method: estimator of the unconstrained fit.
         conditions: the feasible set it was held against.
         constrained: whether it was forced into that set.
         beta: base parameters in SI units, shape (base,).
@@ -75,6 +90,9 @@ class Estimate:
         verdicts: one per base parameter.
         fit: the unconstrained least squares.
         samples: smoothed samples used.
+        prepared: the equations, and what had to be found before them: friction's shape, delay, torque constants.
+        fitted: the equations that the fit solves, for what else is to be asked of them (bootstrap, essential ones).
+        prior: what the constrained estimates were drawn to, where they were.
         recordings: name and hash of what it was fitted to.
         candidates: the estimates of table 8, this one's among them.
         chosen: index of this estimate among the candidates.
@@ -82,7 +100,7 @@ class Estimate:
 
     model: ArmModel
     base: BaseParameters
-    method: str
+    method: Method
     conditions: FeasibleSet
     constrained: bool
     beta: Array
@@ -95,6 +113,9 @@ class Estimate:
     verdicts: tuple[Verdict, ...]
     fit: LeastSquares
     samples: int
+    prepared: Prepared
+    fitted: Equations
+    prior: Prior | None
     recordings: tuple[tuple[str, str], ...]
     candidates: tuple[Candidate, ...]
     chosen: int
@@ -105,72 +126,66 @@ class Estimate:
         return self.margin > 0.0
 
 
+@one_blas_thread()
 def identify(
     model: ArmModel,
     recordings: Sequence[Recording],
     validation: Sequence[Recording] = (),
     *,
-    method: str = "ols",
+    method: Method | None = None,
     set_name: SetName | None = None,
 ) -> Estimate:
     """Identify an arm from recordings.
 
     Args:
-        model: the arm.
+        model: the arm; its configuration says how to smooth, and what else to fit (delay, shape of the friction).
         recordings: to fit to; at least one.
         validation: to judge on; never used for the fit.
-        method: one of METHODS.
+        method: estimator, the configuration's when None.
         set_name: feasible set to hold the estimate in, `none` for none; the configuration's when None.
 
     Raises:
-        UsageError: unknown method, no recordings, or a validation recording that was also fitted to.
+        UsageError: unknown method, no recordings, the same recording twice, or no prior where one is asked for.
         RecordingError: a recording does not fit the arm or cannot be used.
         SolverError: the solver stopped without an optimum.
     """
-    if method not in METHODS:
-        raise UsageError(f"method {method!r} is not one of {', '.join(METHODS)}")
-    if not recordings:
-        raise UsageError("give at least one recording to identify from")
-    fitted = {recording.sha256 for recording in recordings}
-    if seen := [str(recording.path) for recording in validation if recording.sha256 in fitted]:
-        raise UsageError(f"{', '.join(seen)}: a recording that is fitted to cannot validate the fit")
+    method = method or model.config.identification.method
+    _check(method, recordings, validation)
     base = base_parameters(model.chain, model.layout)
-    gathered = reduce(Equations.joined, (equations(recording, model, base) for recording in recordings))
-    unseen = [(recording, equations(recording, model, base)) for recording in validation]
-    fit = ordinary_least_squares(gathered.total)
-    covariance = block_covariance(gathered, fit)
-    deviations = np.sqrt(np.diag(covariance))
-
-    kind = model.config.feasible_set if set_name in (None, "none") else set_name
-    sets = {name: feasible_set(name, base.names, model.config) for name in ("inertia", "pseudo_inertia")}
+    sets = {name: feasible_set(name, base.names, model.config) for name in _SETS}
+    kind: FeasibleSetName = model.config.feasible_set if set_name is None or set_name == "none" else set_name
     conditions = sets[kind]
-    test = feasibility_test(fit.beta, base, conditions)
-    constrained = {name: constrained_least_squares(fit, base, conditions) for name, conditions in sets.items()}
-    corrected = feasibility_correction(fit.beta, base, conditions)
+
+    prepared = prepare(recordings, model, base, conditions)
+    found = unconstrained(method, recordings, prepared, base, conditions)
+    unseen = [(recording, _unseen(recording, prepared, base)) for recording in validation]
+    prior = _prior(prepared.model, found, base, conditions)
+    test = feasibility_test(found.fit.beta, base, conditions)
+    corrected = feasibility_correction(found.fit.beta, base, conditions)
+    held = {name: constrained_least_squares(found.fit, base, conditions, prior) for name, conditions in sets.items()}
+
+    everything = prepared.equations.everything
+    label = method.upper()
 
     def candidate(name: str, beta: Array, margin: float) -> Candidate:
-        scores = tuple(
-            Scored(recording.path.name, recording.sha256, torque_error(eqs.total, beta)) for recording, eqs in unseen
-        )
-        return Candidate(name, beta, margin, torque_error(gathered.total, beta), scores)
+        scores = tuple(Scored(one.path.name, one.sha256, torque_error(rows, beta)) for one, rows in unseen)
+        return Candidate(name, beta, margin, torque_error(everything, beta), scores)
 
-    candidates = (
-        candidate("OLS", fit.beta, test.margin),
+    def tested(name: FeasibleSetName, estimate: FeasibleEstimate) -> float:
+        return estimate.margin if name == kind else feasibility_test(estimate.beta, base, conditions).margin
+
+    candidates = [
+        candidate(label, found.fit.beta, test.margin),
         candidate("BPFC", corrected.beta, corrected.margin),
-        candidate(
-            "FBPE-OLS inertia", constrained["inertia"].beta, _margin(constrained["inertia"].beta, base, conditions)
-        ),
-        candidate("FBPE-OLS pseudo_inertia", constrained["pseudo_inertia"].beta, constrained["pseudo_inertia"].margin),
-    )
+        *(candidate(f"FBPE-{label} {name}", held[name].beta, tested(name, held[name])) for name in _SETS),
+    ]
     free = set_name == "none"
-    chosen = 0 if free else ("inertia", "pseudo_inertia").index(kind) + 2
+    chosen = 0 if free else 2 + _SETS.index(kind)
     beta = candidates[chosen].beta
-    delta: Array | None = constrained[kind].delta
-    margin, tight = constrained[kind].margin, constrained[kind].tight
-    if free:
-        delta, margin, tight = _of_test(test)
+    delta, margin, tight = _of_test(test) if free else (held[kind].delta, held[kind].margin, held[kind].tight)
+    deviations = np.sqrt(np.diag(found.covariance))
     return Estimate(
-        model=model,
+        model=prepared.model,
         base=base,
         method=method,
         conditions=conditions,
@@ -179,20 +194,63 @@ def identify(
         delta=delta,
         margin=margin,
         tight=tight,
-        covariance=covariance,
+        covariance=found.covariance,
         standard_deviations=deviations,
-        white_standard_deviations=fit.standard_deviations,
+        white_standard_deviations=found.fit.standard_deviations,
         verdicts=verdicts(beta, deviations, base.units),
-        fit=fit,
-        samples=gathered.samples,
+        fit=found.fit,
+        samples=prepared.equations.samples,
+        prepared=prepared,
+        fitted=found.equations,
+        prior=prior,
         recordings=tuple((recording.path.name, recording.sha256) for recording in recordings),
-        candidates=candidates,
+        candidates=tuple(candidates),
         chosen=chosen,
     )
 
 
-def _margin(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> float:
-    return feasibility_test(beta, base, conditions).margin
+def _check(method: str, recordings: Sequence[Recording], validation: Sequence[Recording]) -> None:
+    if method not in METHODS:
+        raise UsageError(f"method {method!r} is not one of {', '.join(METHODS)}")
+    if not recordings:
+        raise UsageError("give at least one recording to identify from")
+    fitted: set[str] = set()
+    for recording in recordings:
+        if recording.sha256 in fitted:
+            raise UsageError(f"{recording.path}: the same recording twice would make the doubt too small")
+        fitted.add(recording.sha256)
+    if seen := [str(recording.path) for recording in validation if recording.sha256 in fitted]:
+        raise UsageError(f"{', '.join(seen)}: a recording that is fitted to cannot validate the fit")
+
+
+def _unseen(recording: Recording, prepared: Prepared, base: BaseParameters) -> Information:
+    return equations(recording, prepared.model, base).with_torques_times(prepared.torque_scales).everything
+
+
+def _prior(model: ArmModel, found: Fit, base: BaseParameters, conditions: FeasibleSet) -> Prior | None:
+    """What the configuration asks constrained estimates to be drawn to."""
+    pull = model.config.identification.prior
+    if pull.kind == "none":
+        return None
+    if model.prior is None:
+        raise UsageError(f"{model.config.name}: identification.prior asks for prior parameters, but the arm has none")
+    if pull.weight != "held_out":
+        return Prior(pull.kind, base.names, model.prior, pull.weight)
+    blocks = found.equations.blocks
+    count = len(blocks) - max(1, round(_HELD_OUT * len(blocks)))
+    if count < 1:
+        raise UsageError("a prior's weight cannot be chosen from so short a recording; give it a number")
+    told, kept_back = (reduce(Information.merged, part) for part in (blocks[:count], blocks[count:]))
+    fit = ordinary_least_squares(told, found.fit.weights)
+    given = Prior(pull.kind, base.names, model.prior, 1.0)
+
+    def estimate(weight: float) -> Array:
+        return constrained_least_squares(fit, base, conditions, replace(given, weight=weight)).beta
+
+    def error(beta: Array) -> float:
+        return float(np.sum(found.fit.weights**2 * kept_back.squared_residuals(beta)))
+
+    return replace(given, weight=choose_weight(estimate, error, _WEIGHTS).weight)
 
 
 def _of_test(test: FeasibilityTest) -> tuple[Array | None, float, tuple[str, ...]]:

@@ -1,4 +1,8 @@
-"""Ordinary least squares from triangular factors, with the paper's standard deviations (eqs. 59-70, 81-84)."""
+"""Least squares from triangular factors, with the paper's standard deviations (eqs. 59-70, 81-84).
+
+Ordinary least squares gives every joint's equations the same weight; weighted least squares divides them by the joint's
+own residual (Gautier 1997), which needs no second look at the data, because factors are kept per joint.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
+from ident_service.errors import ModelError
 from ident_service.model.chain import Array
 from ident_service.model.information import Information
 
 _RANK_TOLERANCE = 1e-10
+_SETTLED = 1e-9
+_MOST_ROUNDS = 500
 
 
 @dataclass(frozen=True)
@@ -26,6 +33,7 @@ class LeastSquares:
         condition_number: of W (2-norm, SI units); infinite when W has not full rank.
         rank: of W.
         standard_deviations: eq. 81, which takes residuals for white, shape (base,); infinite where W is blind.
+        weights: per joint, what its equations were multiplied by, shape (joints,).
     """
 
     beta: Array
@@ -36,11 +44,37 @@ class LeastSquares:
     condition_number: float
     rank: int
     standard_deviations: Array
+    weights: Array
 
 
-def ordinary_least_squares(information: Information) -> LeastSquares:
-    """Minimise |omega - W beta| (eq. 60) from the factors of the equations."""
-    stacked = information.stacked()
+def weighted_least_squares(information: Information) -> LeastSquares:
+    """Each joint's equations divided by its own residual's deviation, repeated until neither changes.
+
+    Raises:
+        ModelError: the weights do not settle, which means that some joint's residual vanishes.
+    """
+    fit = ordinary_least_squares(information)
+    floor = 1e-9 * np.sqrt(information.squared_torques() / np.maximum(information.rows, 1))
+    for _ in range(_MOST_ROUNDS):
+        degrees = np.maximum(information.rows - information.base / information.joints, 1)
+        deviations = np.maximum(np.sqrt(information.squared_residuals(fit.beta) / degrees), floor)
+        # Relative to their mean, so that R1, rho1 and the residual keep the size of torques.
+        weights = np.exp(np.mean(np.log(deviations))) / deviations
+        settled = bool(np.all(np.abs(weights - fit.weights) <= _SETTLED * weights))
+        fit = ordinary_least_squares(information, weights)
+        if settled:
+            return fit
+    raise ModelError(f"the weights of the joints do not settle in {_MOST_ROUNDS} rounds: {fit.weights}")
+
+
+def ordinary_least_squares(information: Information, weights: Array | None = None) -> LeastSquares:
+    """Minimise |omega - W beta| (eq. 60) from the factors of the equations.
+
+    Args:
+        information: the equations.
+        weights: per joint, what its equations are multiplied by, shape (joints,); ones when None.
+    """
+    stacked = information.stacked(weights)
     R1, rho1, rho2 = stacked[:-1, :-1], stacked[:-1, -1], abs(float(stacked[-1, -1]))
     # Columns differ by orders of magnitude in SI units; rank is judged on unit columns.
     norms = np.linalg.norm(R1, axis=0)
@@ -63,6 +97,7 @@ def ordinary_least_squares(information: Information) -> LeastSquares:
         condition_number=float(singular[0] / singular[-1]) if rank == information.base else float("inf"),
         rank=rank,
         standard_deviations=np.where(unseen, np.inf, deviations),
+        weights=np.ones(information.joints) if weights is None else weights,
     )
 
 

@@ -1,8 +1,9 @@
 """From positions to positions, velocities and accelerations, without phase (5.2.2).
 
 Third-order Butterworth forwards and backwards, then central differences (five points, fourth order, twice for the
-acceleration). Filtering and differencing commute, so their order does not matter. Runs in overlapping windows: memory
-does not grow with the recording, and what a window's cut ends do has decayed below 1e-12 where windows meet.
+acceleration); filtering and differencing commute, so their order does not matter. Or local polynomials
+(Savitzky-Golay), whose derivatives come with them. Both run in overlapping windows: memory does not grow with the
+recording, and what a window's cut ends do has decayed below 1e-12 where windows meet.
 
 A torque that is held from its stamp to the next (our own recordings) acts, on the average over the two intervals that a
 central difference sees, as the mean of its own and the previous value; that is what stands beside the acceleration.
@@ -18,15 +19,18 @@ import scipy.ndimage
 import scipy.signal
 from numpy.typing import NDArray
 
+from ident_service.config.recording import RecordingFormat
 from ident_service.config.schema import Identification
 from ident_service.errors import RecordingError
+from ident_service.estimation.direction import direction
+from ident_service.record.grid import grid
 from ident_service.record.recording import Block, Recording
+from ident_service.record.segments import Piece, uniform
 
 Array = NDArray[np.float64]
 _WINDOW = 16384
 _DECAY = 28.0  # -ln(1e-12)
 _DIFFERENCE = np.array([1.0, -8.0, 0.0, 8.0, -1.0]) / 12.0
-_JITTER = 0.2
 
 
 @dataclass(frozen=True)
@@ -37,7 +41,8 @@ class Motion:
         time: [s] since the recording's first sample, shape (samples,).
         position, velocity, acceleration: [rad or m and derivatives], shape (samples, joints).
         torque: [N m or N], shape (samples, joints).
-        keep: False where a joint is too near standstill for its friction to be known, shape (samples, joints).
+        keep: False where a drive of the joint is too near standstill for its friction to be known, (samples, joints).
+        direction: of Coulomb friction per drive, between -1 and 1, shape (samples, joints).
     """
 
     time: Array
@@ -46,118 +51,178 @@ class Motion:
     acceleration: Array
     torque: Array
     keep: NDArray[np.bool_]
+    direction: Array | None = None
+
+    def __getitem__(self, part: slice | NDArray[np.intp]) -> Motion:
+        """Some of the samples."""
+        return Motion(
+            self.time[part],
+            self.position[part],
+            self.velocity[part],
+            self.acceleration[part],
+            self.torque[part],
+            self.keep[part],
+            None if self.direction is None else self.direction[part],
+        )
 
 
-def smoothed(recording: Recording, options: Identification) -> Iterator[Motion]:
-    """Smoothed samples of a recording, block by block, its edges left out.
+@dataclass(frozen=True)
+class Window:
+    """Smoothed samples of which only `inner` counts; the rest is there for filters to look at."""
+
+    motion: Motion
+    inner: slice
+
+
+def smoothed(
+    recording: Recording,
+    options: Identification,
+    coupling: Array | None = None,
+    fmt: RecordingFormat | None = None,
+) -> Iterator[Motion]:
+    """Smoothed samples of a recording, block by block; the edges of every stretch without a gap are left out.
+
+    Args:
+        recording: to read.
+        options: how.
+        coupling: drive coordinates per joint coordinates, shape (joints, joints); the identity when None.
+        fmt: what to trim, what a gap is, and the rate; the defaults when None.
 
     Raises:
-        RecordingError: too short for the filter, or stamps too irregular to be differenced.
+        RecordingError: too short for the filter, or what reading the recording raises.
     """
-    first = next(iter(recording.blocks(_WINDOW)), None)
-    if first is None or len(first.stamp_ns) < 2:
-        raise RecordingError(recording.path, "holds no samples; record the motion again")
-    period = float(np.median(np.diff(first.stamp_ns))) * 1e-9
-    if options.smoothing.cutoff >= 0.5 / period:
-        raise RecordingError(
-            recording.path,
-            f"sampled at {1.0 / period:.4g} Hz, too slow for a cut-off of {options.smoothing.cutoff:g} Hz; "
-            "lower identification.smoothing.cutoff",
-        )
-    sos = scipy.signal.butter(options.smoothing.order, options.smoothing.cutoff, fs=1.0 / period, output="sos")
-    slowest = 2.0 * np.pi * options.smoothing.cutoff * np.sin(np.pi / (2 * options.smoothing.order))
-    margin = int(np.ceil(_DECAY / slowest / period)) + int(np.ceil(options.reversal.window / period)) + 4
+    step = options.smoothing.decimate
+    offset = 0
+    for window in windows(recording, options, coupling, fmt):
+        inner = window.motion[window.inner]
+        # Every `step`-th sample of the recording, wherever windows meet.
+        yield inner[slice((-offset) % step, None, step)] if step > 1 else inner
+        offset += len(inner.time)
+
+
+def windows(
+    recording: Recording,
+    options: Identification,
+    coupling: Array | None = None,
+    fmt: RecordingFormat | None = None,
+    extra_margin: float = 0.0,
+) -> Iterator[Window]:
+    """Smoothed samples in windows that overlap by the filter's memory and `extra_margin` [s] on both sides.
+
+    Raises:
+        RecordingError: as for `smoothed`.
+    """
+    fmt = fmt or RecordingFormat()
+    stamps = grid(recording, fmt)
+    period = stamps.period_s
+    smoother = _Smoother(recording, options, period, coupling)
     edge = int(np.ceil(options.edge / period))
-    count = 0
-    for window, start, stop, begin, end in _windows(recording, margin, period):
-        count = begin + len(window.stamp_ns)
-        motion = _smooth(window, options, sos, period, recording.torque_held)
-        # The recording's own edges, where the filter has only one side to look at, are left out.
-        low = max(start, edge - begin)
-        high = min(stop, len(window.stamp_ns) - edge) if end else stop
+    # A window that is not the last must never hold samples of the recording's end edge.
+    margin = max(smoother.margin + int(np.ceil(extra_margin / period)), edge)
+    shortest = max(2.0 * options.edge + 1.0, 2 * margin * period)
+    pieces = uniform(recording, fmt, stamps, shortest_s=shortest, samples=_WINDOW)
+    for window, start, stop, opens, closes in _overlapping(pieces, margin):
+        motion = smoother(window, stamps.first_ns, opens, stop - margin)
+        # At the edges of a stretch the filter has only one side to look at.
+        low = max(start, edge) if opens else start
+        high = min(stop, len(window.stamp_ns) - edge) if closes else stop
         if high > low:
-            yield _part(motion, slice(low, high), begin * period)
-    if count * period < 2.0 * options.edge + 1.0 or count < 2 * margin:
-        shortest = max(2.0 * options.edge + 1.0, 2 * margin * period)
-        raise RecordingError(
-            recording.path,
-            f"{count * period:.3g} s of samples are too few to smooth; at least {shortest:.3g} s are needed",
-        )
+            yield Window(motion, slice(low, high))
 
 
-def _windows(recording: Recording, margin: int, period: float) -> Iterator[tuple[Block, int, int, int, bool]]:
-    """Windows with `margin` samples of overlap: block, inner start and stop, its first sample's index, whether last."""
-    held: list[Block] = []
-    length, begin, left = 0, 0, 0
-    for block in _checked(recording, period):
-        held.append(block)
-        length += len(block.stamp_ns)
-        if length >= _WINDOW + 2 * margin:
-            window = _joined(held)
-            yield window, left, length - margin, begin, False
-            # Keep the margin that was withheld and the margin before it.
-            cut = length - 2 * margin
-            held = [_slice(window, slice(cut, length))]
-            begin, length, left = begin + cut, 2 * margin, margin
-    if length:
-        yield _joined(held), left, length, begin, True
+class _Smoother:
+    """The filter of one recording; its windows must come in order, because friction remembers the way it came."""
 
-
-def _checked(recording: Recording, period: float) -> Iterator[Block]:
-    last: int | None = None
-    index = 0
-    for block in recording.blocks(_WINDOW):
-        stamps = block.stamp_ns if last is None else np.concatenate([[last], block.stamp_ns])
-        steps = np.diff(stamps) * 1e-9
-        if len(steps) and float(np.abs(steps - period).max()) > _JITTER * period:
-            worst = int(np.abs(steps - period).argmax())
+    def __init__(self, recording: Recording, options: Identification, period: float, coupling: Array | None) -> None:
+        smoothing = options.smoothing
+        if smoothing.cutoff >= 0.5 / period:
             raise RecordingError(
                 recording.path,
-                f"irregular stamps: {steps[worst] * 1e3:.3f} ms at sample {index + worst}, "
-                f"where {period * 1e3:.3f} ms are usual; resample the recording to a fixed rate",
+                f"sampled at {1.0 / period:.4g} Hz, too slow for a cut-off of {smoothing.cutoff:g} Hz; "
+                "lower identification.smoothing.cutoff",
             )
-        index += len(block.stamp_ns)
-        last = int(block.stamp_ns[-1])
-        yield block
+        self._options, self._period, self._held = options, period, recording.torque_held
+        self._coupling = np.eye(recording.joints) if coupling is None else coupling
+        presliding = options.friction.presliding
+        if presliding == "fit":
+            presliding = 0.0
+        self._presliding = np.broadcast_to(np.asarray(presliding, dtype=float), (recording.joints,))
+        self._direction: Array | None = None
+        self._delay = 0.0 if options.delay == "estimate" else float(options.delay)
+        self._sos = scipy.signal.butter(smoothing.order, smoothing.cutoff, fs=1.0 / period, output="sos")
+        slowest = 2.0 * np.pi * smoothing.cutoff * np.sin(np.pi / (2 * smoothing.order))
+        memory = _DECAY / slowest
+        if smoothing.method == "savitzky_golay":
+            # The polynomial's window that has about the cut-off asked for (Schafer 2011).
+            half = max(smoothing.order + 2, round((smoothing.order + 1) / (3.2 * 2 * smoothing.cutoff * period) + 0.7))
+            self._length = 2 * half + 1
+            memory = max(half * period, memory if smoothing.filter_torque else 0.0)
+        reach = options.reversal.window + abs(self._delay)
+        self.margin = int(np.ceil(memory / period)) + int(np.ceil(reach / period)) + 4
+
+    def __call__(self, window: Block, first_ns: int, opens: bool, next_begin: int) -> Motion:
+        """Smooth a window; the next one of this stretch will start at `next_begin` of this one."""
+        options = self._options
+        position, velocity, acceleration = self._derivatives(window.position)
+        torque = window.torque
+        if self._held:
+            torque = np.vstack([torque[:1], 0.5 * (torque[:-1] + torque[1:])])
+        if self._delay:
+            steps = self._delay / self._period
+            torque = np.column_stack(
+                [scipy.ndimage.shift(column, -steps, order=3, mode="nearest") for column in torque.T]
+            )
+        if options.smoothing.filter_torque:
+            torque = self._low_pass(torque)
+        rate = velocity @ self._coupling.T
+        near = np.abs(rate) <= options.reversal.speed
+        near[1:] |= np.diff(np.signbit(rate), axis=0)
+        reach = round(options.reversal.window / self._period)
+        if reach:
+            near = scipy.ndimage.binary_dilation(near, np.ones((2 * reach + 1, 1), dtype=bool))
+        keep = ~(near @ (self._coupling != 0.0))
+        way = direction(rate, self._period, self._presliding, None if opens else self._direction)
+        self._direction = way[max(next_begin - 1, 0)]
+        time = np.asarray((window.stamp_ns - first_ns) * 1e-9, dtype=np.float64)
+        return Motion(time, position, velocity, acceleration, torque, keep, way)
+
+    def _derivatives(self, values: Array) -> tuple[Array, Array, Array]:
+        if self._options.smoothing.method == "savitzky_golay":
+            length, degree = min(self._length, len(values) - (len(values) + 1) % 2), self._options.smoothing.order
+            results = [
+                scipy.signal.savgol_filter(values, length, degree, deriv=d, delta=self._period, axis=0)
+                for d in range(3)
+            ]
+            return results[0], results[1], results[2]
+        position = self._low_pass(values)
+        velocity = self._differenced(position)
+        return position, velocity, self._differenced(velocity)
+
+    def _low_pass(self, values: Array) -> Array:
+        # Odd extension as scipy's default, as long as the data allow.
+        pad = min(3 * int(1.0 / (self._options.smoothing.cutoff * self._period)), len(values) - 1)
+        return np.asarray(scipy.signal.sosfiltfilt(self._sos, values, axis=0, padlen=pad))
+
+    def _differenced(self, values: Array) -> Array:
+        return np.asarray(scipy.ndimage.correlate1d(values, _DIFFERENCE / self._period, axis=0, mode="nearest"))
 
 
-def _smooth(window: Block, options: Identification, sos: Array, period: float, held: bool) -> Motion:
-    length = len(window.stamp_ns)
-    # Odd extension as scipy's default, as long as the data allow.
-    pad = min(3 * int(1.0 / (options.smoothing.cutoff * period)), length - 1)
-
-    def low_pass(values: Array) -> Array:
-        return np.asarray(scipy.signal.sosfiltfilt(sos, values, axis=0, padlen=pad))
-
-    position = low_pass(window.position)
-    velocity = _differenced(position, period)
-    acceleration = _differenced(velocity, period)
-    torque = window.torque
-    if held:
-        torque = np.vstack([torque[:1], 0.5 * (torque[:-1] + torque[1:])])
-    if options.smoothing.filter_torque:
-        torque = low_pass(torque)
-    near = np.abs(velocity) <= options.reversal.speed
-    near[1:] |= np.diff(np.signbit(velocity), axis=0)
-    reach = round(options.reversal.window / period)
-    keep = ~scipy.ndimage.binary_dilation(near, np.ones((2 * reach + 1, 1), dtype=bool)) if reach else ~near
-    time = np.arange(length, dtype=np.float64) * period
-    return Motion(time, position, velocity, acceleration, torque, keep)
-
-
-def _differenced(values: Array, period: float) -> Array:
-    return np.asarray(scipy.ndimage.correlate1d(values, _DIFFERENCE / period, axis=0, mode="nearest"))
-
-
-def _part(motion: Motion, part: slice, offset: float) -> Motion:
-    return Motion(
-        motion.time[part] + offset,
-        motion.position[part],
-        motion.velocity[part],
-        motion.acceleration[part],
-        motion.torque[part],
-        motion.keep[part],
-    )
+def _overlapping(pieces: Iterable[Piece], margin: int) -> Iterator[tuple[Block, int, int, bool, bool]]:
+    """Windows of one stretch after the other: block, inner start and stop, whether it opens or closes a stretch."""
+    held: list[Block] = []
+    length, left, opens = 0, 0, True
+    for piece in pieces:
+        held.append(piece.block)
+        length += len(piece.block.stamp_ns)
+        if piece.end:
+            yield _joined(held), left, length, opens, True
+            held, length, left, opens = [], 0, 0, True
+        elif length >= _WINDOW + 2 * margin:
+            window = _joined(held)
+            yield window, left, length - margin, opens, False
+            # Keep the margin that was withheld and the margin before it.
+            held = [_slice(window, slice(length - 2 * margin, length))]
+            length, left, opens = 2 * margin, margin, False
 
 
 def _joined(blocks: Iterable[Block]) -> Block:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -56,7 +56,11 @@ def arm_model(config: ArmConfig) -> ArmModel:
             f"{config.name}: joints are configured as {', '.join(config.joints)} "
             f"but the mechanism has {', '.join(chain.names)}, in this order"
         )
-    layout = Layout(chain.revolute, config.terms)
+    if config.transmission is not None and config.transmission.coupling is not None:
+        chain = replace(chain, coupling=np.array(config.transmission.coupling, dtype=float))
+    velocity = config.identification.friction.stribeck_velocity
+    stribeck = np.broadcast_to(np.asarray(0.1 if velocity == "fit" else velocity, dtype=float), (chain.joints,))
+    layout = Layout(chain.revolute, config.terms, tuple(stribeck.tolist()) if "stribeck" in config.terms else ())
     prior: Array | None = None
     if config.prior is not None:
         prior = layout.vector(config.prior)

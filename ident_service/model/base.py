@@ -69,6 +69,9 @@ def base_parameters(chain: Chain, layout: Layout) -> BaseParameters:
     rng = np.random.default_rng(_SEED)
     samples = max(8, -(-4 * layout.size // chain.joints))
     states = rng.uniform(-np.pi, np.pi, size=(3, samples, chain.joints))
+    if "stribeck" in layout.terms:
+        # Also at the speeds where this term differs from Coulomb friction.
+        states[1, ::2] *= np.array(layout.stribeck_velocity) / np.pi
     H = joint_regressor(chain, layout, *states).transpose(0, 2, 1).reshape(-1, layout.size)
     base, K_d = _first_independent(H)
     K = np.zeros((len(base), layout.size))
@@ -105,8 +108,10 @@ def base_from_expressions(expressions: tuple[str, ...], names: tuple[str, ...]) 
         names: link parameter names that delta consists of.
 
     Raises:
-        ParameterError: expressions that do not parse, use foreign names, or are not independent of each other.
+        ParameterError: no expressions, or ones that do not parse, use foreign names, or depend on each other.
     """
+    if not expressions:
+        raise ParameterError("no expressions: a table of base parameters has at least one")
     K = parameter_matrix(expressions, names)
     _, R, order = scipy.linalg.qr(K.T, mode="economic", pivoting=True)
     rank = int(np.sum(np.abs(np.diag(R)) > _RANK_TOLERANCE * max(1.0, abs(R[0, 0]))))

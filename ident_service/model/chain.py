@@ -9,7 +9,7 @@ Boundary: pure geometry; dynamics are `regressor.py` and `rigid_body.py`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ WORLD = -1
 
 @dataclass(frozen=True, eq=False)  # identity is what a chain is compared and hashed by
 class Chain:
-    """A kinematic tree with joints numbered so that parents come first.
+    """A kinematic tree with joints numbered depth first, as pinocchio needs them: parents, then whole branches.
 
     Attributes:
         names: joint names.
@@ -35,6 +35,8 @@ class Chain:
         link_rotation: link frame to joint frame, shape (joints, 3, 3).
         link_translation: origin of the link frame in the joint frame [m], shape (joints, 3).
         gravity: in the base frame [m/s^2], shape (3,).
+        coupling: drive coordinates per joint coordinates, `d = C q` in the joints' units, shape (joints, joints); the
+            identity where every joint has its own drive. Drive inertia and friction live on the drives.
     """
 
     names: tuple[str, ...]
@@ -46,11 +48,18 @@ class Chain:
     link_rotation: Array
     link_translation: Array
     gravity: Array
+    coupling: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __post_init__(self) -> None:
+        if self.coupling.size == 0:
+            object.__setattr__(self, "coupling", np.eye(len(self.names)))
+        if self.coupling.shape != (len(self.names), len(self.names)):
+            raise ModelError(f"{self.coupling.shape=} but there are {len(self.names)} joints")
         for k, parent in enumerate(self.parents):
             if not WORLD <= parent < k:
                 raise ModelError(f"joint {k} has parent {parent}; parents must come first")
+            if k > 0 and parent != WORLD and parent not in self.ancestors(k - 1):
+                raise ModelError(f"joint {k} has parent {parent}; a branch must be finished before another one begins")
         for array in (
             self.axes,
             self.rotation,
@@ -58,6 +67,7 @@ class Chain:
             self.link_rotation,
             self.link_translation,
             self.gravity,
+            self.coupling,
         ):
             array.setflags(write=False)
 

@@ -44,9 +44,12 @@ def parse_expression(text: str) -> dict[str, float]:
     """Coefficients by name.
 
     Raises:
-        ParameterError: not a sum as in `grammar.py`; the message says where.
+        ParameterError: not a sum as in `grammar.py`, the message says where; or a coefficient too large for a float.
     """
-    return {name: float(coefficient) for name, coefficient in parse_exactly(text).items()}
+    try:
+        return {name: float(coefficient) for name, coefficient in parse_exactly(text).items()}
+    except OverflowError:
+        raise ParameterError(f"a coefficient is too large for a float in {text!r}") from None
 
 
 def parameter_matrix(expressions: Sequence[str], names: Sequence[str]) -> NDArray[np.float64]:

@@ -18,10 +18,9 @@ from ident_service.errors import ParameterError
 
 MAX_LENGTH = 100_000
 MAX_DEPTH = 50
-_END = re.compile(r"\s*$")
-_WORD = re.compile(
-    r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)|(?P<name>[A-Za-z_]\w*)|(?P<sign>[+*()-]))"
-)
+_MAX_DIGITS = 400  # more than any float has
+_SPACE = re.compile(r"\s*")
+_WORD = re.compile(r"(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)|(?P<name>[A-Za-z_]\w*)|(?P<sign>[+*()-]))")
 
 
 def parse_exactly(text: str) -> dict[str, Fraction]:
@@ -41,22 +40,24 @@ def parse_exactly(text: str) -> dict[str, Fraction]:
 class _Parser:
     def __init__(self, text: str) -> None:
         self._text = text
-        self._position = 0
+        self._begin = self._end = 0  # of the word
         self._kind, self._word = "", ""
         self._next()
 
     def _next(self) -> None:
-        if _END.match(self._text, self._position):
+        space = _SPACE.match(self._text, self._end)
+        self._begin = space.end() if space else self._end
+        if self._begin == len(self._text):
             self._kind, self._word = "end", ""
             return
-        match = _WORD.match(self._text, self._position)
+        match = _WORD.match(self._text, self._begin)
         if match is None:
             raise self._error("unexpected character")
-        self._kind, self._word = str(match.lastgroup), match.group(match.lastgroup or 0)
-        self._position = match.end()
+        self._kind, self._word = str(match.lastgroup), match.group()
+        self._end = match.end()
 
     def _error(self, what: str) -> ParameterError:
-        return ParameterError(f"{what} at column {self._position + 1} of {self._text!r}")
+        return ParameterError(f"{what} at column {self._begin + 1} of {self._text!r}")
 
     def expect_end(self) -> None:
         if self._kind != "end":
@@ -86,6 +87,8 @@ class _Parser:
     def _term(self, depth: int) -> dict[str, Fraction]:
         factor = Fraction(1)
         if self._kind == "number":
+            if len(self._word) > _MAX_DIGITS:
+                raise self._error(f"a number of more than {_MAX_DIGITS} digits")
             factor = Fraction(self._word)
             self._next()
             if self._word != "*":

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ident_service.errors import ModelError
 from ident_service.model.chain import Array, Chain
-from ident_service.model.layout import Layout
+from ident_service.model.layout import INERTIAL, Layout
 
 
 @dataclass(frozen=True)
@@ -80,15 +80,30 @@ class Information:
         ]
         return np.array([float(error @ error) for error in errors])
 
+    def with_torques_times(self, scales: Array) -> Information:
+        """The same equations with each joint's torque multiplied, `scales` of shape (joints,)."""
+        factors = []
+        for scale, factor in zip(scales, self.factors, strict=True):
+            scaled = factor.copy()
+            scaled[:, -1] *= scale
+            factors.append(scaled)
+        return Information(self.supports, tuple(factors), self.rows.copy(), self.base)
+
     def squared_torques(self) -> Array:
         """Per joint, the sum of squared torques [N^2 m^2 or N^2], shape (joints,)."""
         return np.array([float(factor[:, -1] @ factor[:, -1]) for factor in self.factors])
 
-    def scores(self, beta: Array) -> Array:
-        """Gradient of half the squared residual, `W^T (omega - W beta)`, summed over joints, shape (base,)."""
+    def scores(self, beta: Array, weights: Array | None = None) -> Array:
+        """Gradient of half the squared residual, `W^T (omega - W beta)`, summed over joints, shape (base,).
+
+        Args:
+            beta: base parameters, shape (base,).
+            weights: per joint, what its equations are multiplied by, shape (joints,); ones when None.
+        """
         total = np.zeros(self.base)
-        for support, factor in zip(self.supports, self.factors, strict=True):
-            total[support] += factor[:, :-1].T @ (factor[:, -1] - factor[:, :-1] @ beta[support])
+        for joint, (support, factor) in enumerate(zip(self.supports, self.factors, strict=True)):
+            score = factor[:, :-1].T @ (factor[:, -1] - factor[:, :-1] @ beta[support])
+            total[support] += score if weights is None else weights[joint] ** 2 * score
         return total
 
 
@@ -98,13 +113,13 @@ def triangle(rows: Array) -> Array:
 
 
 def supports(chain: Chain, layout: Layout, base_columns: NDArray[np.intp]) -> tuple[NDArray[np.intp], ...]:
-    """Per joint, the base columns of the links that it carries and of its own joint terms."""
+    """Per joint, the base columns of the links that it carries and the joint terms of the drives that move it."""
     links = base_columns // layout.per_link
-    own_term = base_columns % layout.per_link >= 10
+    own_term = base_columns % layout.per_link >= len(INERTIAL)
     felt = []
     for joint in range(chain.joints):
         carried = np.array([joint in chain.ancestors(int(link)) for link in links])
-        felt.append(np.flatnonzero(np.where(own_term, links == joint, carried)))
+        felt.append(np.flatnonzero(np.where(own_term, chain.coupling[links, joint] != 0.0, carried)))
     return tuple(felt)
 
 
@@ -115,7 +130,11 @@ def empty_information(joint_supports: tuple[NDArray[np.intp], ...], base: int) -
 
 
 def information_of(
-    H_b: Array, torque: Array, keep: NDArray[np.bool_], joint_supports: tuple[NDArray[np.intp], ...]
+    H_b: Array,
+    torque: Array,
+    keep: NDArray[np.bool_],
+    joint_supports: tuple[NDArray[np.intp], ...],
+    row_weights: Array | None = None,
 ) -> Information:
     """Information of one block of samples.
 
@@ -124,6 +143,7 @@ def information_of(
         torque: [N m or N], shape (samples, joints).
         keep: which equations count, shape (samples, joints).
         joint_supports: from `supports`.
+        row_weights: what each equation is multiplied by, shape (samples, joints); ones when None.
     """
     factors = []
     for joint, support in enumerate(joint_supports):
@@ -131,5 +151,7 @@ def information_of(
         rows = np.empty((int(mask.sum()), len(support) + 1), order="F")
         rows[:, :-1] = H_b[joint, support].T[mask]
         rows[:, -1] = torque[mask, joint]
+        if row_weights is not None:
+            rows *= row_weights[mask, joint][:, None]
         factors.append(triangle(rows))
     return Information(joint_supports, tuple(factors), keep.sum(axis=0).astype(np.int64), H_b.shape[1])

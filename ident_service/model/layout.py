@@ -1,6 +1,11 @@
 """Names, order and units of the link parameters delta (eqs. 12, 13, 27, 28).
 
-Per link k: `Lxx Lxy Lxz Lyy Lyz Lzz lx ly lz m`, then the joint terms the model has, in the order `Ia fv fc fo`.
+Per link k: `Lxx Lxy Lxz Lyy Lyz Lzz lx ly lz m`, then the joint terms the model has, in the order `Ia fv fc fo` and,
+beyond eq. 27, `fs` (Stribeck), `fq` (quadratic) and `fa` (viscous asymmetry; an asymmetric Coulomb friction is `fo`):
+
+    f = fv dq + fc s + fo + fs s exp(-(dq / v_s)^2) + fq dq |dq| + fa |dq|
+
+with s the direction of motion, sign(dq) or what smoothing makes of it near standstill.
 """
 
 from __future__ import annotations
@@ -16,10 +21,26 @@ from ident_service.config.schema import JointTerm
 from ident_service.errors import ParameterError
 
 INERTIAL = ("Lxx", "Lxy", "Lxz", "Lyy", "Lyz", "Lzz", "lx", "ly", "lz", "m")
-TERM_SYMBOLS: dict[JointTerm, str] = {"drive_inertia": "Ia", "viscous": "fv", "coulomb": "fc", "offset": "fo"}
-_TERM_ORDER: tuple[JointTerm, ...] = ("drive_inertia", "viscous", "coulomb", "offset")
-_REVOLUTE_UNITS = {"Ia": "kg m^2", "fv": "N m s/rad", "fc": "N m", "fo": "N m"}
-_PRISMATIC_UNITS = {"Ia": "kg", "fv": "N s/m", "fc": "N", "fo": "N"}
+TERM_SYMBOLS: dict[JointTerm, str] = {
+    "drive_inertia": "Ia",
+    "viscous": "fv",
+    "coulomb": "fc",
+    "offset": "fo",
+    "stribeck": "fs",
+    "quadratic": "fq",
+    "viscous_asymmetry": "fa",
+}
+_TERM_ORDER: tuple[JointTerm, ...] = tuple(TERM_SYMBOLS)
+_REVOLUTE_UNITS = {
+    "Ia": "kg m^2",
+    "fv": "N m s/rad",
+    "fc": "N m",
+    "fo": "N m",
+    "fs": "N m",
+    "fq": "N m s^2/rad^2",
+    "fa": "N m s/rad",
+}
+_PRISMATIC_UNITS = {"Ia": "kg", "fv": "N s/m", "fc": "N", "fo": "N", "fs": "N", "fq": "N s^2/m^2", "fa": "N s/m"}
 
 
 @dataclass(frozen=True)
@@ -29,13 +50,17 @@ class Layout:
     Attributes:
         revolute: per joint, True where it turns and False where it slides.
         terms: joint terms of the model, in the order of the conventions.
+        stribeck_velocity: v_s per joint [rad/s or m/s]; needed where the model has the term.
     """
 
     revolute: tuple[bool, ...]
     terms: tuple[JointTerm, ...]
+    stribeck_velocity: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "terms", tuple(term for term in _TERM_ORDER if term in self.terms))
+        if "stribeck" in self.terms and len(self.stribeck_velocity) != len(self.revolute):
+            raise ParameterError(f"{len(self.stribeck_velocity)} Stribeck velocities for {len(self.revolute)} joints")
 
     @property
     def joints(self) -> int:

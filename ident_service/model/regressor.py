@@ -22,6 +22,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from ident_service.config.schema import JointTerm
 from ident_service.errors import ModelError
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.layout import INERTIAL, Layout
@@ -42,6 +43,7 @@ def joint_regressor(
     acceleration: Array,
     columns: Sequence[int] | NDArray[np.intp] | None = None,
     out: Array | None = None,
+    direction: Array | None = None,
 ) -> Array:
     """The rows of H for every joint and sample.
 
@@ -49,11 +51,13 @@ def joint_regressor(
         chain: the mechanism.
         layout: order of the parameters.
         position: [rad or m], shape (samples, joints).
-        velocity: [rad/s or m/s], shape (samples, joints); its sign is the friction's.
+        velocity: [rad/s or m/s], shape (samples, joints).
         acceleration: [rad/s^2 or m/s^2], shape (samples, joints).
         columns: which parameters, all when None.
         out: what an earlier call for the same chain and columns and as many samples or more returned; it is written
             over, which saves the time of fresh memory.
+        direction: what Coulomb friction is multiplied by, per drive, shape (samples, joints); the sign of the drive's
+            velocity when None.
 
     Returns:
         H, shape (joints, columns, samples): joint i's equations are `H[i].T @ delta`.
@@ -72,9 +76,10 @@ def joint_regressor(
     if H.shape != shape:
         raise ModelError(f"{H.shape=} but expected {shape}")
     program, places = _program(chain, layout, wanted)
-    inputs = [
-        np.ascontiguousarray(array[:, k], dtype=float) for array in (position, velocity, acceleration) for k in range(n)
-    ]
+    if direction is None:
+        direction = np.sign(velocity @ chain.coupling.T)
+    states = (position, velocity, acceleration, direction)
+    inputs = [np.ascontiguousarray(array[:, k], dtype=float) for array in states for k in range(n)]
     program.run(inputs, [H[joint, row] for joint, row in places])
     return H
 
@@ -83,8 +88,8 @@ def joint_regressor(
 def _program(chain: Chain, layout: Layout, columns: tuple[int, ...]) -> tuple[Program, list[tuple[int, int]]]:
     """The traced formulas, and the (joint, column) that each of its outputs belongs to; the others are zero."""
     tape = Tape()
-    q, dq, ddq = ([tape.input() for _ in range(chain.joints)] for _ in range(3))
-    entries = _joint_terms(tape, layout, dq, ddq)
+    q, dq, ddq, direction = ([tape.input() for _ in range(chain.joints)] for _ in range(4))
+    entries = _joint_terms(tape, chain, layout, dq, ddq, direction)
     states = _Forward(tape, chain, q, dq, ddq)
     for link in range(chain.joints):
         for (joint, parameter), value in _link_entries(states, link).items():
@@ -98,20 +103,35 @@ def _program(chain: Chain, layout: Layout, columns: tuple[int, ...]) -> tuple[Pr
     return Program(tape, list(kept.values())), list(kept)
 
 
-def _joint_terms(tape: Tape, layout: Layout, dq: list[Symbol], ddq: list[Symbol]) -> dict[tuple[int, int], Value]:
-    """Drive inertia and eq. 27: each joint's own columns in its own row."""
+def _joint_terms(
+    tape: Tape, chain: Chain, layout: Layout, dq: list[Symbol], ddq: list[Symbol], direction: list[Symbol]
+) -> dict[tuple[int, int], Value]:
+    """Drive inertia and friction (`layout.py`): each drive's own columns, in the rows of the joints it moves."""
     entries: dict[tuple[int, int], Value] = {}
-    for term in layout.terms:
-        for joint, column in enumerate(layout.term_columns(term)):
-            value: Value = 1.0
-            if term == "drive_inertia":
-                value = ddq[joint]
-            elif term == "viscous":
-                value = dq[joint]
-            elif term == "coulomb":
-                value = tape.apply("sign", dq[joint])
-            entries[joint, int(column)] = value
+    for drive in range(chain.joints):
+        share = _constant(chain.coupling[drive])
+        rate = sum((c * x for c, x in zip(share, dq, strict=True)), 0.0)
+        if not isinstance(rate, Symbol):
+            raise ModelError(f"drive {drive + 1} moves no joint")
+        values: dict[JointTerm, Value] = {
+            "drive_inertia": sum((c * x for c, x in zip(share, ddq, strict=True)), 0.0),
+            "viscous": rate,
+            "coulomb": direction[drive],
+            "offset": 1.0,
+            "quadratic": rate * tape.apply("abs", rate),
+            "viscous_asymmetry": tape.apply("abs", rate),
+        }
+        if "stribeck" in layout.terms:
+            ratio = rate * (1.0 / layout.stribeck_velocity[drive])
+            values["stribeck"] = direction[drive] * _exp(tape, -(ratio * ratio))
+        for term in layout.terms:
+            for joint in range(chain.joints):
+                entries[joint, int(layout.term_columns(term)[drive])] = share[joint] * values[term]
     return entries
+
+
+def _exp(tape: Tape, value: Value) -> Value:
+    return tape.apply("exp", value) if isinstance(value, Symbol) else float(np.exp(value))
 
 
 class _Forward:

@@ -9,16 +9,18 @@ from __future__ import annotations
 import re
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dposv
 
 from ident_service.config.quantities import TextFile
 from ident_service.errors import ModelError
 from ident_service.model.chain import WORLD, Array, Chain
-from ident_service.model.layout import Layout
+from ident_service.model.layout import TERM_SYMBOLS, Layout
 
 _SUPPORTED = ("JointModelR", "JointModelP")
 _UNSUPPORTED = ("JointModelPlanar",)
@@ -147,7 +149,9 @@ def pinocchio_model(chain: Chain, layout: Layout, delta: Array) -> pin.Model:
         index = model.addJoint(parent, joint, placement, chain.names[k])
         inertia = inertia_from_delta(delta[layout.inertial(k)])
         model.appendBodyToJoint(index, inertia, link_frame(chain, k))
-    model.armature = layout.term_values("drive_inertia", delta)
+    if not np.array_equal(chain.coupling, np.diag(np.diag(chain.coupling))):
+        raise ModelError("drives that move several joints have no armature per joint; pinocchio cannot represent them")
+    model.armature = np.diag(chain.coupling) ** 2 * layout.term_values("drive_inertia", delta)
     return model
 
 
@@ -166,3 +170,72 @@ class InverseDynamics:
         """M(q), shape (joints, joints), drive inertia included."""
         upper = pin.crba(self._model, self._data, position)
         return np.asarray(np.triu(upper) + np.triu(upper, 1).T)
+
+
+class ForwardDynamics:
+    """Where a chain with known parameters goes, drives and friction included, in steps that are stable at any speed.
+
+    Friction is a secant through its present value, `f = D(v) v` with `D = fv + (fc + fs exp(-(v/v_s)^2)) / max(|v|,
+    1 mrad/s) + fq |v| + fa sign(v)`, and taken at the end of the step, so that a joint creeps where it ought to stick:
+    the accuracy of an instrument's motion, not of a simulated arm's.
+    """
+
+    _CREEP = 1e-3  # rad/s or m/s
+
+    def __init__(self, chain: Chain, layout: Layout, delta: Array) -> None:
+        """Take the parameters.
+
+        Raises:
+            ModelError: `delta` does not fit the layout, or a link has no positive mass.
+        """
+        drive_free = np.array(delta, dtype=float)
+        drive_free[layout.term_columns("drive_inertia")] = 0.0
+        # Drives that move several joints have no armature; what drives add is added here, by their own coordinates.
+        self._model = pinocchio_model(replace(chain, coupling=np.eye(chain.joints)), layout, drive_free)
+        self._data = self._model.createData()
+        self._coupling = chain.coupling
+        self._terms = {term: layout.term_values(term, delta) for term in TERM_SYMBOLS}
+        self._stribeck_velocity = np.array(layout.stribeck_velocity or np.ones(chain.joints))
+        inertia = self._terms["drive_inertia"]
+        self._drive_matrix = chain.coupling.T @ (inertia[:, None] * chain.coupling)
+        self._offset = chain.coupling.T @ self._terms["offset"]
+
+    def torque(self, position: Array, velocity: Array, acceleration: Array) -> NDArray[np.float64]:
+        """`M(q) ddq + c(q, dq) + g(q)` [N m or N], shape (joints,), drive inertia included, no friction."""
+        rigid = pin.rnea(self._model, self._data, position, velocity, acceleration)
+        return np.asarray(rigid + self._drive_matrix @ acceleration)
+
+    def friction(self, velocity: Array) -> NDArray[np.float64]:
+        """Torque that friction takes [N m or N], shape (joints,)."""
+        rate = self._coupling @ velocity
+        return np.asarray(self._coupling.T @ (self._secant(rate) * rate) + self._offset)
+
+    def next_velocity(self, position: Array, velocity: Array, torque: Array, period: float) -> NDArray[np.float64]:
+        """The velocity after one step of a constant torque, implicit in the friction, explicit in the rest.
+
+        Args:
+            position: [rad or m], shape (joints,).
+            velocity: [rad/s or m/s], shape (joints,).
+            torque: [N m or N], shape (joints,).
+            period: of the step [s].
+
+        Raises:
+            ModelError: the mass matrix is not positive definite.
+        """
+        damping = self._secant(self._coupling @ velocity)
+        rest = pin.nonLinearEffects(self._model, self._data, position, velocity)
+        resistance = self._coupling.T @ (damping[:, None] * self._coupling)
+        # Of a mass matrix only the upper triangle is filled, and read by this solver.
+        implicit = pin.crba(self._model, self._data, position) + self._drive_matrix + period * resistance
+        _, acceleration, status = dposv(implicit, torque - rest - self._offset - resistance @ velocity)
+        if status != 0:
+            raise ModelError("the mass matrix is not positive definite: no real body has these parameters")
+        return np.asarray(velocity + period * acceleration)
+
+    def _secant(self, rate: Array) -> Array:
+        """D of every drive at its velocity, shape (joints,)."""
+        terms, speed = self._terms, np.abs(rate)
+        dry = terms["coulomb"] + terms["stribeck"] * np.exp(-((rate / self._stribeck_velocity) ** 2))
+        damping = terms["viscous"] + dry / np.maximum(speed, self._CREEP) + terms["quadratic"] * speed
+        damping += terms["viscous_asymmetry"] * np.sign(rate)
+        return np.asarray(np.maximum(damping, 0.0))

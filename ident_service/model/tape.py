@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-_UNARY = {"sin": np.sin, "cos": np.cos, "sign": np.sign, "neg": np.negative}
+_UNARY = {"sin": np.sin, "cos": np.cos, "exp": np.exp, "abs": np.abs, "neg": np.negative}
 _BINARY = {"mul": np.multiply, "add": np.add, "sub": np.subtract}
 
 
@@ -71,7 +71,7 @@ class Tape:
         return self.step("input", len(self.steps), None)
 
     def apply(self, function: str, value: Symbol) -> Symbol:
-        """`sin`, `cos` or `sign` of a value."""
+        """`sin`, `cos`, `exp` or `abs` of a value."""
         return self.step(function, value.index, None)
 
     def step(self, operation: str, a: _Operand, b: _Operand) -> Symbol:

@@ -28,7 +28,8 @@ def urdf_text(model: ArmModel, delta: Array | None) -> str:
         ModelError: a link without positive mass, which URDF cannot express.
     """
     robot = ET.Element("robot", name=model.config.name)
-    ET.SubElement(robot, "link", name=BASE_LINK)
+    root = _root_name(model)
+    ET.SubElement(robot, "link", name=root)
     inertials = None if delta is None else _inertials(model, delta)
     chain, layout = model.chain, model.layout
     for k, name in enumerate(chain.names):
@@ -45,7 +46,7 @@ def urdf_text(model: ArmModel, delta: Array | None) -> str:
         kind = ("revolute" if bounded else "continuous") if chain.revolute[k] else "prismatic"
         joint = ET.SubElement(robot, "joint", name=name, type=kind)
         parent = chain.parents[k]
-        ET.SubElement(joint, "parent", link=BASE_LINK if parent == WORLD else _link_name(model, parent))
+        ET.SubElement(joint, "parent", link=root if parent == WORLD else _link_name(model, parent))
         ET.SubElement(joint, "child", link=_link_name(model, k))
         ET.SubElement(
             joint, "origin", xyz=_numbers(chain.translation[k]), rpy=_numbers(_roll_pitch_yaw(chain.rotation[k]))
@@ -80,6 +81,15 @@ def _inertials(model: ArmModel, delta: Array) -> list[tuple[float, Array, Array]
     ]
 
 
+def _root_name(model: ArmModel) -> str:
+    # A joint may well be called "base".
+    taken = {_link_name(model, link) for link in range(model.chain.joints)}
+    name = BASE_LINK
+    while name in taken:
+        name += "_0"
+    return name
+
+
 def _link_name(model: ArmModel, link: int) -> str:
     return f"{model.chain.names[link]}_link"
 
@@ -89,9 +99,10 @@ def _numbers(values: Array) -> str:
 
 
 def _roll_pitch_yaw(rotation: Array) -> Array:
-    """URDF's fixed-axis angles [rad]: R = Rz(yaw) Ry(pitch) Rx(roll)."""
-    flat = float(np.hypot(rotation[0, 0], rotation[1, 0]))
-    pitch = np.arctan2(-rotation[2, 0], flat)
-    if flat > 1e-12:
-        return np.array([np.arctan2(rotation[2, 1], rotation[2, 2]), pitch, np.arctan2(rotation[1, 0], rotation[0, 0])])
-    return np.array([np.arctan2(-rotation[1, 2], rotation[1, 1]), pitch, 0.0])
+    """URDF's fixed-axis angles [rad]: R = Rz(yaw) Ry(pitch) Rx(roll); exact near gimbal lock too."""
+    yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
+    # Roll and pitch of what is left after that very yaw, so that where it is arbitrary, they make up for it.
+    c, s = np.cos(yaw), np.sin(yaw)
+    pitch = np.arctan2(-rotation[2, 0], c * rotation[0, 0] + s * rotation[1, 0])
+    roll = np.arctan2(s * rotation[0, 2] - c * rotation[1, 2], c * rotation[1, 1] - s * rotation[0, 1])
+    return np.array([roll, pitch, yaw])

@@ -21,6 +21,8 @@ class ComputedTorque:
 
     Attributes:
         velocity: filtered velocity of the last update [rad/s or m/s], shape (joints,).
+        correction: what the errors added to the last torque, `M(q) (K_d (dq_r - dq) + K_p (q_r - q))` [N m or N],
+            shape (joints,).
     """
 
     def __init__(
@@ -41,6 +43,7 @@ class ComputedTorque:
         self._gain = 1.0 - float(np.exp(-2.0 * np.pi * velocity_cutoff * period))
         self._position = position.copy()
         self.velocity = np.zeros_like(position)
+        self.correction = np.zeros_like(position)
 
     def torque(self, position: Vector, valid: Flags, reference: Setpoint) -> Vector:
         """One update.
@@ -62,4 +65,6 @@ class ComputedTorque:
             + self._kd * (reference.velocity - self.velocity)
             + self._kp * (reference.position - position)
         )
-        return self._dynamics.torque(position, self.velocity, alpha)
+        torque = self._dynamics.torque(position, self.velocity, alpha)
+        self.correction = torque - self._dynamics.torque(position, self.velocity, reference.acceleration)
+        return torque

@@ -44,6 +44,7 @@ REACTIONS: dict[str, Reaction] = {
     "recorder_behind": Reaction.CONTROLLED_STOP,
     "feedback_gone": Reaction.TORQUE_OFF,
     "feedback_not_finite": Reaction.TORQUE_OFF,
+    "frozen_encoder": Reaction.TORQUE_OFF,  # a controlled stop would turn against a position that never comes
     "far_outside": Reaction.TORQUE_OFF,
     "runaway": Reaction.TORQUE_OFF,
     "torque_not_finite": Reaction.TORQUE_OFF,
@@ -53,7 +54,10 @@ REACTIONS: dict[str, Reaction] = {
 
 MAX_AGE = 3  # cycles without an axis' feedback before it counts as gone (FIELDBUS.md: 3 to 5)
 VELOCITY_STOP, VELOCITY_OFF = 1.2, 2.0  # times the velocity limit
-JUMP = 4.0  # times the largest step that the velocity limit allows in one cycle
+JUMP = 4.0  # times what the velocity limit allows in one cycle, away from where the arm should have gone on to
+# A position that stays the same to the last bit for so many cycles, while the controller asks for more than this share
+# of the torque limit beyond the model's torque: no free joint stands that long against that much.
+FROZEN_CYCLES, FROZEN_EFFORT = 20, 0.2
 ABSURD = 3.0  # times the torque limit: no controller of ours asks for that
 
 
@@ -69,33 +73,47 @@ class Guard:
         self.warnings: dict[str, int] = {}
         self._names = joint_names
         self._limits = limits
-        self._largest_step = JUMP * limits.velocity * period
+        self._period = period
+        self._largest_jump = JUMP * limits.velocity * period
         self._position = position.copy()
         self._age = np.zeros(len(position), dtype=np.int64)
         self._jumps = np.zeros(len(position), dtype=np.int64)
+        self._shown = position.copy()
+        self._still = np.zeros(len(position), dtype=np.int64)
 
-    def feedback(self, sample: Sample, reference: Setpoint, velocity: Vector) -> tuple[Flags, Fault | None]:
+    def feedback(
+        self, sample: Sample, reference: Setpoint, velocity: Vector, correction: Vector
+    ) -> tuple[Flags, Fault | None]:
         """Judge a sample.
 
         Args:
             sample: of this cycle.
             reference: where the arm should be at its stamp.
             velocity: filtered velocity before this sample [rad/s or m/s], shape (joints,).
+            correction: of the torque before this sample, what the errors added to it [N m or N], shape (joints,).
 
         Returns:
             Which axes' positions may be used, and the most severe fault found, if any.
         """
         limits, position = self._limits, sample.position
         if not np.isfinite(position[sample.valid]).all():
-            return sample.valid, self._fault("feedback_not_finite", ~np.isfinite(position), "position is not a number")
-        step = np.abs(position - self._position)
-        jumped = sample.valid & (step > self._largest_step * (1 + self._age))
+            bad = sample.valid & ~np.isfinite(position)
+            return sample.valid, self._fault("feedback_not_finite", bad, "position is not a number")
+        # A window that only grew with the age would let the second reading of a wrong position in.
+        expected = self._position + velocity * self._period * (1 + self._age)
+        jumped = sample.valid & (np.abs(position - expected) > self._largest_jump)
         usable = sample.valid & ~jumped
         self._jumps = np.where(jumped, self._jumps + 1, 0)
         self._age = np.where(usable, 0, self._age + 1)
         self._position = np.where(usable, position, self._position)
+        changed = sample.valid & (position != self._shown)
+        self._shown = np.where(changed, position, self._shown)
+        pushed = np.abs(correction) > FROZEN_EFFORT * limits.torque
+        self._still = np.where(pushed & ~changed, self._still + 1, 0)
         if (self._age >= MAX_AGE).any():
             return usable, self._fault("feedback_gone", self._age >= MAX_AGE, f"no feedback for {MAX_AGE} cycles")
+        if (frozen := self._still >= FROZEN_CYCLES).any():
+            return usable, self._fault("frozen_encoder", frozen, "position stands still however much torque pushes")
         seen = self._position
         beyond = np.maximum(limits.lower - seen, seen - limits.upper)
         if (far := beyond > limits.following_error).any():

@@ -16,6 +16,8 @@ from ident_service.config.limits import MotionLimits, Vector
 from ident_service.errors import MotionRefused
 from ident_service.excitation.fourier import Excitation
 
+_EXTENT_STEP = 1e-3  # s; a turning point lies at most acceleration * step^2 / 8 outside: 2e-6 rad at 16 rad/s^2
+
 
 @dataclass(frozen=True)
 class Setpoint:
@@ -55,7 +57,10 @@ class RuckigReference:
 
     def __init__(self, parameters: ruckig.InputParameter) -> None:
         self._trajectory = ruckig.Trajectory(parameters.degrees_of_freedom)
-        result = ruckig.Ruckig(parameters.degrees_of_freedom).calculate(parameters, self._trajectory)
+        try:
+            result = ruckig.Ruckig(parameters.degrees_of_freedom).calculate(parameters, self._trajectory)
+        except ruckig.RuckigError as error:
+            raise MotionRefused(f"no jerk-limited way exists within the limits: {str(error).strip()}") from error
         if result not in (ruckig.Result.Working, ruckig.Result.Finished):
             raise MotionRefused(f"no jerk-limited way exists within the limits: {result}")
         self.duration = float(self._trajectory.duration)
@@ -66,9 +71,11 @@ class RuckigReference:
         return Setpoint(np.array(position), np.array(velocity), np.array(acceleration))
 
     def extent(self) -> tuple[Vector, Vector]:
-        """Lowest and highest position on the way, each of shape (joints,)."""
-        extrema = self._trajectory.position_extrema
-        return np.array([bound.min for bound in extrema]), np.array([bound.max for bound in extrema])
+        """Lowest and highest position on the way, each of shape (joints,), but for what happens between two points."""
+        # The position_extrema of ruckig itself miss turning points (pantor/ruckig#215), here by more than 0.1 rad.
+        times = np.linspace(0.0, self.duration, 2 + int(self.duration / _EXTENT_STEP))
+        positions = np.array([self._trajectory.at_time(time)[0] for time in times])
+        return positions.min(axis=0), positions.max(axis=0)
 
 
 def way(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference:

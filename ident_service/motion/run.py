@@ -1,13 +1,14 @@
 """One run: approach, excite, return, every cycle guarded, every cycle recorded.
 
-The loop owns no file: it hands samples to a sink that keeps the disk away. The stop path is `_halt`: torque off, no
-condition, nothing that can raise.
+The loop owns no file: it hands samples to a sink that keeps the disk away, and a sink that fails stops the arm under
+control like one that is slow. The stop path is `_halt`: torque off, no condition, nothing that can raise.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -23,11 +24,12 @@ from ident_service.model.rigid_body import InverseDynamics
 from ident_service.motion.control import ComputedTorque
 from ident_service.motion.guard import REACTIONS, Fault, Guard, Reaction
 from ident_service.motion.reference import FourierReference, Reference, Setpoint, rest, stop, way
-from ident_service.motion.states import MOVING, State, next_state
+from ident_service.motion.states import LAWFUL, MOVING, State, next_state
 
 _KEPT_SAMPLES = 100
 _REST_CYCLES = 20
-_WARNING, _ERROR, _INFO = 30, 40, 20  # levels of rcl_interfaces/msg/Log
+_LONGEST_GAP = 20  # periods without a cycle, through which nobody guarded the arm (FIELDBUS.md: whole bus silent)
+_ERROR, _INFO = 40, 20  # levels of rcl_interfaces/msg/Log
 
 
 class Sink(Protocol):
@@ -128,18 +130,20 @@ class _Run:
         self._guard = Guard(self.model.chain.names, limits, period, home)
         self._control = ComputedTorque(dynamics, limits, period, self.model.config.control.velocity_cutoff, home)
         self._peaks = _Peaks(np.zeros_like(home), np.zeros_like(home))
-        self._begin_ns, self._way = sample.stamp_ns, ways.pop(0)
-        torque, _ = self._guard.torque(self._control.torque(home, sample.valid, rest(home)))
+        self._way = ways.pop(0)
+        torque, cannot_hold = self._guard.torque(self._control.torque(home, sample.valid, rest(home)))
+        if cannot_hold is not None:
+            raise MotionRefused(f"the arm cannot be held where it stands: {cannot_hold.message}")
         try:
             self.arm.enable()
             self._enter(State.APPROACHING, sample.stamp_ns)
             fault = self._loop(torque, ways, limits, period)
-        except BaseException:
-            self._halt()
+            if fault is not None:
+                raise ArmFault(fault.code, fault.message, self.last)
+            self.arm.stop(StopKind.TORQUE_OFF)
+        except BaseException as error:
+            self._halt(error)
             raise
-        self._halt()
-        if fault is not None:
-            raise ArmFault(fault.code, fault.message, self.last)
         return RunReport(
             self.state,
             self.last[-1].cycle + 1,
@@ -181,8 +185,11 @@ class _Run:
             try:
                 sample = self.arm.exchange(torque)
             except DriverError as error:
-                self._enter(State.FAULTED, self.arm.clock.now_ns())
                 return Fault("driver", REACTIONS["driver"], str(error))
+            if not self.last:
+                self._begin_ns = sample.stamp_ns  # not before: enabling takes as long as it takes
+            elif not 0 < (gap := sample.stamp_ns - self.last[-1].stamp_ns) <= _LONGEST_GAP * period * 1e9:
+                return Fault("driver", REACTIONS["driver"], f"consecutive stamps are {gap * 1e-6:g} ms apart")
             woken_ns = self.arm.clock.now_ns()
             lateness_ns = 0 if expected_ns is None else max(0, woken_ns - expected_ns)
             expected_ns = woken_ns - lateness_ns + round(period * 1e9) if lateness_ns < period * 1e9 else None
@@ -199,55 +206,64 @@ class _Run:
                 self._way = ways.pop(0)
                 elapsed = (sample.stamp_ns - self._begin_ns) * 1e-9
             reference = self._way.at(elapsed)
-            usable, fault = self._guard.feedback(sample, reference, self._control.velocity)
+            usable, fault = self._guard.feedback(sample, reference, self._control.velocity, self._control.correction)
             wanted = self._control.torque(sample.position, usable, reference)
             torque, torque_fault = self._guard.torque(wanted)
-            if torque_fault is not None and (fault is None or torque_fault.reaction > fault.reaction):
-                fault = torque_fault
             compute_ns = self.arm.clock.now_ns() - woken_ns
-            if not self._record(sample, reference, lateness_ns, compute_ns) and self.state is not State.STOPPING:
-                fault = fault or Fault("recorder_behind", REACTIONS["recorder_behind"], "the recorder cannot keep up")
-            self._remember(sample, reference)
+            unrecorded = self._record(sample, reference, lateness_ns, compute_ns)
+            for found in (torque_fault, None if self.state is State.STOPPING else unrecorded):
+                if found is not None and (fault is None or found.reaction > fault.reaction):
+                    fault = found
+            self._remember(sample, usable, reference)
             if fault is not None and fault.reaction is Reaction.TORQUE_OFF:
-                self._enter(State.FAULTED, sample.stamp_ns)
-                self._tell(_ERROR, sample.stamp_ns, fault)
                 return fault
-            asked = self.state in MOVING and self.stop_requested()
             must_stop = fault is not None and fault.reaction is Reaction.CONTROLLED_STOP
-            if self.state in MOVING and (asked or must_stop):
-                ended_by = fault if must_stop else None
-                if ended_by is not None:
-                    self._tell(_ERROR, sample.stamp_ns, ended_by)
+            if fault is not None and must_stop and ended_by is None:
+                ended_by = fault
+                self._tell(_ERROR, sample.stamp_ns, f"{fault.code}: {fault.message}")
+            if self.state in MOVING and (must_stop or self.stop_requested()):
                 self._enter(State.STOPPING, sample.stamp_ns)
                 self._begin_ns, self._way = sample.stamp_ns, stop(reference, limits)
 
-    def _record(self, sample: Sample, reference: Setpoint, lateness_ns: int, compute_ns: int) -> bool:
-        return self.sink.put(
-            sample.stamp_ns,
-            sample.position,
-            sample.velocity,
-            sample.torque,
-            reference.position,
-            reference.velocity,
-            sample.cycle,
-            lateness_ns,
-            compute_ns,
-            sample.valid,
-            sample.age,
-            sample.lost,
-        )
+    def _record(self, sample: Sample, reference: Setpoint, lateness_ns: int, compute_ns: int) -> Fault | None:
+        try:
+            kept = self.sink.put(
+                sample.stamp_ns,
+                sample.position,
+                sample.velocity,
+                sample.torque,
+                reference.position,
+                reference.velocity,
+                sample.cycle,
+                lateness_ns,
+                compute_ns,
+                sample.valid,
+                sample.age,
+                sample.lost,
+            )
+        except Exception as error:  # noqa: BLE001 - whatever a recorder died of, the arm must not fall for it
+            return Fault("recorder_behind", REACTIONS["recorder_behind"], f"the recorder failed: {error}")
+        return None if kept else Fault("recorder_behind", REACTIONS["recorder_behind"], "the recorder cannot keep up")
 
-    def _remember(self, sample: Sample, reference: Setpoint) -> None:
-        error = np.where(sample.valid, np.abs(reference.position - sample.position), 0.0)
+    def _remember(self, sample: Sample, usable: NDArray[np.bool_], reference: Setpoint) -> None:
+        error = np.where(usable, np.abs(reference.position - sample.position), 0.0)
         np.maximum(self._peaks.following_error, error, out=self._peaks.following_error)
         np.maximum(self._peaks.torque, np.abs(sample.torque), out=self._peaks.torque)
 
     def _enter(self, state: State, stamp_ns: int) -> None:
         self.state = next_state(self.state, state)
-        self.sink.event(stamp_ns, _INFO, state.value)
+        self._tell(_INFO, stamp_ns, state.value)
 
-    def _tell(self, level: int, stamp_ns: int, fault: Fault) -> None:
-        self.sink.event(stamp_ns, level, f"{fault.code}: {fault.message}")
+    def _tell(self, level: int, stamp_ns: int, message: str) -> None:
+        with suppress(Exception):  # a recorder that has failed says so at its next sample
+            self.sink.event(stamp_ns, level, message)
 
-    def _halt(self) -> None:
-        self.arm.stop(StopKind.TORQUE_OFF)
+    def _halt(self, error: BaseException) -> None:
+        try:
+            self.arm.stop(StopKind.TORQUE_OFF)
+        except Exception as second:  # noqa: BLE001 - a driver that breaks its promise must not hide why it was stopped
+            error.add_note(f"and taking the torque away failed: {second}")
+        if State.FAULTED in LAWFUL[self.state]:
+            now_ns = self.arm.clock.now_ns()
+            self._enter(State.FAULTED, now_ns)
+            self._tell(_ERROR, now_ns, str(error) or type(error).__name__)

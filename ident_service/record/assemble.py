@@ -1,6 +1,8 @@
 """From the pieces a reader decodes to the blocks the door promises: of the asked length, and checked.
 
-The checks are the same for every kind of file: finite values and strictly increasing stamps.
+The checks are the same for every kind of file: finite values and strictly increasing stamps. A sample that repeats the
+one before it, stamp and values, says nothing new (a message delivered twice, a bag merged with itself); it is left out
+and counted. The same stamp with other values, or one that runs backwards, has no meaning and is refused.
 """
 
 from __future__ import annotations
@@ -9,9 +11,10 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ident_service.errors import RecordingError, UsageError
-from ident_service.record.recording import Block, Matrix
+from ident_service.record.recording import Block, Matrix, Stamps, cut, join
 
 
 def assemble(
@@ -28,10 +31,11 @@ def assemble(
         samples: length of the blocks; the last one is shorter.
         path: of the file, for messages.
         joints: a name per column, for messages.
-        place: what to call the sample of this index (from 0) in messages.
+        place: what to call the sample of this index (from 0, repeated ones counted) in messages.
 
     Raises:
-        RecordingError: a value that is not finite, a stamp that does not increase; names the first one.
+        RecordingError: a value that is not finite, a stamp that runs backwards or repeats with other values; names
+            the first one.
         UsageError: `samples` is not positive.
     """
     if samples < 1:
@@ -40,18 +44,22 @@ def assemble(
     waiting: list[Block] = []
     count = 0
     for piece in pieces:
-        waiting.append(piece)
-        count += len(piece.stamp_ns)
-        if count < samples:
+        if not len(piece.stamp_ns):
             continue
-        whole = _join(waiting)
-        for start in range(0, count - samples + 1, samples):
-            yield check(_cut(whole, start, start + samples))
-        rest = count % samples
-        waiting = [_cut(whole, count - rest, count)] if rest else []
-        count = rest
+        waiting.append(check(piece))
+        count += len(waiting[-1].stamp_ns)
+        if count <= samples:
+            continue
+        # One sample at least keeps waiting, so that repeats at the very end have a block to be counted in.
+        whole = join(waiting)
+        start = 0
+        while count - start > samples:
+            yield _frozen(cut(whole, start, start + samples))
+            start += samples
+        waiting = [cut(whole, start, count)]
+        count -= start
     if count:
-        yield check(_join(waiting))
+        yield _frozen(join(waiting))
 
 
 class _Check:
@@ -62,35 +70,49 @@ class _Check:
         self._joints = joints
         self._place = place
         self._seen = 0
-        self._first_ns = 0
-        self._last_ns: int | None = None
+        self._first_ns: int | None = None
+        self._last: Block | None = None
 
-    def __call__(self, block: Block) -> Block:
-        stamps = block.stamp_ns
-        stuck = np.zeros(len(stamps), np.bool_)
-        stuck[1:] = stamps[1:] <= stamps[:-1]
-        if self._last_ns is None:
-            self._first_ns = int(stamps[0])
-        else:
-            stuck[0] = stamps[0] <= self._last_ns
-        problems = [(int(np.argmax(stuck)), "the stamp does not increase")] if stuck.any() else []
-        for what, values in (("position", block.position), ("velocity", block.velocity), ("torque", block.torque)):
+    def __call__(self, piece: Block) -> Block:
+        """The piece without the samples that repeat the one before."""
+        if self._first_ns is None:
+            self._first_ns = int(piece.stamp_ns[0])
+        before = 0 if self._last is None else 1
+        run = piece if self._last is None else join([self._last, piece])
+        step = np.zeros(len(piece.stamp_ns), np.int64)
+        step[1 - before :] = np.diff(run.stamp_ns)
+        repeats = np.zeros(len(step), np.bool_)
+        repeats[1 - before :] = _same_as_before(run)
+        stuck = (step == 0) & ~repeats
+        stuck[: 1 - before] = False
+        self._refuse(piece, step, stuck)
+        self._seen += len(step)
+        self._last = cut(piece, len(step) - 1, len(step))
+        if not repeats.any():
+            return piece
+        kept = ~repeats
+        velocity = None if piece.velocity is None else piece.velocity[kept]
+        return Block(piece.stamp_ns[kept], piece.position[kept], piece.torque[kept], velocity, int(repeats.sum()))
+
+    def _refuse(self, piece: Block, step: Stamps, stuck: NDArray[np.bool_]) -> None:
+        """Raise for the first sample that cannot be."""
+        problems = []
+        if stuck.any():
+            problems.append((int(np.argmax(stuck)), "the stamp does not increase, but the values change"))
+        if (step < 0).any():
+            index = int(np.argmax(step < 0))
+            problems.append((index, f"the stamp does not increase, it runs back by {-int(step[index]) * 1e-9:.9g} s"))
+        for what, values in (("position", piece.position), ("velocity", piece.velocity), ("torque", piece.torque)):
             if values is not None and (found := self._not_finite(what, values)) is not None:
                 problems.append(found)
         if problems:
             index, problem = min(problems)
-            after = (int(stamps[index]) - self._first_ns) * 1e-9
+            after = (int(piece.stamp_ns[index]) - (self._first_ns or 0)) * 1e-9
             raise RecordingError(
                 self._path,
                 f"{self._place(self._seen + index)}, {after:.6f} s after the first: {problem}; "
                 "remove the samples from there on, or record again",
             )
-        self._seen += len(stamps)
-        self._last_ns = int(stamps[-1])
-        for array in (stamps, block.position, block.torque, block.velocity):
-            if array is not None:
-                array.flags.writeable = False
-        return block
 
     def _not_finite(self, what: str, values: Matrix) -> tuple[int, str] | None:
         finite = np.isfinite(values)
@@ -100,19 +122,18 @@ class _Check:
         return index, f"{what} of joint {self._joints[joint]} is {values[index, joint]}"
 
 
-def _join(pieces: Sequence[Block]) -> Block:
-    if len(pieces) == 1:
-        return pieces[0]
-    velocities = [piece.velocity for piece in pieces if piece.velocity is not None]
-    return Block(
-        np.concatenate([piece.stamp_ns for piece in pieces]),
-        np.concatenate([piece.position for piece in pieces]),
-        np.concatenate([piece.torque for piece in pieces]),
-        np.concatenate(velocities) if velocities else None,
-    )
+def _same_as_before(run: Block) -> NDArray[np.bool_]:
+    """Which samples, from the second on, equal the one before in everything."""
+    same: NDArray[np.bool_] = np.diff(run.stamp_ns) == 0
+    if same.any():
+        for values in (run.position, run.torque, run.velocity):
+            if values is not None:
+                same &= (values[1:] == values[:-1]).all(axis=1)
+    return same
 
 
-def _cut(block: Block, start: int, stop: int) -> Block:
-    part = slice(start, stop)
-    velocity = None if block.velocity is None else block.velocity[part]
-    return Block(block.stamp_ns[part], block.position[part], block.torque[part], velocity)
+def _frozen(block: Block) -> Block:
+    for array in (block.stamp_ns, block.position, block.torque, block.velocity):
+        if array is not None:
+            array.flags.writeable = False
+    return block

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import gzip
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
 from typing import IO, Final, cast
@@ -32,32 +32,35 @@ _FIRST_ROW: Final = 2  # line numbers count from 1, and the header is line 1
 
 
 class CsvRecording:
-    """A Recording in a CSV file; its columns are the joints 1..N and have no names.
+    """A Recording in a CSV file; its columns are the joints 1..N, which the file does not name.
 
     Attributes:
         path: the file.
         sha256: of the file's bytes, compressed where it is.
-        joint_names: empty.
+        joint_names: those it was opened with, else empty.
         joints: number of joints.
         torque_held: False.
         torn: False; what does not fit raises.
     """
 
-    joint_names: tuple[str, ...] = ()
     torque_held = False
     torn = False
 
-    def __init__(self, path: Path | str, *, columns: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self, path: Path | str, *, columns: Mapping[str, str] | None = None, joints: Sequence[str] | None = None
+    ) -> None:
         """Open the file and read its header.
 
         Args:
             path: the file.
             columns: for a file with another header, its name for each of `t`, `q1`, `tau1`, ...; columns that are
                 not named here are then left out.
+            joints: names of the joints 1..N, where they are known.
 
         Raises:
             UsageError: no such file.
-            RecordingError: the header does not fit; the message has all that is wrong with it.
+            RecordingError: the header does not fit, and the message has all that is wrong with it; another number of
+                joints.
         """
         self.path = Path(path)
         require_file(self.path)
@@ -70,15 +73,18 @@ class CsvRecording:
             raise RecordingError(self.path, "line 1: the header is not text") from error
         self._columns: CsvColumns = parse_header(self.path, header, columns)
         self.joints = self._columns.joints
+        self.joint_names: tuple[str, ...] = tuple(joints or ())
+        if joints is not None and self.joints != len(joints):
+            raise RecordingError(self.path, f"has {self.joints} joints but the arm has {len(joints)}")
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
         """Read the samples in order, `samples` at a time (the last block is shorter).
 
         Raises:
             RecordingError: a row with too few or too many fields, a field that is no finite number, a time that
-                does not increase, a damaged or oversized gzip file; names the line.
+                runs backwards or repeats with other values, a damaged or oversized gzip file; names the line.
         """
-        names = [str(joint + 1) for joint in range(self.joints)]
+        names = self.joint_names or [str(joint + 1) for joint in range(self.joints)]
         return assemble(self._pieces(), samples, self.path, names, place=lambda index: f"line {index + _FIRST_ROW}")
 
     def _pieces(self) -> Iterator[Block]:

@@ -13,6 +13,7 @@ from typing import IO, Final
 import numpy as np
 from mcap.opcode import Opcode
 
+from ident_service.config.recording import RecordingFormat
 from ident_service.errors import RecordingError
 from ident_service.record import mcap_records as mcap
 from ident_service.record.assemble import assemble
@@ -38,16 +39,25 @@ class McapRecording:
         torque_held: True for our own recordings.
         torn: whether the file ends, or is damaged, before its end mark.
         metadata: the record `ident`, empty for a bag.
+        own: whether this package wrote it; topic, names and sides are then its own whatever the arm's bags are like.
         damage: what is wrong where the file is torn, else empty.
     """
 
-    def __init__(self, path: Path | str, *, topic: str = "/joint_states", order: Sequence[str] | None = None) -> None:
+    def __init__(
+        self,
+        path: Path | str,
+        *,
+        topic: str | None = None,
+        order: Sequence[str] | None = None,
+        bag: RecordingFormat | None = None,
+    ) -> None:
         """Open the file, check all of its chunks and find the joints.
 
         Args:
             path: the file.
-            topic: with sensor_msgs/msg/JointState on it.
+            topic: with sensor_msgs/msg/JointState on it; None takes `/joint_states`, or in a bag what `bag` says.
             order: joints to read, in the order of the columns; None takes the first message's.
+            bag: topic of a bag, and its own names for joints that have others.
 
         Raises:
             UsageError: no such file.
@@ -57,7 +67,6 @@ class McapRecording:
         self.torn = False
         self.damage = ""
         self.metadata: dict[str, str] = {}
-        self._topic = topic
         require_file(self.path)
         with self._open() as stream:
             self._size = stream.seek(0, 2)
@@ -68,11 +77,19 @@ class McapRecording:
         self._verify()
         self._offset_ns = self._utc_offset()
         self.torque_held = self.metadata.get("torque_hold") == "zero_order"
-        layout, payload = self._first(order)
-        self.joint_names = tuple(order) if order is not None else layout.names
+        self.own = bool(self.metadata)
+        form = RecordingFormat() if self.own or bag is None else bag
+        self._topic = form.topic if topic is None else topic
+        theirs = form.joint_names
+        wanted = None if order is None else tuple(theirs.get(name, name) for name in order)
+        layout, payload = self._first(wanted)
+        ours = {their: our for our, their in theirs.items()}
+        self.joint_names = tuple(order) if order is not None else tuple(ours.get(name, name) for name in layout.names)
         self.joints = len(self.joint_names)
         self._decoder = JointStateDecoder(
-            self.joint_names, others=order is not None, velocity=_has_velocity(layout, payload)
+            layout.names if wanted is None else wanted,
+            others=wanted is not None,
+            velocity=_has_velocity(layout, payload),
         )
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
@@ -81,8 +98,8 @@ class McapRecording:
         Velocity is there when the first message has one; a first velocity of nothing but NaN counts as none.
 
         Raises:
-            RecordingError: values that are not finite, stamps that repeat or run backwards, messages whose joints
-                change; names the first one.
+            RecordingError: values that are not finite, stamps that run backwards or repeat with other values,
+                messages whose joints change; names the first one.
         """
         return assemble(self._pieces(min(samples, BLOCK_SAMPLES)), samples, self.path, self.joint_names)
 

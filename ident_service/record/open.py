@@ -2,37 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Final
 
-from ident_service.errors import RecordingError
+from ident_service.config.recording import RecordingFormat, Transmission
+from ident_service.errors import RecordingError, UsageError
 from ident_service.record.csv_file import GZIP_MAGIC, CsvRecording
 from ident_service.record.files import require_file
 from ident_service.record.mcap_file import McapRecording
 from ident_service.record.mcap_records import MAGIC
 from ident_service.record.recording import Recording
+from ident_service.record.transmission import JointSideRecording
+
+PLAIN: Final = RecordingFormat()
 
 
 def open_recording(
     path: Path | str,
     joints: Sequence[str] | None = None,
     *,
-    topic: str = "/joint_states",
-    columns: Mapping[str, str] | None = None,
+    fmt: RecordingFormat = PLAIN,
+    transmission: Transmission | None = None,
 ) -> Recording:
-    """Open an MCAP or CSV recording for reading.
+    """Open an MCAP or CSV recording for reading; its blocks are on the joint side.
+
+    A recording that this package wrote names its joints as the arm does and is on the joint side already: of `fmt`,
+    topic, names and side are for the files of others.
 
     Args:
         path: the file.
         joints: the arm's joints. An MCAP file's columns come in this order; a CSV file must have as many.
-        topic: of the joint states, in an MCAP file.
-        columns: a CSV file's own name for each of `t`, `q1`, `tau1`, ...
+        fmt: how the file is to be read.
+        transmission: the arm's gears, needed for a file that was recorded on the motor side.
 
     Returns:
         The recording; its file is read when its blocks are.
 
     Raises:
-        UsageError: no such file.
+        UsageError: no such file; motor side, but no transmission.
         RecordingError: neither MCAP nor CSV, or not of these joints.
     """
     path = Path(path)
@@ -44,11 +52,17 @@ def open_recording(
         raise RecordingError(path, f"cannot be read: {error.strerror}") from error
     if not start:
         raise RecordingError(path, "is empty")
+    recording: McapRecording | CsvRecording
     if start.startswith(MAGIC):
-        return McapRecording(path, topic=topic, order=joints)
-    if not start.startswith(GZIP_MAGIC) and b"\x00" in start:
+        recording = McapRecording(path, order=joints, bag=fmt)
+        if recording.own:
+            return recording
+    elif not start.startswith(GZIP_MAGIC) and b"\x00" in start:
         raise RecordingError(path, "is neither MCAP nor CSV (plain or gzip)")
-    recording = CsvRecording(path, columns=columns)
-    if joints is not None and recording.joints != len(joints):
-        raise RecordingError(path, f"has {recording.joints} joints but the arm has {len(joints)}")
-    return recording
+    else:
+        recording = CsvRecording(path, columns=fmt.columns or None, joints=joints)
+    if fmt.side == "joint":
+        return recording
+    if transmission is None:
+        raise UsageError(f"{path}: recorded on the motor side, but no transmission leads from there to the joints")
+    return JointSideRecording(recording, transmission)

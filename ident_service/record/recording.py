@@ -5,7 +5,7 @@ A block is what passes the door; how it lies in a file is `mcap_file.py`'s and `
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -28,12 +28,37 @@ class Block:
         position: [rad or m], shape (samples, joints).
         torque: [N m or N], shape (samples, joints).
         velocity: [rad/s or m/s], shape (samples, joints), or None where the recording has none.
+        repeats: samples of the file that were left out before the last one here because they repeat, stamp and
+            values, the one before them; a recording's blocks together count every one.
     """
 
     stamp_ns: Stamps
     position: Matrix
     torque: Matrix
     velocity: Matrix | None = None
+    repeats: int = 0
+
+
+def join(blocks: Sequence[Block]) -> Block:
+    """Consecutive blocks, at least one, as one."""
+    if len(blocks) == 1:
+        return blocks[0]
+    velocities = [block.velocity for block in blocks if block.velocity is not None]
+    return Block(
+        np.concatenate([block.stamp_ns for block in blocks]),
+        np.concatenate([block.position for block in blocks]),
+        np.concatenate([block.torque for block in blocks]),
+        np.concatenate(velocities) if velocities else None,
+        sum(block.repeats for block in blocks),
+    )
+
+
+def cut(block: Block, start: int, stop: int) -> Block:
+    """Samples `start` to `stop` of a block, as views; its repeats count in the part with its first sample."""
+    part = slice(start, stop)
+    velocity = None if block.velocity is None else block.velocity[part]
+    repeats = block.repeats if start == 0 else 0
+    return Block(block.stamp_ns[part], block.position[part], block.torque[part], velocity, repeats)
 
 
 class Recording(Protocol):
@@ -60,6 +85,6 @@ class Recording(Protocol):
         """Read the samples in order, `samples` at a time (the last block is shorter).
 
         Raises:
-            RecordingError: NaN or infinite values, stamps that repeat or run backwards, a torn row in a CSV file;
-                the message names the first place.
+            RecordingError: NaN or infinite values, stamps that run backwards or repeat with other values, a torn row
+                in a CSV file; the message names the first place.
         """

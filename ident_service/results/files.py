@@ -26,8 +26,10 @@ def write_atomically(path: Path, text: str) -> None:
             os.fsync(stream.fileno())
         partial.replace(path)
     except OSError as error:
-        partial.unlink(missing_ok=True)
         raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
+    finally:
+        # After the replacement there is none.
+        partial.unlink(missing_ok=True)
 
 
 @contextmanager

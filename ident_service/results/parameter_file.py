@@ -19,13 +19,14 @@ import numpy as np
 
 from ident_service import __version__
 from ident_service.errors import ParameterError, UsageError
+from ident_service.estimation.certificate import certify
 from ident_service.estimation.feasible_set import SetName
 from ident_service.estimation.identify import Estimate
 from ident_service.estimation.least_squares import TorqueError
 from ident_service.model.base import BaseParameters, base_from_expressions
 from ident_service.model.chain import Array
 from ident_service.model.expressions import parse_expression
-from ident_service.model.layout import INERTIAL
+from ident_service.model.layout import INERTIAL, TERM_SYMBOLS
 from ident_service.results.files import write_atomically
 
 MAX_BYTES = 64 * 2**20
@@ -71,7 +72,9 @@ def read_parameters(path: Path, names: tuple[str, ...] | None = None) -> Paramet
     if path.stat().st_size > MAX_BYTES:
         raise ParameterError(f"{path}: larger than {MAX_BYTES} bytes")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
+        content = json.loads(
+            path.read_text(encoding="utf-8"), parse_constant=_refuse, parse_float=_finite, parse_int=_finite_whole
+        )
     except (ValueError, RecursionError) as error:
         raise ParameterError(f"{path}: not JSON: {error}") from None
     _validate(content, str(path))
@@ -88,9 +91,15 @@ def read_parameters(path: Path, names: tuple[str, ...] | None = None) -> Paramet
 
 
 def parameters_document(estimate: Estimate) -> dict[str, Any]:
-    """The content of `parameters.json` for an estimate."""
+    """The content of `parameters.json` for an estimate, its feasibility certified in exact arithmetic.
+
+    Raises:
+        SolverError: no proof was found where the solver should have led to one.
+    """
     model, base = estimate.model, estimate.base
     own = estimate.candidates[estimate.chosen]
+    certificate = certify(estimate.beta, base, estimate.conditions, estimate.delta)
+    options = model.config.identification
     document: dict[str, Any] = {
         "format": "ident-parameters",
         "version": 1,
@@ -115,14 +124,20 @@ def parameters_document(estimate: Estimate) -> dict[str, Any]:
             "verdicts": list(estimate.verdicts),
         },
         "feasibility": {
-            "feasible": estimate.feasible,
+            "feasible": certificate.verdict == "feasible",
             "margin": estimate.margin,
             "tight": list(estimate.tight),
-            "certificate": {
-                "kind": "witness" if estimate.delta is not None else "none",
-                "set": estimate.conditions.kind,
-            },
+            "certificate": certificate.document,
         },
+        "friction": {
+            "presliding": _numbers(options.friction.presliding, model.chain.joints),
+            "stribeck_velocity": list(model.layout.stribeck_velocity),
+        },
+        "torque_delay": {
+            "seconds": options.delay,
+            "deviation": None if estimate.prepared.delay is None else estimate.prepared.delay.deviation,
+        },
+        "torque_scales": estimate.prepared.torque_scales.tolist(),
         "fit": {
             "samples": estimate.samples,
             "condition_number": estimate.fit.condition_number if np.isfinite(estimate.fit.condition_number) else None,
@@ -164,6 +179,18 @@ def _refuse(constant: str) -> NoReturn:
     raise ValueError(f"{constant} is not a number that JSON knows")
 
 
+def _finite(text: str) -> float:
+    value = float(text)
+    if not np.isfinite(value):
+        raise ValueError(f"{text[:40]} is too large for a double")
+    return value
+
+
+def _finite_whole(text: str) -> int:
+    _finite(text)
+    return int(text)
+
+
 def _names_in(expressions: tuple[str, ...]) -> tuple[str, ...]:
     mentioned = {name for expression in expressions for name in parse_expression(expression)}
     links, extra = 0, set()
@@ -178,8 +205,19 @@ def _names_in(expressions: tuple[str, ...]) -> tuple[str, ...]:
     names: list[str] = []
     for link in range(1, links + 1):
         names += [f"{symbol}{link}" for symbol in INERTIAL]
-        names += [f"{symbol}{link}" for number, symbol in sorted(extra) if number == link]
+        own = [symbol for number, symbol in extra if number == link]
+        names += [f"{symbol}{link}" for symbol in sorted(own, key=_place)]
     return tuple(names)
+
+
+def _place(symbol: str) -> tuple[int, str]:
+    """Joint terms stand in the order of the conventions, unknown ones after them."""
+    known = tuple(TERM_SYMBOLS.values())
+    return (known.index(symbol) if symbol in known else len(known)), symbol
+
+
+def _numbers(value: Any, joints: int) -> list[float]:
+    return [float(one) for one in np.broadcast_to(np.asarray(value, dtype=float), (joints,))]
 
 
 def _perhaps(values: Array) -> list[float | None]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
+from typing import Any
 
 from ident_service import __version__
 from ident_service.estimation.identify import Estimate
@@ -16,13 +17,18 @@ from ident_service.results.summary import parameter_table, summary
 PARAMETERS, URDF, REPORT, MANIFEST = "parameters.json", "identified.urdf", "report.txt", "manifest.json"
 
 
-def write_results(folder: Path, estimate: Estimate) -> list[str]:
+def write_results(folder: Path, estimate: Estimate, more: dict[str, Any] | None = None) -> list[str]:
     """Write an estimate's files into an existing folder.
+
+    Args:
+        folder: where to.
+        estimate: what to write.
+        more: further entries of `parameters.json`.
 
     Returns:
         The names of the files. An estimate that no body has comes without a URDF, because URDF cannot express it.
     """
-    write_parameters(folder / PARAMETERS, parameters_document(estimate))
+    write_parameters(folder / PARAMETERS, parameters_document(estimate) | (more or {}))
     names = [PARAMETERS]
     if estimate.delta is not None:
         write_urdf(folder / URDF, estimate.model, estimate.delta)

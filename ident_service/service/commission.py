@@ -11,7 +11,7 @@ from pathlib import Path
 from drivers.arm import Arm
 from drivers.clock import Clock
 from ident_service.config.schema import ArmConfig
-from ident_service.errors import UsageError
+from ident_service.errors import ArmError, UsageError
 from ident_service.estimation.equations import equations
 from ident_service.estimation.feasible_set import SetName
 from ident_service.estimation.identify import Estimate, identify
@@ -21,6 +21,7 @@ from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.urdf import urdf_text
 from ident_service.motion.factory import make_arm
 from ident_service.motion.run import RunReport, run
+from ident_service.motion.states import State
 from ident_service.record.open import open_recording
 from ident_service.record.recorder import Recorder
 from ident_service.record.writer import RecordingWriter
@@ -101,6 +102,7 @@ def simulate(
 
     Raises:
         UsageError: the folder exists, or the arm is not simulated.
+        ArmError: somebody asked for a stop.
         IdentError: anything the steps raise; no folder is left behind.
     """
     if folder.exists():
@@ -119,7 +121,11 @@ def simulate(
             arm = make_arm(config, clock)
             if isinstance(arm, SimulatedArm):
                 arm.observer = observed.append
-            reports.append(record_motion(arm, model, motion, path, stop_requested))
+            report = record_motion(arm, model, motion, path, stop_requested)
+            if report.state is not State.DONE:
+                # Who asked for a stop does not want to see the arm move again.
+                raise ArmError(f"{motion.name} motion: stopped on request; nothing was kept")
+            reports.append(report)
             write_atomically(staging / f"{motion.name}.excitation.json", motion.to_json() + "\n")
         tell("identifying")
         recordings = [open_recording(path, model.chain.names) for path in paths]

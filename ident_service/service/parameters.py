@@ -9,6 +9,7 @@ from pathlib import Path
 from ident_service.config.load import load_arm
 from ident_service.config.schema import FeasibleSetName
 from ident_service.errors import ParameterError
+from ident_service.estimation.certificate import certify
 from ident_service.estimation.feasibility import (
     FeasibilityTest,
     FeasibleEstimate,
@@ -73,10 +74,11 @@ def correct_file(path: Path, out: Path, kind: FeasibleSetName | None = None, arm
     content["method"] = "correction"
     content["feasible_set"] = conditions.kind
     content["link_parameters"] = {"names": list(file.base.names), "values": result.delta.tolist()}
+    proof = certify(result.beta, file.base, conditions, result.delta, expressions=table["expressions"])
     content["feasibility"] = {
-        "feasible": result.margin > 0.0,
+        "feasible": proof.verdict == "feasible",
         "margin": result.margin,
-        "certificate": {"kind": "witness", "set": conditions.kind},
+        "certificate": proof.document,
     }
     write_parameters(out, content)
     return CorrectedFile(conditions.kind, result)

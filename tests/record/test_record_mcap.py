@@ -188,7 +188,7 @@ def test_chunks_end_by_size_and_by_time(tmp_path: Path) -> None:
 
 
 def test_bad_samples_are_named(tmp_path: Path) -> None:
-    for name, change in {"nan": (np.nan, STEP_NS), "stamp": (0.0, 0)}.items():
+    for name, change in {"nan": (np.nan, STEP_NS), "stamp": (1.0, 0)}.items():
         path = tmp_path / f"{name}.mcap"
         value, step = change
         with RecordingWriter(path, ["a", "b"], URDF, 0) as writer:

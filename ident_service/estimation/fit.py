@@ -1,0 +1,120 @@
+"""From recordings to an unconstrained fit: what has to be found before, the estimator, and its covariance.
+
+Order: the shape of the friction, the delay between the channels, the equations, the factors of the torque constants,
+the estimator. Each step looks at the recordings that are fitted to, never at those that validate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+
+import numpy as np
+
+from ident_service.config.schema import Method
+from ident_service.estimation.delay import Delay, estimate_delay, with_delay
+from ident_service.estimation.doubt import block_covariance
+from ident_service.estimation.equations import Equations, equations
+from ident_service.estimation.feasibility import constrained_least_squares
+from ident_service.estimation.feasible_set import FeasibleSet
+from ident_service.estimation.friction_fit import fit_friction
+from ident_service.estimation.instruments import instrumental_variables
+from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares, weighted_least_squares
+from ident_service.estimation.robust import huber
+from ident_service.estimation.torque_scales import constrained_least_squares_with_scales, scale_bounds
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.base import BaseParameters
+from ident_service.model.chain import Array
+from ident_service.record.recording import Recording
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Recordings turned into equations.
+
+    Attributes:
+        model: the arm, with the friction's shape and the delay as numbers.
+        equations: of all recordings, torques multiplied by `torque_scales`.
+        delay: between position and torque, where it was estimated.
+        torque_scales: what each joint's measured torque was multiplied by, shape (joints,).
+    """
+
+    model: ArmModel
+    equations: Equations
+    delay: Delay | None
+    torque_scales: Array
+
+
+@dataclass(frozen=True)
+class Fit:
+    """An unconstrained estimate and its doubt.
+
+    Attributes:
+        fit: the least squares whose factors constrained estimates use.
+        equations: what it solves, with row weights where the method has them.
+        covariance: from blocks of scores, shape (base, base).
+    """
+
+    fit: LeastSquares
+    equations: Equations
+    covariance: Array
+
+
+def prepare(
+    recordings: Sequence[Recording], model: ArmModel, base: BaseParameters, conditions: FeasibleSet
+) -> Prepared:
+    """Find what has to be known before the equations are linear, and gather them.
+
+    Raises:
+        RecordingError: a recording does not fit the arm or cannot be used.
+        ParameterError: bounds of torque constants that mean nothing.
+        SolverError: the solver stopped without an optimum.
+    """
+    model = fit_friction(recordings, model, base)
+    delay = None
+    if model.config.identification.delay == "estimate":
+        delay = estimate_delay(recordings, model, base)
+        model = with_delay(model, delay.seconds)
+    gathered = gather(recordings, model, base)
+    scales = np.ones(model.chain.joints)
+    if bounds := scale_bounds(model.config, model.chain.names):
+        weights = weighted_least_squares(gathered.total).weights
+        scales = constrained_least_squares_with_scales(gathered.total, base, conditions, bounds, weights).scales
+        gathered = gathered.with_torques_times(scales)
+    return Prepared(model, gathered, delay, scales)
+
+
+def gather(recordings: Sequence[Recording], model: ArmModel, base: BaseParameters) -> Equations:
+    """The equations of several recordings."""
+    return reduce(Equations.joined, (equations(recording, model, base) for recording in recordings))
+
+
+def unconstrained(
+    method: Method,
+    recordings: Sequence[Recording],
+    prepared: Prepared,
+    base: BaseParameters,
+    conditions: FeasibleSet,
+) -> Fit:
+    """The estimate of a method.
+
+    Raises:
+        RecordingError: a recording cannot be used.
+        ModelError: an iteration does not settle.
+        SolverError: the solver stopped without an optimum.
+    """
+    model, gathered = prepared.model, prepared.equations
+    if method == "ols":
+        fit = ordinary_least_squares(gathered.total)
+        return Fit(fit, gathered, block_covariance(gathered, fit))
+    fit = weighted_least_squares(gathered.total)
+    if method == "wls":
+        return Fit(fit, gathered, block_covariance(gathered, fit))
+    if method == "huber":
+        fit, reweighted = huber(recordings, model, base, fit, prepared.torque_scales)
+        return Fit(fit, reweighted, block_covariance(reweighted, fit))
+    delta = constrained_least_squares(fit, base, conditions).delta
+    refined = instrumental_variables(recordings, model, base, conditions, fit, delta)
+    moved = replace(fit, beta=refined.beta, rho1=fit.R1 @ refined.beta, standard_deviations=refined.standard_deviations)
+    return Fit(moved, gathered, refined.covariance)

@@ -1,0 +1,146 @@
+"""The feasible point nearest to a target: the shape that BPFC (eq. 55) and FBPE (eq. 74) share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ident_service.errors import SolverError
+from ident_service.estimation.conic import ConicProblem, Solution
+from ident_service.estimation.consistency import ConditionsError, contradiction
+from ident_service.estimation.feasible_set import FeasibleSet
+from ident_service.estimation.posing import EPSILON, Lift, constrain, minimise, pressing, project
+from ident_service.model.base import BaseParameters
+from ident_service.model.chain import Array
+
+_SHARPNESS = 1e-2  # a gap of 1e-9 in the solver is at most one of 1e-7 in the distance
+
+
+@dataclass(frozen=True)
+class FeasibleEstimate:
+    """A feasible point that is optimal for something.
+
+    Attributes:
+        beta: base parameters, shape (base,).
+        delta: link parameters with K delta = beta, shape (parameters,).
+        objective: a distance in the space of beta, or a residual norm, without what a prior adds.
+        margin: smallest eigenvalue of all blocks at delta.
+        tight: names of the blocks that keep the objective from being smaller, the most decisive first.
+        iterations: of the solver.
+        solver_seconds: inside the solver.
+        prior_distance: divergence from the prior, before its weight; 0 without one.
+    """
+
+    beta: Array
+    delta: Array
+    objective: float
+    margin: float
+    tight: tuple[str, ...]
+    iterations: int
+    solver_seconds: float
+    prior_distance: float = 0.0
+
+
+def hold(problem: ConicProblem, conditions: FeasibleSet, to_delta: Array, inset: float = EPSILON) -> None:
+    """Every block of the set with the paper's inset (eq. 21), every equality exactly; delta = to_delta x."""
+    for block in conditions.blocks:
+        constrain(problem, block, block.times(to_delta), block.f - inset * block.identity())
+    E, e = conditions.equality_rows()
+    if len(e):
+        problem.zero(E @ to_delta, e)
+
+
+def solve_inside(
+    problem: ConicProblem,
+    objective: Array,
+    name: str,
+    to_delta: Array,
+    conditions: FeasibleSet,
+    size: float,
+    quadratic: Array | None = None,
+) -> tuple[Array, Solution]:
+    """Solve a problem whose answer must lie inside the set.
+
+    Args:
+        problem: constraints gathered, those of the set included.
+        objective: linear coefficients, shape (variables,).
+        name: of the problem, for errors.
+        to_delta: delta = to_delta x.
+        conditions: the set.
+        size: of the largest base parameter.
+        quadratic: diagonal of the Hessian, shape (variables,).
+
+    Returns:
+        Delta, with a positive margin and the equalities fulfilled to the last digit, and the solution.
+
+    Raises:
+        ConditionsError: no parameters at all fulfil the conditions.
+        SolverError: the solver stopped without an optimum.
+    """
+
+    def inside(x: Array) -> bool:
+        return conditions.margin(project(to_delta @ x, conditions))[0] > 0.0
+
+    try:
+        solution = minimise(
+            problem,
+            objective,
+            name,
+            (to_delta, np.zeros(len(to_delta))),
+            conditions,
+            size=size,
+            quadratic=quadratic,
+            accept=inside,
+        )
+    except SolverError as error:
+        if blocks := contradiction(conditions):
+            raise ConditionsError(name, error.status, blocks) from error
+        raise
+    return project(to_delta @ solution.x, conditions), solution
+
+
+def nearest(
+    metric: Array, target: Array, beta: Array, base: BaseParameters, conditions: FeasibleSet, name: str
+) -> FeasibleEstimate:
+    """Minimise |metric b - target| over feasible b.
+
+    Args:
+        metric: shape (rows, base).
+        target: shape (rows,).
+        beta: what the unconstrained answer is about, shape (base,).
+        base: grouping of the parameters.
+        conditions: the set.
+        name: of the problem, for errors.
+
+    Raises:
+        ConditionsError: no parameters at all fulfil the conditions.
+        SolverError: the solver stopped without an optimum.
+    """
+    lift = Lift(base)
+    n, variables = base.size, len(base.names) + 1
+    problem = ConicProblem(variables)
+    # Unit columns for beta: in SI units they differ by orders of magnitude.
+    norms = np.linalg.norm(metric, axis=0)
+    unit = np.where(norms > 0.0, norms, 1.0)
+    scale = max(float(norms.max()), np.finfo(float).tiny)
+    columns = scale / unit
+    distance = np.zeros((len(target) + 1, variables))
+    distance[0, -1] = 1.0
+    distance[1:, :n] = metric * columns / scale
+    problem.second_order(distance, np.concatenate([[0.0], -target / scale]))
+    to_delta = np.column_stack([lift.of_beta * columns, lift.of_dependent, np.zeros(len(base.names))])
+    hold(problem, conditions, to_delta)
+    objective = np.append(np.zeros(variables - 1), max(1.0, _SHARPNESS * scale))
+    size = float(np.max(np.abs(beta), initial=0.0))
+    delta, solution = solve_inside(problem, objective, name, to_delta, conditions, size)
+    found = columns * solution.x[:n] if not conditions.equalities else base.K @ delta
+    return FeasibleEstimate(
+        beta=found,
+        delta=delta,
+        objective=float(np.linalg.norm(metric @ found - target)),
+        margin=conditions.margin(delta)[0],
+        tight=pressing(conditions, solution.duals[1:]),
+        iterations=solution.iterations,
+        solver_seconds=solution.seconds,
+    )

@@ -1,0 +1,140 @@
+"""What all feasibility problems share: delta from (beta, delta_d), blocks into cones, optima that lie too far out.
+
+Where nothing bounds the mass of a link that hardly shows in beta, an optimum may lie far out, or only be approached as
+masses grow beyond all limits. A problem that cannot be solved for that reason is posed again with every link's
+tr(P) = m + tr(Sigma) bounded by a reach that no robot has; the answer then is the best one within that reach.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from ident_service.errors import ParameterError, SolverError
+from ident_service.estimation.conic import ConicProblem, Solution
+from ident_service.estimation.feasible_set import Block, FeasibleSet
+from ident_service.model.base import BaseParameters
+from ident_service.model.chain import Array
+
+EPSILON = 1e-6  # eq. 21, the paper's margin
+MULTIPLIER = 1e-6  # smaller ones are the interior-point method's own distance from the boundary
+_REACHES = (1e4, 1e3, 1e2)  # kg and kg m^2, times the largest base parameter if that is above 1
+
+
+class Lift:
+    """The bijection (beta, delta_d) -> delta of eq. 49, for any grouping whose K has full row rank."""
+
+    def __init__(self, base: BaseParameters) -> None:
+        inverse = np.linalg.inv(base.K[:, base.base])
+        self.dependent = base.dependent
+        self.of_beta = np.zeros((len(base.names), base.size))
+        self.of_beta[base.base] = inverse
+        self.of_dependent = np.zeros((len(base.names), len(self.dependent)))
+        self.of_dependent[base.base] = -inverse @ base.K[:, self.dependent]
+        self.of_dependent[self.dependent, np.arange(len(self.dependent))] = 1.0
+
+    def delta(self, beta: Array, dependent: Array) -> Array:
+        """Link parameters, shape (parameters,)."""
+        return np.asarray(self.of_beta @ beta + self.of_dependent @ dependent)
+
+
+def constrain(problem: ConicProblem, block: Block, F: Array, f: Array) -> None:
+    """Put a block into its cone; F and f are its affine map in the problem's own variables."""
+    if block.size == 0:
+        problem.nonnegative(F, f)
+    else:
+        problem.semidefinite(F, f, block.size)
+
+
+def minimise(
+    problem: ConicProblem,
+    objective: Array,
+    name: str,
+    to_delta: tuple[Array, Array],
+    conditions: FeasibleSet,
+    *,
+    size: float = 1.0,
+    quadratic: Array | None = None,
+    accept: Callable[[Array], bool] = lambda _: True,
+) -> Solution:
+    """Solve, within a reach where it cannot be solved without one.
+
+    Args:
+        problem: constraints gathered.
+        objective: linear coefficients, shape (variables,).
+        name: of the problem, for errors.
+        to_delta: T and d with delta = T x + d.
+        conditions: whose links to bound.
+        size: of the largest base parameter, which a reach must not cut off.
+        quadratic: diagonal of the Hessian, shape (variables,).
+        accept: whether an optimum is accurate enough to be used.
+
+    Raises:
+        SolverError: no optimum, with or without a reach, or none that is acceptable.
+    """
+    T, d = to_delta
+    status = "outside the set"
+    try:
+        solution = problem.minimise(objective, name, quadratic)
+        if accept(solution.x):
+            return solution
+    except SolverError as error:
+        if error.status.endswith("Infeasible"):
+            raise
+        status = error.status
+    largest, trace = max(1.0, size), _traces(conditions)
+    for reach in _REACHES:
+        bounded = problem.copy()
+        bounded.nonnegative(-trace @ T / reach, largest - trace @ d / reach)
+        try:
+            solution = bounded.minimise(objective, name, quadratic)
+        except SolverError:
+            continue
+        if accept(solution.x):
+            return solution
+    raise SolverError(name, status)
+
+
+def _traces(conditions: FeasibleSet) -> Array:
+    """Rows tr(P_k) = m + tr(L)/2 per link, shape (links, parameters)."""
+    index = {name: column for column, name in enumerate(conditions.names)}
+    links = [name[1:] for name in conditions.names if name.startswith("m") and name[1:].isdigit()]
+    rows = np.zeros((len(links), len(index)))
+    for row, link in zip(rows, links, strict=True):
+        row[[index[f"Lxx{link}"], index[f"Lyy{link}"], index[f"Lzz{link}"]]] = 0.5
+        row[index[f"m{link}"]] = 1.0
+    return rows
+
+
+def pressing(conditions: FeasibleSet, duals: Sequence[Array]) -> tuple[str, ...]:
+    """Blocks with a multiplier that counts: relaxing them would let the optimum improve; the most decisive first."""
+    weights = [float(np.abs(dual).max()) for dual in duals[: len(conditions.blocks)]]
+    order = sorted(range(len(weights)), key=lambda i: -weights[i])
+    floor = max(MULTIPLIER, 1e-3 * max(weights))
+    return tuple(conditions.blocks[i].name for i in order if weights[i] > floor)
+
+
+def project(delta: Array, conditions: FeasibleSet) -> Array:
+    """The nearest delta that fulfils the equalities to the last digit."""
+    E, e = conditions.equality_rows()
+    if len(e) == 0:
+        return delta
+    moved = np.asarray(delta - np.linalg.pinv(E) @ (E @ delta + e))
+    # An equality about one parameter alone is a value, without rounding.
+    for row in np.flatnonzero(np.count_nonzero(E, axis=1) == 1):
+        column = int(np.flatnonzero(E[row])[0])
+        moved[column] = -e[row] / E[row, column] + 0.0
+    return moved
+
+
+def check(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> None:
+    """Refuse what does not belong together.
+
+    Raises:
+        ParameterError: shapes or names do not fit.
+    """
+    if beta.shape != (base.size,):
+        raise ParameterError(f"{beta.shape=} but there are {base.size} base parameters")
+    if conditions.names != base.names:
+        raise ParameterError("the feasible set and the base parameters are about different link parameters")

@@ -1,0 +1,229 @@
+"""Estimates drawn towards known link parameters delta0, as from CAD, in units of the residual's variance.
+
+    minimise  |R_1 beta - rho_1|^2 / sigma^2 + weight * d(delta, delta0)    over the feasible set
+
+- `euclidean`: d is the sum of squared differences, each in units of its parameter's reference scale (`blocks.py`).
+- `entropic`: per link the log-det Bregman divergence of the 4x4 pseudo-inertias (Lee, Wensing and Park 2020),
+  `-logdet(P) + logdet(P0) + tr(P0^-1 P) - 4`, which does not depend on the choice of link frame; joint terms, which
+  have no such metric, are Euclidean.
+
+With P0 = G G^T the divergence is that of Q = G^-1 P G^-T from the identity. In cones, logdet Q >= sum_i t_i where
+[[Q, Z], [Z^T, diag(Z)]] >= 0 for a lower triangular Z and t_i <= log Z_ii.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident_service.errors import ParameterError
+from ident_service.estimation.blocks import reference, symmetric
+from ident_service.estimation.conic import ConicProblem, triangle_entries
+from ident_service.estimation.feasible_set import Block, FeasibleSet, feasible_set
+from ident_service.estimation.least_squares import LeastSquares
+from ident_service.estimation.nearest import FeasibleEstimate, hold, solve_inside
+from ident_service.estimation.posing import pressing
+from ident_service.model.base import BaseParameters
+from ident_service.model.chain import Array
+from ident_service.model.layout import INERTIAL
+
+_TRIANGLE = [(i, j) for i in range(4) for j in range(i + 1)]  # entries of Z, row by row
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known beforehand, and how much it counts.
+
+    Attributes:
+        kind: which divergence.
+        names: link parameters.
+        delta: their values [SI], shape (parameters,).
+        weight: of one unit of divergence against one residual variance; 0 for none.
+        sigma: standard deviation of the residual [N m or N]; that of the fit when None.
+    """
+
+    kind: Literal["euclidean", "entropic"]
+    names: tuple[str, ...]
+    delta: Array
+    weight: float
+    sigma: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.delta.shape != (len(self.names),):
+            raise ParameterError(f"{self.delta.shape=} but the prior has {len(self.names)} names")
+        if not np.all(np.isfinite(self.delta)):
+            raise ParameterError("the prior has values that are not finite")
+        if not (np.isfinite(self.weight) and self.weight >= 0.0):
+            raise ParameterError(f"the weight of a prior is {self.weight:g}, not a number from 0 up")
+        if self.sigma is not None and not (np.isfinite(self.sigma) and self.sigma > 0.0):
+            raise ParameterError(f"the residual's standard deviation is {self.sigma:g}, not a positive number")
+        if self.kind == "entropic":
+            _ = self.whitened
+
+    @cached_property
+    def scales(self) -> Array:
+        """Reference scale per parameter, shape (parameters,)."""
+        return np.array([reference(name) for name in self.names])
+
+    @cached_property
+    def euclidean(self) -> NDArray[np.intp]:
+        """Columns of delta whose squared difference counts."""
+        inertial = [name.rstrip("0123456789") in INERTIAL for name in self.names]
+        return np.flatnonzero(np.ones(len(self.names)) if self.kind == "euclidean" else ~np.array(inertial))
+
+    @cached_property
+    def whitened(self) -> tuple[Block, ...]:
+        """Per link, Q as an affine map of delta.
+
+        Raises:
+            ParameterError: a link whose prior pseudo-inertia is not positive definite.
+        """
+        blocks = []
+        for block in feasible_set("pseudo_inertia", self.names).blocks:
+            size = np.sqrt(block.references())
+            P0 = symmetric(block.F @ self.delta, 4) / np.outer(size, size)
+            if np.linalg.eigvalsh(P0)[0] <= 1e-12 * np.trace(P0):
+                link = block.name.split(":")[0]
+                raise ParameterError(
+                    f"{link}: no real body has the inertia of the prior, its pseudo-inertia is not > 0"
+                )
+            root = np.linalg.inv(size[:, None] * np.linalg.cholesky(P0))
+            matrices = [root @ symmetric(column, 4) @ root.T for column in block.F.T]
+            F = np.array([[matrix[i, j] for i, j in triangle_entries(4)] for matrix in matrices]).T
+            blocks.append(Block(block.name, 4, F, np.zeros(10)))
+        return tuple(blocks)
+
+    def divergence(self, delta: Array) -> float:
+        """Divergence of delta from the prior; infinite outside the positive pseudo-inertias if `entropic`."""
+        columns = self.euclidean
+        total = float(np.sum(((delta - self.delta)[columns] / self.scales[columns]) ** 2))
+        if self.kind == "entropic":
+            for block in self.whitened:
+                values = np.linalg.eigvalsh(symmetric(block.F @ delta, 4))
+                if values[0] <= 0.0:
+                    return float("inf")
+                total += float(np.sum(values - 1.0 - np.log(values)))
+        return total
+
+
+def residual_deviation(fit: LeastSquares) -> float:
+    """Standard deviation of the residual that the fit's own deviations are made from (eq. 81).
+
+    Raises:
+        ParameterError: no parameter was seen, or the residual is exactly zero.
+    """
+    rows = np.linalg.norm(fit.inverse, axis=1)
+    seen = np.isfinite(fit.standard_deviations) & (rows > 0.0)
+    if not np.any(seen):
+        raise ParameterError("a prior is weighted by the residual's variance, but the data saw no parameter at all")
+    sigma = float(np.median(fit.standard_deviations[seen] / rows[seen]))
+    if sigma <= 0.0:
+        raise ParameterError("a prior is weighted by the residual's variance, but the residual is zero; give a sigma")
+    return sigma
+
+
+def towards_prior(fit: LeastSquares, base: BaseParameters, conditions: FeasibleSet, prior: Prior) -> FeasibleEstimate:
+    """Constrained least squares with a prior.
+
+    Raises:
+        ParameterError: the prior is about other link parameters, or the residual has no variance.
+        ConditionsError: no parameters at all fulfil the conditions.
+        SolverError: the solver stopped without an optimum.
+    """
+    if prior.names != conditions.names:
+        raise ParameterError("the prior and the feasible set are about different link parameters")
+    sigma = residual_deviation(fit) if prior.sigma is None else prior.sigma
+    n, links = len(prior.names), prior.whitened if prior.kind == "entropic" else ()
+    rows = len(fit.rho1)
+    # Variables: delta in reference scales, the whitened residual r, per link Z and t.
+    variables = n + rows + 14 * len(links)
+    problem = ConicProblem(variables)
+    to_delta = np.zeros((n, variables))
+    to_delta[:, :n] = np.diag(prior.scales)
+    hold(problem, conditions, to_delta)
+    residual = np.zeros((rows, variables))
+    residual[:, :n] = fit.R1 @ base.K * prior.scales / sigma
+    residual[:, n : n + rows] = -np.eye(rows)
+    problem.zero(residual, -fit.rho1 / sigma)
+    # Divided by 1 + weight, neither part overwhelms the solver's sense of scale.
+    data, known = 1.0 / (1.0 + prior.weight), prior.weight / (1.0 + prior.weight)
+    objective, quadratic = np.zeros(variables), np.zeros(variables)
+    quadratic[n : n + rows] = 2.0 * data
+    quadratic[prior.euclidean] = 2.0 * known
+    objective[prior.euclidean] = -2.0 * known * (prior.delta / prior.scales)[prior.euclidean]
+    for k, block in enumerate(links):
+        start = n + rows + 14 * k
+        _logdet(problem, block, to_delta, start)
+        trace = block.F[[entry for entry, (i, j) in enumerate(triangle_entries(4)) if i == j]].sum(axis=0)
+        objective += known * (trace @ to_delta)
+        objective[start + 10 : start + 14] -= known
+    size = float(np.max(np.abs(np.concatenate([fit.beta, prior.delta])), initial=0.0))
+    delta, solution = solve_inside(
+        problem, objective, "constrained least squares with a prior", to_delta, conditions, size, quadratic
+    )
+    beta = base.K @ delta
+    return FeasibleEstimate(
+        beta=beta,
+        delta=delta,
+        objective=float(np.linalg.norm(fit.R1 @ beta - fit.rho1)),
+        margin=conditions.margin(delta)[0],
+        tight=pressing(conditions, solution.duals),
+        iterations=solution.iterations,
+        solver_seconds=solution.seconds,
+        prior_distance=prior.divergence(delta),
+    )
+
+
+def _logdet(problem: ConicProblem, block: Block, to_delta: Array, start: int) -> None:
+    """Z from variable `start` on (10, row by row) and t (4) with sum t <= logdet Q."""
+    entries = triangle_entries(8)
+    place = {entry: row for row, entry in enumerate(entries)}
+    lifted = np.zeros((len(entries), to_delta.shape[1]))
+    Q = block.F @ to_delta
+    for row, (i, j) in enumerate(triangle_entries(4)):
+        lifted[place[i, j]] = Q[row]
+    for offset, (i, j) in enumerate(_TRIANGLE):
+        lifted[place[i, 4 + j], start + offset] = 1.0
+        if i == j:
+            lifted[place[4 + i, 4 + i], start + offset] = 1.0
+            cone = np.zeros((3, to_delta.shape[1]))
+            cone[0, start + 10 + i] = 1.0
+            cone[2, start + offset] = 1.0
+            problem.exponential(cone, np.array([0.0, 1.0, 0.0]))
+    problem.semidefinite(lifted, np.zeros(len(entries)), 8)
+
+
+@dataclass(frozen=True)
+class WeightChoice:
+    """A weight and what it was chosen from: the score of every weight tried, in the order of the grid."""
+
+    weight: float
+    weights: tuple[float, ...]
+    scores: tuple[float, ...]
+
+
+def choose_weight(
+    fit_for_weight: Callable[[float], Array], score: Callable[[Array], float], grid: Sequence[float]
+) -> WeightChoice:
+    """The weight whose estimate explains recordings best that the fit never saw.
+
+    Args:
+        fit_for_weight: base parameters for a weight, shape (base,).
+        score: of base parameters on held-out recordings, smaller is better.
+        grid: weights to try; of equal scores the larger weight wins, which asks less of the data.
+
+    Raises:
+        ParameterError: an empty grid, a negative weight or a score that is not a number.
+    """
+    if not grid or not all(np.isfinite(weight) and weight >= 0.0 for weight in grid):
+        raise ParameterError("weights to choose from are one or more numbers from 0 up")
+    scores = tuple(float(score(fit_for_weight(float(weight)))) for weight in grid)
+    if not np.all(np.isfinite(scores)):
+        raise ParameterError(f"held-out scores are not all finite: {scores}")
+    best = min(range(len(grid)), key=lambda i: (scores[i], -grid[i]))
+    return WeightChoice(float(grid[best]), tuple(float(weight) for weight in grid), scores)

@@ -1,0 +1,174 @@
+"""From recording files to a folder of results: what `ident identify` does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ident_service.config.load import load_arm, load_recording_format
+from ident_service.config.schema import ArmConfig, Method
+from ident_service.errors import UsageError
+from ident_service.estimation.bootstrap import bootstrap
+from ident_service.estimation.essential import essential_parameters
+from ident_service.estimation.feasible_set import SetName
+from ident_service.estimation.identify import Estimate, identify
+from ident_service.estimation.sdpa import bpfc_sdpa, bpft_sdpa, fbpe_sdpa
+from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.record.open import open_recording
+from ident_service.record.quality import quality
+from ident_service.record.recording import Recording
+from ident_service.results.files import appearing_folder, write_atomically
+from ident_service.results.run_folder import write_manifest, write_results
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked for.
+
+    Attributes:
+        arm: description file or name of a shipped one.
+        recordings: to fit to.
+        validation: to judge on.
+        columns: a YAML file with the keys of the arm's `recording` section, instead of it.
+        method: estimator, the arm's when None.
+        set_name: feasible set, the arm's when None.
+        prior: `none`, `euclidean` or `entropic`, the arm's when None.
+        prior_weight: of the prior, the arm's (or chosen on held-out data) when None.
+        delay: between position and torque [s], or `estimate`; the arm's when None.
+        replicates: of the bootstrap of the constrained estimate; 0 for none.
+        essential: whether to look for the smallest model that predicts as well.
+        sdpa: whether to write the optimisation problems for other solvers.
+    """
+
+    arm: str
+    recordings: tuple[Path, ...]
+    validation: tuple[Path, ...] = ()
+    columns: Path | None = None
+    method: Method | None = None
+    set_name: SetName | None = None
+    prior: str | None = None
+    prior_weight: float | None = None
+    delay: float | str | None = None
+    replicates: int = 0
+    essential: bool = False
+    sdpa: bool = False
+
+
+@dataclass(frozen=True)
+class Identified:
+    """What came out.
+
+    Attributes:
+        estimate: with everything known of it.
+        files: names of the files in the folder.
+        warnings: what is wrong with the recordings, in words.
+    """
+
+    estimate: Estimate
+    files: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+def identify_files(request: Request, folder: Path, tell: Callable[[str], None] = lambda _: None) -> Identified:
+    """Identify an arm from files and write the results.
+
+    Args:
+        request: what is asked for.
+        folder: where results go; existing files of other names stay.
+        tell: called with a line at each step that takes longer.
+
+    Raises:
+        UsageError, ConfigError: the request or the arm's description cannot be meant.
+        RecordingError: a recording cannot be used.
+        SolverError: a solver stopped without an optimum.
+    """
+    model = arm_model(_config(request))
+    recordings = [_open(path, model) for path in request.recordings]
+    validation = [_open(path, model) for path in request.validation]
+    warnings = tuple(line for recording in [*recordings, *validation] for line in _warnings(recording, model))
+    estimate = identify(model, recordings, validation, method=request.method, set_name=request.set_name)
+    more: dict[str, Any] = {}
+    if request.replicates:
+        tell(f"bootstrap of {request.replicates} replicates")
+        more["bootstrap"] = _bootstrap(estimate, request.replicates)
+    if request.essential:
+        tell("essential parameters")
+        more["essential"] = _essential(estimate)
+    with appearing_folder(folder) as staging:
+        files = write_results(staging, estimate, more)
+        if request.sdpa:
+            files += _write_sdpa(staging, estimate)
+        write_manifest(staging)
+    return Identified(estimate, tuple(files), warnings)
+
+
+def _config(request: Request) -> ArmConfig:
+    config = load_arm(request.arm)
+    if request.columns is not None:
+        config = config.model_copy(update={"recording": load_recording_format(request.columns)})
+    options = config.identification
+    pull = options.prior
+    if request.prior is not None:
+        pull = pull.model_copy(update={"kind": request.prior})
+    if request.prior_weight is not None:
+        if pull.kind == "none":
+            raise UsageError("a prior weight without a prior; add --prior")
+        pull = pull.model_copy(update={"weight": request.prior_weight})
+    changes: dict[str, Any] = {"prior": pull}
+    if request.delay is not None:
+        changes["delay"] = request.delay
+    return config.model_copy(update={"identification": options.model_copy(update=changes)})
+
+
+def _open(path: Path, model: ArmModel) -> Recording:
+    return open_recording(path, model.chain.names, fmt=model.config.recording, transmission=model.config.transmission)
+
+
+def _warnings(recording: Recording, model: ArmModel) -> list[str]:
+    torn = [f"{recording.path.name}: torn; read up to the tear"] if recording.torn else []
+    limits = np.array(
+        [
+            np.nan if (joint := model.config.joints.get(name)) is None or joint.torque is None else joint.torque
+            for name in model.chain.names
+        ]
+    )
+    found = quality(recording, model.config.recording, limits)
+    return [*torn, *(f"{recording.path.name}: {line}" for line in found.warnings())]
+
+
+def _bootstrap(estimate: Estimate, replicates: int) -> dict[str, Any]:
+    drawn = bootstrap(estimate.fitted, estimate.fit, estimate.base, estimate.conditions, replicates)
+    return {
+        "replicates": replicates,
+        "blocks_in_a_run": drawn.run,
+        "standard_deviations": [float(value) if np.isfinite(value) else None for value in drawn.standard_deviations],
+    }
+
+
+def _essential(estimate: Estimate) -> dict[str, Any]:
+    found = essential_parameters(estimate.fitted, estimate.fit, covariance=estimate.covariance)
+    return {
+        "expressions": [estimate.base.expressions[index] for index in found.kept],
+        "values": found.beta[found.kept].tolist(),
+        "standard_deviations": found.standard_deviations[found.kept].tolist(),
+        "relative_error_percent": {
+            "all": found.full.relative_percent,
+            "essential": found.reduced.relative_percent,
+        },
+    }
+
+
+def _write_sdpa(folder: Path, estimate: Estimate) -> list[str]:
+    fit, base, conditions = estimate.fit, estimate.base, estimate.conditions
+    texts: Sequence[tuple[str, str]] = (
+        ("feasibility_test.dat-s", bpft_sdpa(fit.beta, base, conditions)),
+        ("correction.dat-s", bpfc_sdpa(fit.beta, base, conditions)),
+        ("constrained_least_squares.dat-s", fbpe_sdpa(fit, base, conditions)),
+    )
+    for name, text in texts:
+        write_atomically(folder / name, text)
+    return [name for name, _ in texts]

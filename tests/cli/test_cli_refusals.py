@@ -1,0 +1,294 @@
+"""Bad input: a clear message, the right exit code, and nothing left behind, not even a hidden file."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli.conftest import Commissioned, Ended, Ident, Samples, left_over, quick_arm
+
+from ident_service.config.load import load_arm
+from ident_service.errors import ArmError
+from ident_service.service.commission import simulate
+
+TABLE = {"format": "ident-parameters", "version": 1, "base_parameters": {"expressions": ["m1"], "values": [-1.0]}}
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    """Where input lies and output would appear; what is here after a refusal was here before."""
+    folder = tmp_path / "place"
+    folder.mkdir()
+    return folder
+
+
+def refused(place: Path, ident: Ident, words: tuple[object, ...], code: int, message: str) -> Ended:
+    """Run a command that must be refused, in words and as JSON; `{}` in the message stands for any text."""
+    before = left_over(place.parent)
+    in_words = ident(*words)
+    assert in_words.code == code, in_words
+    assert in_words.err.startswith("ident: ")
+    assert message in in_words.err
+    assert "Traceback" not in in_words.err
+    as_json = ident(*words, "--json")
+    assert as_json.code == code
+    error = as_json.json["error"]
+    assert message in error["message"]
+    assert error["kind"].endswith(("Error", "Refused", "Fault"))
+    assert left_over(place.parent) == before
+    return in_words
+
+
+@pytest.mark.parametrize("verb", [("config", "check"), ("base",), ("simulate",)])
+def test_unknown_key(place: Path, ident: Ident, verb: tuple[str, ...]) -> None:
+    arm = quick_arm(place, ("gravity:", "gravitiy:"))
+    line = (
+        arm.read_text()
+        .splitlines()
+        .index("gravitiy: [0, -9.81, 0] # m/s^2; the joints turn about the base's z, which lies level")
+        + 1
+    )
+    refused(place, ident, (*verb, arm), 2, f"{arm}:{line}:1: gravitiy: unknown key 'gravitiy'")
+
+
+def test_lower_above_upper(place: Path, ident: Ident) -> None:
+    arm = quick_arm(place, ("position: [-1.8, 1.8]", "position: [103, -103]"))
+    ended = refused(place, ident, ("config", "check", arm), 2, "lower bound 103 is not below upper bound -103")
+    assert f"{arm}:" in ended.err
+
+
+def test_all_mistakes_at_once(place: Path, ident: Ident) -> None:
+    arm = quick_arm(
+        place,
+        ("gravity:", "gravitiy:"),
+        ("position: [-1.8, 1.8]", "position: [103, -103]"),
+        ("name: planar2", "nome: x"),
+    )
+    ended = refused(place, ident, ("config", "check", arm), 2, "unknown key 'gravitiy'")
+    for message in ("is not below upper bound", "unknown key 'nome'", "'name' is missing"):
+        assert message in ended.err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("simulate", "nowhere.yaml"),
+        ("base", "nowhere.yaml"),
+        ("config", "check", "nowhere.yaml"),
+        ("feasible", "nowhere.json"),
+        ("correct", "nowhere.json", "--out", "{place}/c.json"),
+        ("identify", "nowhere.mcap", "--arm", "planar2", "--out", "{place}/out"),
+        ("identify", "nowhere.csv", "--arm", "planar2"),
+        ("identify", "{run}/identification.mcap", "--arm", "nowhere.yaml", "--out", "{place}/out"),
+        ("identify", "{run}/identification.mcap", "--arm", "planar2", "--validate", "nowhere.mcap"),
+    ],
+)
+def test_missing_file(place: Path, quick: Commissioned, ident: Ident, words: tuple[str, ...]) -> None:
+    given = tuple(word.format(place=place, run=quick.folder) for word in words)
+    refused(place, ident, given, 2, "nowhere.")
+
+
+def identify(place: Path, quick: Commissioned, recording: Path) -> tuple[object, ...]:
+    return ("identify", recording, "--arm", quick.arm, "--out", place / "out")
+
+
+def test_wrong_joint_count(place: Path, quick: Commissioned, samples: Samples, ident: Ident) -> None:
+    wide = replace(samples, position=np.tile(samples.position, 3), torque=np.tile(samples.torque, 3))
+    path = wide.write(place / "six.csv")
+    refused(place, ident, identify(place, quick, path), 1, f"{path}: has 6 joints but the arm has 2")
+
+
+def test_recording_of_another_arm(place: Path, quick: Commissioned, ident: Ident) -> None:
+    words = ("identify", quick.folder / "identification.mcap", "--arm", "wam7", "--out", place / "out")
+    refused(place, ident, words, 1, str(quick.folder / "identification.mcap"))
+
+
+@pytest.mark.parametrize(("column", "name"), [("position", "position"), ("torque", "torque")])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_samples_that_are_no_numbers(
+    place: Path, quick: Commissioned, samples: Samples, ident: Ident, column: str, name: str, value: float
+) -> None:
+    values = getattr(samples, column).copy()
+    values[7000, 1] = value
+    path = replace(samples, **{column: values}).write(place / "nan.csv")
+    message = f"{path}: line 7002, 7.000000 s after the first: {name} of joint "
+    ended = refused(place, ident, identify(place, quick, path), 1, message)
+    assert f" is {value};" in ended.err
+
+
+def test_two_seconds(place: Path, quick: Commissioned, samples: Samples, ident: Ident) -> None:
+    short = Samples(samples.time[:2000], samples.position[:2000], samples.torque[:2000])
+    path = short.write(place / "short.csv")
+    ended = refused(place, ident, identify(place, quick, path), 1, f"{path}: ")
+    assert "at least 2.6" in ended.err
+
+
+def test_torn_last_row(place: Path, quick: Commissioned, samples: Samples, ident: Ident) -> None:
+    path = samples.write(place / "torn.csv")
+    whole = path.read_text()
+    path.write_text(whole[: whole.rindex(",")])
+    lines = whole.count("\n")
+    refused(place, ident, identify(place, quick, path), 1, f"{path}: line {lines}: has 4 fields but the header has 5")
+
+
+def test_time_that_stands_still(place: Path, quick: Commissioned, samples: Samples, ident: Ident) -> None:
+    time = samples.time.copy()
+    time[500] = time[499]
+    path = replace(samples, time=time).write(place / "stuck.csv")
+    refused(place, ident, identify(place, quick, path), 1, "line 502, 0.499000 s after the first: the stamp does not")
+
+
+def test_a_joint_that_never_moves(place: Path, quick: Commissioned, samples: Samples, ident: Ident) -> None:
+    position = samples.position.copy()
+    position[:, 1] = 0.5
+    path = replace(samples, position=position).write(place / "still.csv")
+    refused(place, ident, identify(place, quick, path), 1, "elbow: never faster than")
+
+
+@pytest.mark.parametrize("content", [b"", b"hello\n", b"\x00\x01\x02", b"t,q1,tau1\n"])
+def test_files_that_are_no_recordings(place: Path, quick: Commissioned, ident: Ident, content: bytes) -> None:
+    path = place / "other.csv"
+    path.write_bytes(content)
+    refused(place, ident, identify(place, quick, path), 1, str(path))
+
+
+def test_validation_on_the_fitted_recording(place: Path, quick: Commissioned, ident: Ident) -> None:
+    recording = quick.folder / "identification.mcap"
+    copy = place / "copy.mcap"
+    copy.write_bytes(recording.read_bytes())
+    for unseen in (recording, copy):
+        words = (*identify(place, quick, recording), "--validate", unseen)
+        refused(place, ident, words, 2, f"{unseen}: a recording that is fitted to cannot validate the fit")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        (),
+        ("fly",),
+        ("simulate", "--seed", "-1"),
+        ("simulate", "--seed", "one"),
+        ("simulate", "--feasible-set", "magic"),
+        ("simulate", "planar2", "wam7_sim"),
+        ("identify", "--arm", "planar2"),
+        ("identify", "a.mcap"),
+        ("identify", "a.mcap", "--arm", "planar2", "--method", "magic"),
+        ("feasible",),
+        ("feasible", "a.json", "--feasible-set", "none"),
+        ("feasible", "a.json", "--out", "b.json"),
+        ("correct", "a.json"),
+        ("config",),
+        ("config", "mend", "a.yaml"),
+    ],
+)
+def test_words_that_cannot_be_meant(place: Path, ident: Ident, words: tuple[str, ...]) -> None:
+    ended = ident(*words)
+    assert ended.code == 2
+    assert ended.out == ""
+    assert "usage: ident" in ended.err
+    assert left_over(place.parent) == ["place"]
+
+
+def test_an_arm_that_is_not_simulated(place: Path, ident: Ident) -> None:
+    refused(place, ident, ("simulate", "wam7"), 2, "wam7 has no simulated driver")
+
+
+def test_parameter_files_that_do_not_fit(place: Path, ident: Ident) -> None:
+    path = place / "p.json"
+    path.write_text("{}")
+    message = f"{path}: not a parameter file: $: 'format' is a required property; $: 'version' is a required property; "
+    for words in (("feasible", path), ("correct", path, "--out", place / "c.json")):
+        refused(place, ident, words, 1, message)
+    path.write_text(json.dumps(TABLE).replace("-1.0", "NaN"))
+    refused(place, ident, ("feasible", path), 1, f"{path}: not JSON: NaN is not a number that JSON knows")
+    path.write_text(json.dumps(TABLE).replace("m1", "m9"))
+    refused(place, ident, ("feasible", path, "--arm", "planar2"), 1, "no parameter is called 'm9'")
+
+
+def test_a_file_about_another_arm(place: Path, quick: Commissioned, ident: Ident) -> None:
+    words = ("feasible", quick.folder / "parameters.json", "--arm", "wam7")
+    refused(place, ident, words, 1, "is about the arm planar2 with other joints than wam7")
+
+
+def test_a_correction_that_cannot_be_written(place: Path, ident: Ident) -> None:
+    path = place / "p.json"
+    path.write_text(json.dumps(TABLE))
+    words = ("correct", path, "--out", place / "nowhere" / "c.json")
+    refused(place, ident, words, 2, f"{place / 'nowhere' / 'c.json'}: cannot be written: No such file or directory")
+
+
+def test_conditions_that_contradict_each_other(place: Path, ident: Ident) -> None:
+    arm = quick_arm(place, ("body: {center_of_mass", "body: {mass: [5, 6], center_of_mass"))
+    path = place / "p.json"
+    path.write_text(json.dumps(TABLE))
+    assert ident("feasible", path, "--arm", arm).code == 3
+    words = ("correct", path, "--arm", arm, "--out", place / "c.json")
+    refused(place, ident, words, 1, "feasibility correction: the solver stopped with status PrimalInfeasible")
+
+
+def test_an_existing_run_folder_is_not_touched_by_simulate(place: Path, quick: Commissioned, ident: Ident) -> None:
+    folder = place / "run"
+    folder.mkdir()
+    (folder / "mine").write_text("keep")
+    words = ("simulate", quick.arm, "--out", folder)
+    refused(place, ident, words, 2, f"{folder}: exists already; give a folder that does not")
+    assert (folder / "mine").read_text() == "keep"
+
+
+def test_identify_adds_to_an_existing_folder(place: Path, quick: Commissioned, ident: Ident) -> None:
+    folder = place / "out"
+    folder.mkdir()
+    (folder / "mine").write_text("keep")
+    (folder / "report.txt").write_text("old")
+    words = identify(place, quick, quick.folder / "identification.mcap")
+    assert ident(*words).code == 0
+    names = ["identified.urdf", "manifest.json", "mine", "parameters.json", "report.txt"]
+    assert left_over(place) == ["out", *(f"out/{name}" for name in names)]
+    assert (folder / "mine").read_text() == "keep"
+    assert (folder / "report.txt").read_text() != "old"
+    # An unusable recording does not touch what is there.
+    (place / "bad.csv").write_text("hello\n")
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert ident(*identify(place, quick, place / "bad.csv")).code == 1
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+@pytest.mark.parametrize("verb", ["simulate", "identify"])
+def test_a_file_in_the_place_of_the_folder(place: Path, quick: Commissioned, ident: Ident, verb: str) -> None:
+    (place / "out").write_text("a file")
+    words = (
+        ("simulate", quick.arm, "--out", place / "out")
+        if verb == "simulate"
+        else identify(place, quick, quick.folder / "identification.mcap")
+    )
+    refused(place, ident, words, 2, str(place / "out"))
+    assert (place / "out").read_text() == "a file"
+
+
+def test_a_motion_beyond_the_limits_is_a_no(place: Path, ident: Ident) -> None:
+    arm = quick_arm(place, ("torque: 40", "torque: 4"))
+    refused(place, ident, ("simulate", arm, "--out", place / "run"), 3, "planar2: gravity alone asks for more than")
+
+
+def test_a_fault_stops_the_arm(place: Path, ident: Ident) -> None:
+    # An elbow a hundred times as sticky as the controller's model has it cannot follow.
+    arm = quick_arm(place, ("fc2: 0.3", "fc2: 30"))
+    ended = refused(place, ident, ("simulate", arm, "--out", place / "run"), 4, "elbow")
+    assert "following" in ended.err
+
+
+@pytest.mark.parametrize(
+    ("cycles", "motion"), [(100, "identification"), (9000, "identification"), (18000, "validation")]
+)
+def test_a_stop_on_request_is_no_success_and_nothing_moves_again(place: Path, cycles: int, motion: str) -> None:
+    config = load_arm(quick_arm(place))
+    before = left_over(place)
+    asked = iter([False] * cycles)
+    told: list[str] = []
+    with pytest.raises(ArmError, match=f"^{motion} motion: stopped on request; nothing was kept$"):
+        simulate(config, place / "run", stop_requested=lambda: next(asked, True), tell=told.append)
+    assert told[-1].startswith(f"{motion} motion: ")
+    assert left_over(place) == before

@@ -1,0 +1,333 @@
+"""Every verb, in words and as JSON, with the exit codes of the conventions."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli.conftest import Commissioned, Ident, Samples, left_over, quick_arm
+
+from ident_service import __version__
+from ident_service.cli import main
+from ident_service.config.load import shipped_arms
+from ident_service.results.parameter_file import read_parameters
+
+RUN_FILES = [
+    "arm.json",
+    "identification.excitation.json",
+    "identification.mcap",
+    "identified.urdf",
+    "manifest.json",
+    "parameters.json",
+    "report.txt",
+    "score.json",
+    "validation.excitation.json",
+    "validation.mcap",
+]
+FEASIBLE = {"expressions": ["m1", "Lzz1"], "values": [1.0, 0.2]}
+INFEASIBLE = {"expressions": ["m1", "Lzz1"], "values": [-1.0, 0.2]}
+
+
+def table(folder: Path, content: dict[str, list[object]], **rest: object) -> Path:
+    path = folder / "table.json"
+    path.write_text(json.dumps({"format": "ident-parameters", "version": 1, "base_parameters": content, **rest}))
+    return path
+
+
+def test_simulate_prints_score_and_files(quick: Commissioned) -> None:
+    assert sorted(path.name for path in quick.folder.iterdir()) == RUN_FILES
+    assert f"files: {quick.folder}" in quick.out
+    assert all(f"  {name}\n" in quick.out for name in RUN_FILES)
+    assert "score against the truth" in quick.out
+    assert "planar2: 13 base parameters of 28 link parameters" in quick.out
+
+
+def test_simulate_keeps_what_it_says(quick: Commissioned) -> None:
+    score = json.loads((quick.folder / "score.json").read_text())
+    assert score["noise_free_torque_error_percent"] < 0.3
+    assert score["validation_residual_ratio"] < 1.2
+    assert score["worst_identified_sigma"] < 4.0
+    manifest = json.loads((quick.folder / "manifest.json").read_text())["files"]
+    assert sorted(manifest) == [name for name in RUN_FILES if name != "manifest.json"]
+    for name, digest in manifest.items():
+        assert hashlib.sha256((quick.folder / name).read_bytes()).hexdigest() == digest
+    parameters = json.loads((quick.folder / "parameters.json").read_text())
+    assert parameters["feasibility"]["feasible"] is True
+    assert parameters["validation"][0]["recording"] == "validation.mcap"
+    used = parameters["provenance"]["recordings"]
+    assert used == [{"name": "identification.mcap", "sha256": manifest["identification.mcap"]}]
+
+
+def test_identify_in_words(quick: Commissioned, ident: Ident, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    recording, unseen = quick.folder / "identification.mcap", quick.folder / "validation.mcap"
+    ended = ident("identify", recording, "--arm", quick.arm, "--validate", unseen, "--out", out)
+    assert ended.code == 0
+    assert ended.err == ""
+    assert f"files: {out}\n  parameters.json\n  identified.urdf\n  report.txt\n" in ended.out
+    assert left_over(out) == ["identified.urdf", "manifest.json", "parameters.json", "report.txt"]
+    # The same recordings give the same numbers as the whole job did.
+    one, other = (read_parameters(folder / "parameters.json").values for folder in (out, quick.folder))
+    np.testing.assert_allclose(one, other, rtol=1e-9)
+
+
+def test_identify_as_json(quick: Commissioned, ident: Ident, state: Path) -> None:
+    recording, unseen = quick.folder / "identification.mcap", quick.folder / "validation.mcap"
+    ended = ident("identify", recording, "--arm", quick.arm, "--validate", unseen, "--json")
+    document = ended.json
+    assert ended.code == 0
+    folder = Path(document["folder"])
+    assert folder.parent == state / "runs"
+    assert sorted([*document["files"], "manifest.json"]) == left_over(folder)
+    assert document["arm"] == "planar2"
+    assert document["feasible"] is True
+    assert document["margin"] > 0.0
+    assert document["validation"][0]["recording"] == "validation.mcap"
+    assert {"OLS", "BPFC"} <= {candidate["name"] for candidate in document["candidates"]}
+    assert sum(document["verdicts"].values()) == 13
+
+
+def test_identify_from_csv(quick: Commissioned, samples: Samples, ident: Ident, tmp_path: Path) -> None:
+    path = samples.write(tmp_path / "motion.csv")
+    ended = ident("identify", path, "--arm", quick.arm, "--out", tmp_path / "out", "--json")
+    assert ended.code == 0
+    table = json.loads((tmp_path / "out" / "parameters.json").read_text())["base_parameters"]
+    wanted = json.loads((quick.folder / "parameters.json").read_text())["base_parameters"]
+    # A CSV's torque counts as sampled, not held; half a millisecond is all that this changes.
+    np.testing.assert_allclose(table["values"], wanted["values"], rtol=0, atol=0.02)
+
+
+def test_identify_from_two_recordings(quick: Commissioned, ident: Ident, tmp_path: Path) -> None:
+    recordings = [quick.folder / f"{name}.mcap" for name in ("identification", "validation")]
+    ended = ident("identify", *recordings, "--arm", quick.arm, "--out", tmp_path / "out", "--json")
+    assert ended.code == 0
+    content = json.loads((tmp_path / "out" / "parameters.json").read_text())
+    assert [entry["name"] for entry in content["provenance"]["recordings"]] == [path.name for path in recordings]
+    alone = json.loads((quick.folder / "parameters.json").read_text())
+    assert content["fit"]["samples"] > 1.9 * alone["fit"]["samples"]
+
+
+@pytest.mark.parametrize("name", ["inertia", "pseudo_inertia", "none"])
+def test_identify_in_each_set(quick: Commissioned, ident: Ident, tmp_path: Path, name: str) -> None:
+    recording = quick.folder / "identification.mcap"
+    ended = ident("identify", recording, "--arm", quick.arm, "--feasible-set", name, "--out", tmp_path / "out")
+    assert ended.code == 0
+    assert json.loads((tmp_path / "out" / "parameters.json").read_text())["feasible_set"] == name
+
+
+def test_a_torn_recording_is_read_up_to_the_tear(quick: Commissioned, ident: Ident, tmp_path: Path) -> None:
+    whole = (quick.folder / "identification.mcap").read_bytes()
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(whole[: int(0.9 * len(whole))])
+    ended = ident("identify", torn, "--arm", quick.arm, "--out", tmp_path / "out", "--json")
+    assert ended.code == 0
+    assert f"ident: {torn}: torn; read up to the tear\n" in ended.err
+    assert ended.json["feasible"] is True
+
+
+def test_base(ident: Ident) -> None:
+    words = ident("base", "planar2")
+    assert words.code == 0
+    lines = words.out.splitlines()
+    assert lines[-1] == "13 base parameters of 28 link parameters"
+    assert len(lines) == 14
+    document = ident("base", "planar2", "--json").json
+    expressions = document["base_parameters"]["expressions"]
+    assert [line.split(maxsplit=1)[1] for line in lines[:-1]] == expressions
+    assert len(document["base_parameters"]["units"]) == 13
+    assert len(document["link_parameters"]) == 28
+
+
+@pytest.mark.parametrize(("content", "code"), [(FEASIBLE, 0), (INFEASIBLE, 3)])
+def test_feasible(ident: Ident, tmp_path: Path, content: dict[str, list[object]], code: int) -> None:
+    path = table(tmp_path, content)
+    words = ident("feasible", path)
+    assert words.code == code
+    assert words.out.startswith(f"{path}: {'feasible' if code == 0 else 'INFEASIBLE'} (pseudo_inertia), margin ")
+    assert ("contradicted by:\n  link 1: a mass distribution exists" in words.out) is (code == 3)
+    document = ident("feasible", path, "--json", "--feasible-set", "inertia").json
+    assert document["feasible"] is (code == 0)
+    assert document["feasible_set"] == "inertia"
+    assert (document["margin"] > 0.0) is (code == 0)
+    assert left_over(tmp_path) == ["table.json"]
+
+
+def test_feasible_uses_the_file_s_own_set(ident: Ident, tmp_path: Path) -> None:
+    # A rod that is longer than its inertia allows: only the stricter set knows.
+    content = {"expressions": ["Lxx1", "Lyy1", "Lzz1"], "values": [1.0, 0.1, 0.1]}
+    assert ident("feasible", table(tmp_path, content)).code == 3
+    assert ident("feasible", table(tmp_path, content, feasible_set="inertia")).code == 0
+    assert ident("feasible", table(tmp_path, content, feasible_set="none")).code == 3
+    own = table(tmp_path, content, feasible_set="inertia")
+    assert ident("feasible", own, "--feasible-set", "pseudo_inertia").code == 3
+
+
+def test_an_arm_adds_its_conditions(ident: Ident, tmp_path: Path) -> None:
+    # More than the 4 kg that the arm's description allows, and no wrong sign.
+    path = table(tmp_path, {"expressions": ["m1 + m2"], "values": [5.0]})
+    assert ident("feasible", path).code == 0
+    ended = ident("feasible", path, "--arm", "planar2", "--json")
+    assert ended.code == 3
+    assert ended.json["tight"] == ["total mass at most 4 kg"]
+    assert ended.json["margin"] == pytest.approx(-1.0, abs=1e-6)
+    corrected = ident("correct", path, "--out", tmp_path / "c.json", "--arm", "planar2", "--json").json
+    assert corrected["values"][0] == pytest.approx(4.0, abs=1e-5)
+    assert ident("feasible", tmp_path / "c.json", "--arm", "planar2").code == 0
+
+
+def test_correct(ident: Ident, tmp_path: Path) -> None:
+    path = table(tmp_path, INFEASIBLE, notes="mine", validation=[])
+    out = tmp_path / "corrected.json"
+    words = ident("correct", path, "--out", out)
+    assert words.code == 0
+    assert words.out.startswith(f"{out}: feasible (pseudo_inertia), margin ")
+    document = ident("correct", path, "--out", out, "--json").json
+    assert document["distance"] == pytest.approx(1.0, abs=1e-3)
+    content = json.loads(out.read_text())
+    assert content["base_parameters"]["values"] == document["values"]
+    assert content["notes"] == "mine"
+    assert "validation" not in content
+    assert ident("feasible", out).code == 0
+    assert left_over(tmp_path) == ["corrected.json", "table.json"]
+
+
+def test_correct_of_what_needs_none(ident: Ident, tmp_path: Path) -> None:
+    document = ident("correct", table(tmp_path, FEASIBLE), "--out", tmp_path / "c.json", "--json").json
+    assert document["distance"] < 1e-6
+    np.testing.assert_allclose(document["values"], FEASIBLE["values"], rtol=0, atol=1e-6)
+
+
+def test_a_run_s_own_parameters_are_feasible(quick: Commissioned, ident: Ident) -> None:
+    ended = ident("feasible", quick.folder / "parameters.json", "--arm", quick.arm, "--json")
+    assert ended.code == 0
+    assert ended.json["margin"] > 0.0
+
+
+def test_table_1_through_the_command(ident: Ident, wam7_data: Path, tmp_path: Path) -> None:
+    from estimation.bodies import table_names
+
+    rows = json.loads((wam7_data / "table1.json").read_text())["rows"]
+    expressions = table_names([row[0] for row in rows])
+
+    def column(number: int) -> Path:
+        return table(tmp_path, {"expressions": expressions, "values": [row[number] for row in rows]})
+
+    assert ident("feasible", column(1), "--feasible-set", "inertia").code == 0
+    assert ident("feasible", column(2), "--feasible-set", "inertia").code == 3
+    document = ident("correct", column(2), "--feasible-set", "inertia", "--out", tmp_path / "c.json", "--json").json
+    assert document["distance"] == pytest.approx(1.652e-3, abs=2.5e-6)
+    np.testing.assert_allclose(document["values"], [row[3] for row in rows], rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize("arm", sorted(shipped_arms()))
+def test_shipped_descriptions_are_good(ident: Ident, arm: str) -> None:
+    words = ident("config", "check", arm)
+    assert words.code == 0, words.err
+    assert words.out.rstrip().endswith(": good")
+    assert ident("config", "check", arm, "--json").json["problems"] == []
+
+
+@pytest.mark.parametrize("words", [(), ("simulate",), ("identify",), ("config",), ("config", "check"), ("correct",)])
+def test_help(ident: Ident, words: tuple[str, ...]) -> None:
+    ended = ident(*words, "--help")
+    assert ended.code == 0
+    assert ended.out.startswith("usage: ident")
+
+
+def test_version(ident: Ident) -> None:
+    assert ident("--version").out == f"ident-service {__version__}\n"
+
+
+def test_state_folder_is_the_option_s_then_the_variable_s_then_the_user_s(
+    quick: Commissioned, ident: Ident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("identify", quick.folder / "identification.mcap", "--arm", quick.arm, "--json")
+
+    def parent(*more: object) -> Path:
+        return Path(ident(*words, *more).json["folder"]).parent
+
+    assert parent("--state", tmp_path / "mine") == tmp_path / "mine" / "runs"
+    assert parent() == tmp_path / "state" / "runs"
+    monkeypatch.delenv("IDENT_STATE")
+    assert parent() == tmp_path / "xdg" / "ident" / "runs"
+    monkeypatch.delenv("XDG_STATE_HOME")
+    assert parent() == tmp_path / "home" / ".local" / "state" / "ident" / "runs"
+
+
+def test_runs_of_the_same_second_get_folders_of_their_own(quick: Commissioned, ident: Ident, state: Path) -> None:
+    words = ("identify", quick.folder / "identification.mcap", "--arm", quick.arm, "--json")
+    folders = {ident(*words).json["folder"] for _ in range(3)}
+    assert len(folders) == 3
+    assert {str(path) for path in (state / "runs").iterdir()} == folders
+
+
+@pytest.mark.slow
+def test_a_seed_gives_the_same_numbers_again(quick: Commissioned, ident: Ident, tmp_path: Path) -> None:
+    same = ident("simulate", quick.arm, "--seed", 1, "--out", tmp_path / "same", "--json").json
+    assert same["score"] == json.loads((quick.folder / "score.json").read_text())
+    other = ident("simulate", quick.arm, "--seed", 2, "--out", tmp_path / "other", "--json").json
+    assert other["score"] != same["score"]
+
+
+def test_module_runs_as_a_process_of_its_own(tmp_path: Path) -> None:
+    def run(*words: object) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-W", "error", "-m", "ident_service", *map(str, words)]
+        return subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False, timeout=60)
+
+    good = run("base", "planar2", "--json")
+    assert good.returncode == 0, good.stderr
+    assert json.loads(good.stdout)["arm"] == "planar2"
+    no = run("feasible", table(tmp_path, INFEASIBLE))
+    assert (no.returncode, no.stderr) == (3, "")
+    usage = run("feasible")
+    assert usage.returncode == 2
+    assert usage.stdout == ""
+    assert "usage: ident" in usage.stderr
+    missing = run("feasible", "none.json")
+    assert (missing.returncode, missing.stderr) == (2, "ident: no such file: none.json\n")
+    assert left_over(tmp_path) == ["table.json"]
+
+
+@pytest.mark.parametrize("words", [["--help"], ["simulate", "--help"], ["--version"]])
+def test_help_loads_no_large_library(words: list[str]) -> None:
+    program = (
+        "import sys\n"
+        "from ident_service.cli import main\n"
+        "try:\n"
+        f"    main({words!r})\n"
+        "except SystemExit:\n"
+        "    pass\n"
+        "large = ('numpy', 'scipy', 'pinocchio', 'clarabel', 'ruckig', 'pydantic', 'mcap', 'yaml', 'jsonschema')\n"
+        "print([name for name in large if name in sys.modules], file=sys.stderr)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stderr == "[]\n"
+
+
+def test_foreign_packages_of_the_same_name_are_refused(
+    ident: Ident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "drivers").mkdir()
+    (tmp_path / "drivers" / "__init__.py").write_text("")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for name in [name for name in sys.modules if name.split(".")[0] == "drivers"]:
+        monkeypatch.delitem(sys.modules, name)
+    ended = ident("base", "planar2")
+    assert ended.code == 2
+    assert "the package 'drivers' was found at" in ended.err
+
+
+def test_main_is_the_console_script() -> None:
+    from importlib.metadata import entry_points
+
+    (script,) = entry_points(group="console_scripts", name="ident")
+    assert script.load() is main
+
+
+def test_quick_arm_is_a_good_description(ident: Ident, tmp_path: Path) -> None:
+    assert ident("config", "check", quick_arm(tmp_path)).code == 0

@@ -1,0 +1,45 @@
+"""What tests share: published data beside the checkout, the WAM's model, how hypothesis searches."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+from threadpoolctl import threadpool_limits
+
+from ident_service.config.load import load_arm
+from ident_service.model.arm_model import ArmModel, arm_model
+
+_CI = os.environ.get("CI") == "true"
+# Small matrices on several BLAS threads are slow, and very slow on a busy machine; child processes inherit this.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+threadpool_limits(limits=1, user_api="blas")
+_SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+settings.register_profile("default", deadline=None, derandomize=_CI, print_blob=True)
+settings.load_profile("default")
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder of published data that stands beside the checkout."""
+    if not _SHARED.is_dir():
+        reason = f"needs the published data in {_SHARED.name}/ beside the checkout"
+        if _CI:
+            pytest.fail(reason)
+        pytest.skip(reason)
+    return _SHARED
+
+
+@pytest.fixture(scope="session")
+def wam7_data(shared: Path) -> Path:
+    """Tables, trajectories and CAD parameters of the WAM."""
+    return shared / "data" / "wam7"
+
+
+@pytest.fixture(scope="session")
+def wam7() -> ArmModel:
+    """The shipped WAM."""
+    return arm_model(load_arm("wam7"))

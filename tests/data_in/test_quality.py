@@ -1,0 +1,139 @@
+"""Quality figures of recordings that were made to have them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from made_recordings import MadeRecording, jittered, moving
+
+from ident_service.config.recording import RecordingFormat
+from ident_service.errors import UsageError
+from ident_service.record.grid import grid
+from ident_service.record.quality import quality
+
+PLAIN = RecordingFormat()
+MILLISECONDS = np.arange(10_000) * 1_000_000
+
+
+def test_a_good_recording_has_nothing_to_warn_of() -> None:
+    found = quality(moving(MILLISECONDS), PLAIN, np.array([50.0, 50.0]))
+    assert found.warnings() == ()
+    assert (found.samples, found.duration_s, found.rate_hz) == (10_000, 9.999, pytest.approx(1000.0))
+    assert (found.jitter_std_s, found.jitter_max_s, found.gaps, found.repeats) == (0.0, 0.0, (), 0)
+    assert not found.resampled
+    assert [joint.name for joint in found.joints] == ["j0", "j1"]
+    assert [joint.saturated for joint in found.joints] == [0.0, 0.0]
+
+
+def test_stamps() -> None:
+    stamps = jittered(1000, 1_000_000, 0.2)
+    stamps[400:] += 30_000_000
+    stamps[700:] += 500_000_000
+    stamps[123] = stamps[122]
+    recording = moving(stamps)
+    recording.block.position[123] = recording.block.position[122]
+    recording.block.torque[123] = recording.block.torque[122]
+    found = quality(recording, PLAIN)
+    assert found.samples == 999
+    assert found.repeats == 1
+    assert found.resampled
+    assert len(found.gaps) == 2
+    assert found.longest_gap_s == pytest.approx(0.501, abs=5e-4)
+    assert found.jitter_std_s == pytest.approx(2e-4 / np.sqrt(3) * np.sqrt(2), rel=0.1)
+    text = "\n".join(found.warnings())
+    assert "2 gaps, the longest 0.50" in text
+    assert "0.729" in text
+    assert "1 samples repeat" in text
+    assert "stamps jitter by 0.1" in text
+    assert found == quality(recording, PLAIN, None, grid(recording, PLAIN))
+
+
+@pytest.mark.parametrize("samples", [4096, 37, 5])
+def test_saturation(samples: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A sine of 10 N m that a drive cuts at 8 N m, and one that it lets pass."""
+    sine = 10.0 * np.sin(2 * np.pi * 0.5 * MILLISECONDS * 1e-9)
+    torque = np.column_stack([np.clip(sine, -8.0, 8.0), sine, np.full(10_000, 3.0)])
+    recording = MadeRecording(MILLISECONDS, np.cumsum(torque, axis=0) * 1e-3, torque)
+    blocks = recording.blocks
+    monkeypatch.setattr(recording, "blocks", lambda: blocks(samples))
+    at_limit = float((np.abs(sine) >= 8.0).mean())
+    guessed = quality(recording, PLAIN)
+    assert [joint.saturated for joint in guessed.joints] == [pytest.approx(at_limit), 0.0, 0.0]
+    at_limit = float((np.abs(sine) >= 0.999 * 8.004).mean())
+    known = quality(recording, PLAIN, np.array([8.004, np.nan, 100.0]))
+    assert [joint.saturated for joint in known.joints] == [pytest.approx(at_limit), 0.0, 0.0]
+    assert quality(recording, PLAIN, np.array([8.1, 9.0, 3.0])).joints[0].saturated == 0.0
+    text = "\n".join(known.warnings())
+    assert f"joint j0: torque saturated in {100 * at_limit:.2g} %" in text
+    assert "j1" not in text
+    assert "joint j2: torque is always 3" in text
+    with pytest.raises(UsageError, match=r"torque_limit\.shape=\(2,\)"):
+        quality(recording, PLAIN, np.ones(2))
+
+
+def test_a_touch_of_the_extreme_is_no_saturation() -> None:
+    torque = np.zeros((1000, 1))
+    torque[100:104] = 1.0
+    torque[500:504] = 1.0
+    torque[::2] -= 0.5
+    recording = MadeRecording(MILLISECONDS[:1000], np.arange(1000.0)[:, None], torque)
+    assert quality(recording, PLAIN).joints[0].saturated == 0.0
+    torque[700:705] = 1.0
+    recording = MadeRecording(MILLISECONDS[:1000], np.arange(1000.0)[:, None], torque)
+    assert quality(recording, PLAIN).joints[0].saturated == pytest.approx(0.005)
+
+
+@pytest.mark.parametrize("samples", [4096, 7])
+def test_standstill_and_encoder_steps(samples: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The joint moves at 0.1 rad/s for a quarter of the time; read by an encoder of 1e-4 rad."""
+    position = np.cumsum(np.where(np.arange(10_000) < 2500, 1e-4, 0.0))
+    quantised = np.round(position / 1e-4) * 1e-4
+    torque = np.random.default_rng(4).normal(size=(10_000, 2))
+    recording = MadeRecording(MILLISECONDS, np.column_stack([quantised, np.full(10_000, 1.5)]), torque)
+    blocks, at_once = recording.blocks, quality(recording, PLAIN)
+    monkeypatch.setattr(recording, "blocks", lambda: blocks(samples))
+    assert quality(recording, PLAIN) == at_once
+    moving_joint, still = quality(recording, PLAIN).joints
+    assert moving_joint.standstill == pytest.approx(0.75, abs=0.003)
+    assert moving_joint.smallest_step == pytest.approx(1e-4)
+    assert moving_joint.position == (pytest.approx(1e-4), pytest.approx(0.25))
+    assert moving_joint.torque == (torque[:, 0].min(), torque[:, 0].max())
+    assert (still.standstill, still.smallest_step) == (1.0, 0.0)
+    text = "\n".join(quality(recording, PLAIN).warnings())
+    assert "joint j0: at standstill 75 % of the time" in text
+    assert "joint j1: at standstill 1e+02 % of the time" in text
+
+
+def test_speed_is_not_taken_across_a_gap() -> None:
+    stamps = MILLISECONDS.copy()
+    stamps[5000:] += 10**9
+    position = np.where(np.arange(10_000) < 5000, 0.0, 10.0)[:, None]
+    recording = MadeRecording(stamps, position, np.random.default_rng(5).normal(size=(10_000, 1)))
+    assert quality(recording, PLAIN).joints[0].standstill == 1.0
+
+
+def test_what_is_trimmed_is_not_judged() -> None:
+    recording = moving(MILLISECONDS)
+    recording.block.torque[:100] = 90.0
+    recording.block.position[:100, 0] = 50.0
+    found = quality(recording, RecordingFormat(trim=(0.1, 1.0)), np.array([90.0, 90.0]))
+    assert found.samples == 8900
+    assert found.joints[0].saturated == 0.0
+    assert found.joints[0].position[1] < 2.1
+
+
+@pytest.mark.parametrize("samples", [4096, 1, 50])
+def test_stamps_of_arrival_are_told_from_stamps_of_sampling(samples: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken = moving(jittered(500, 1_000_000, 0.3))
+    arrived = moving(MILLISECONDS[:500])
+    arrived.block.stamp_ns[:] = taken.block.stamp_ns
+    for recording, arrival, right, wrong in (
+        (taken, False, PLAIN, RecordingFormat(stamps="arrival")),
+        (arrived, True, RecordingFormat(stamps="arrival"), PLAIN),
+    ):
+        blocks = recording.blocks
+        monkeypatch.setattr(recording, "blocks", lambda blocks=blocks: blocks(samples))
+        assert quality(recording, right).arrival is arrival
+        assert not any("recording.stamps" in warning for warning in quality(recording, right).warnings())
+        assert any("recording.stamps" in warning for warning in quality(recording, wrong).warnings())
+    assert quality(moving(MILLISECONDS), PLAIN).arrival is None

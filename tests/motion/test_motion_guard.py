@@ -1,0 +1,420 @@
+"""Every fault is found, at its threshold and not below, with its reaction and its joint; no torque leaves unlimited."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from motion_bench import bench_limits
+
+from drivers.arm import Sample
+from ident_service.motion.guard import (
+    ABSURD,
+    FROZEN_CYCLES,
+    FROZEN_EFFORT,
+    JUMP,
+    MAX_AGE,
+    REACTIONS,
+    VELOCITY_OFF,
+    VELOCITY_STOP,
+    Fault,
+    Guard,
+    Reaction,
+)
+from ident_service.motion.reference import Setpoint, rest
+
+Array = np.ndarray
+NAMES = ("shoulder", "elbow")
+LIMITS = bench_limits()
+PERIOD = 1e-3
+HOME = np.array([0.1, -0.1])
+STILL = np.zeros(2)
+WINDOW = JUMP * LIMITS.velocity * PERIOD
+OFF, STOP, WARN = Reaction.TORQUE_OFF, Reaction.CONTROLLED_STOP, Reaction.WARN
+
+
+def unit(joint: int) -> Array:
+    return np.eye(2)[joint]
+
+
+class Bench:
+    """A guard that is shown one position after another."""
+
+    def __init__(self, position: Array = HOME) -> None:
+        self.guard = Guard(NAMES, LIMITS, PERIOD, position)
+        self.cycle = 0
+
+    def see(
+        self,
+        position: Array,
+        reference: Array | None = None,
+        velocity: Array = STILL,
+        valid: tuple[bool, bool] = (True, True),
+        correction: Array = STILL,
+    ) -> tuple[list[bool], Fault | None]:
+        flags = np.array(valid)
+        age = np.where(flags, 0, 1)
+        sample = Sample(self.cycle, self.cycle * 1_000_000, np.array(position), None, np.zeros(2), flags, age)
+        self.cycle += 1
+        setpoint = rest(position if reference is None else reference)
+        usable, fault = self.guard.feedback(sample, setpoint, velocity, correction)
+        return usable.tolist(), fault
+
+
+def is_fault(fault: Fault | None, code: str, joint: int | None = None) -> str:
+    """Check a fault's code, reaction and joint; its code."""
+    assert fault is not None
+    assert fault.code == code
+    assert fault.reaction is REACTIONS[code]
+    if joint is not None:
+        assert fault.message.startswith(f"{NAMES[joint]}: ")
+    return code
+
+
+def torque_saturated(joint: int) -> Fault | None:
+    return Bench().guard.torque(1.01 * LIMITS.torque * unit(joint))[1]
+
+
+def torque_absurd(joint: int) -> Fault | None:
+    return Bench().guard.torque(-1.01 * ABSURD * LIMITS.torque * unit(joint))[1]
+
+
+def torque_not_finite(joint: int) -> Fault | None:
+    return Bench().guard.torque(np.where(unit(joint) > 0.0, np.nan, 0.0))[1]
+
+
+def encoder_jump(joint: int) -> Fault | None:
+    return Bench().see(HOME + 1.01 * WINDOW * unit(joint), HOME)[1]
+
+
+def encoder_jumps(joint: int) -> Fault | None:
+    bench = Bench()
+    bench.see(HOME + 0.5 * unit(joint), HOME)
+    return bench.see(HOME + 0.5 * unit(joint), HOME)[1]
+
+
+def lost_feedback(joint: int) -> Fault | None:
+    return Bench().see(HOME, valid=(joint != 0, joint != 1))[1]
+
+
+def feedback_gone(joint: int) -> Fault | None:
+    bench = Bench()
+    faults = [bench.see(HOME, valid=(joint != 0, joint != 1))[1] for _ in range(MAX_AGE)]
+    return faults[-1]
+
+
+def feedback_not_finite(joint: int) -> Fault | None:
+    return Bench().see(np.where(unit(joint) > 0.0, np.nan, HOME), HOME)[1]
+
+
+def position_limit(joint: int) -> Fault | None:
+    edge = np.where(unit(joint) > 0.0, LIMITS.upper + 1e-9, HOME)
+    return Bench(edge).see(edge)[1]
+
+
+def far_outside(joint: int) -> Fault | None:
+    far = np.where(unit(joint) > 0.0, LIMITS.lower - 1.01 * LIMITS.following_error, HOME)
+    return Bench(far).see(far)[1]
+
+
+def over_velocity(joint: int) -> Fault | None:
+    return Bench().see(HOME, velocity=-1.01 * VELOCITY_STOP * LIMITS.velocity * unit(joint))[1]
+
+
+def runaway(joint: int) -> Fault | None:
+    return Bench().see(HOME, velocity=1.01 * VELOCITY_OFF * LIMITS.velocity * unit(joint))[1]
+
+
+def following_error(joint: int) -> Fault | None:
+    return Bench().see(HOME, HOME + 1.01 * LIMITS.following_error * unit(joint))[1]
+
+
+def frozen_encoder(joint: int) -> Fault | None:
+    bench, push = Bench(), -1.01 * FROZEN_EFFORT * LIMITS.torque * unit(joint)
+    return [bench.see(HOME, correction=push)[1] for _ in range(FROZEN_CYCLES)][-1]
+
+
+TRIGGERS: dict[str, Callable[[int], Fault | None]] = {
+    trigger.__name__: trigger
+    for trigger in (
+        torque_saturated,
+        torque_absurd,
+        torque_not_finite,
+        encoder_jump,
+        encoder_jumps,
+        lost_feedback,
+        feedback_gone,
+        feedback_not_finite,
+        position_limit,
+        far_outside,
+        over_velocity,
+        runaway,
+        following_error,
+        frozen_encoder,
+    )
+}
+# These two are found by the loop, not by the guard: test_motion_run.py.
+FOUND_BY_THE_LOOP = {"driver", "recorder_behind"}
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+@pytest.mark.parametrize("code", sorted(TRIGGERS))
+def test_a_fault_is_found_and_names_its_joint(code: str, joint: int) -> None:
+    is_fault(TRIGGERS[code](joint), code, joint)
+
+
+def test_every_fault_of_the_table_is_triggered() -> None:
+    assert set(TRIGGERS) | FOUND_BY_THE_LOOP == set(REACTIONS)
+
+
+def test_the_reactions_are_those_of_the_fault_table() -> None:
+    by_reaction = {reaction: {code for code in REACTIONS if REACTIONS[code] is reaction} for reaction in Reaction}
+    assert by_reaction[WARN] == {"torque_saturated", "encoder_jump", "lost_feedback"}
+    controlled = {"encoder_jumps", "position_limit", "over_velocity", "following_error", "recorder_behind"}
+    assert by_reaction[STOP] == controlled
+    assert WARN < STOP < OFF
+
+
+def test_a_healthy_sample_is_no_fault() -> None:
+    bench = Bench()
+    assert bench.see(HOME) == ([True, True], None)
+    assert bench.guard.warnings == {}
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_thresholds_of_position(joint: int, side: float) -> None:
+    edge = LIMITS.upper if side > 0.0 else LIMITS.lower
+
+    def seen(beyond: Array) -> Fault | None:
+        position = np.where(unit(joint) > 0.0, edge + side * beyond, HOME)
+        return Bench(position).see(position)[1]
+
+    margin = LIMITS.following_error
+    assert seen(0.0 * margin) is None
+    is_fault(seen(np.full(2, 1e-9)), "position_limit", joint)
+    is_fault(seen(0.999 * margin), "position_limit", joint)
+    is_fault(seen(1.001 * margin), "far_outside", joint)
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_thresholds_of_velocity(joint: int, side: float) -> None:
+    def seen(times: float) -> Fault | None:
+        velocity = side * times * LIMITS.velocity * unit(joint)
+        return Bench().see(HOME + PERIOD * velocity, velocity=velocity)[1]
+
+    assert seen(0.999 * VELOCITY_STOP) is None
+    is_fault(seen(1.001 * VELOCITY_STOP), "over_velocity", joint)
+    is_fault(seen(0.999 * VELOCITY_OFF), "over_velocity", joint)
+    is_fault(seen(1.001 * VELOCITY_OFF), "runaway", joint)
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_thresholds_of_the_following_error(joint: int, side: float) -> None:
+    def seen(times: float) -> Fault | None:
+        position = HOME + 1e-5
+        return Bench().see(position, position + side * times * LIMITS.following_error * unit(joint))[1]
+
+    assert seen(0.999) is None
+    is_fault(seen(1.001), "following_error", joint)
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_thresholds_of_a_jump(joint: int, side: float) -> None:
+    for times, jumped in ((0.999, False), (1.001, True)):
+        usable, fault = Bench().see(HOME + side * times * WINDOW * unit(joint), HOME)
+        assert usable == [not (jumped and k == joint) for k in range(2)]
+        assert (fault is not None) == jumped
+
+
+def test_a_jump_is_measured_from_where_the_arm_goes() -> None:
+    velocity, bench = LIMITS.velocity * unit(0), Bench()
+    expected = HOME + PERIOD * velocity
+    usable, fault = bench.see(expected - 1.001 * WINDOW * unit(0), velocity=velocity)
+    assert usable == [False, True]
+    is_fault(fault, "encoder_jump", 0)
+
+
+@pytest.mark.parametrize("times", [1.01, 1.5, 1.99, 2.5, 100.0])
+def test_a_jump_that_stays_is_never_let_in(times: float) -> None:
+    bench, wrong = Bench(), HOME + times * WINDOW * unit(1)
+    usable, fault = bench.see(wrong, HOME)
+    assert usable == [True, False]
+    is_fault(fault, "encoder_jump", 1)
+    usable, fault = bench.see(wrong, HOME)
+    assert usable == [True, False]
+    is_fault(fault, "encoder_jumps", 1)
+    usable, fault = bench.see(wrong, HOME)
+    assert usable == [True, False]
+    is_fault(fault, "feedback_gone", 1)
+
+
+def test_one_jump_is_discarded_and_forgiven() -> None:
+    bench = Bench()
+    for _ in range(3):
+        is_fault(bench.see(HOME + 0.5 * unit(0), HOME)[1], "encoder_jump", 0)
+        assert bench.see(HOME) == ([True, True], None)
+    assert bench.guard.warnings == {"encoder_jump": 3}
+
+
+def test_jumps_of_different_axes_in_turn_are_not_two_in_a_row() -> None:
+    bench = Bench()
+    is_fault(bench.see(HOME + 0.5 * unit(0), HOME)[1], "encoder_jump", 0)
+    is_fault(bench.see(HOME + 0.5 * unit(1), HOME)[1], "encoder_jump", 1)
+
+
+@pytest.mark.parametrize("lost", range(1, MAX_AGE))
+def test_an_axis_that_comes_back_where_it_should_be_is_welcome(lost: int) -> None:
+    velocity, bench = LIMITS.velocity * np.array([1.0, -1.0]), Bench()
+    for cycle in range(1, lost + 1):
+        now = HOME + cycle * PERIOD * velocity
+        usable, fault = bench.see(np.array([np.nan, now[1]]), now, velocity, (False, True))
+        assert usable == [False, True]
+        is_fault(fault, "lost_feedback", 0)
+    now = HOME + (lost + 1) * PERIOD * velocity
+    assert bench.see(now, velocity=velocity) == ([True, True], None)
+    assert bench.guard.warnings == {"lost_feedback": lost}
+
+
+def test_an_axis_that_comes_back_elsewhere_has_jumped() -> None:
+    bench = Bench()
+    for _ in range(MAX_AGE - 1):
+        bench.see(HOME, valid=(False, True))
+    usable, fault = bench.see(HOME + 1.01 * WINDOW * unit(0), HOME)
+    assert usable == [False, True]
+    is_fault(fault, "feedback_gone", 0)
+
+
+def test_age_counts_again_from_every_answer() -> None:
+    bench = Bench()
+    for _ in range(5):
+        for _ in range(MAX_AGE - 1):
+            is_fault(bench.see(HOME, valid=(True, False))[1], "lost_feedback", 1)
+        assert bench.see(HOME)[1] is None
+
+
+def test_losing_both_axes_by_turns_is_not_losing_one() -> None:
+    bench = Bench()
+    for cycle in range(12):
+        is_fault(bench.see(HOME, valid=(cycle % 2 == 0, cycle % 2 == 1))[1], "lost_feedback")
+
+
+def test_not_a_number_where_nothing_was_answered_is_only_lost() -> None:
+    usable, fault = Bench().see(np.array([np.nan, -0.1]), HOME, valid=(False, True))
+    assert usable == [False, True]
+    is_fault(fault, "lost_feedback", 0)
+
+
+def test_only_axes_that_answered_are_blamed_for_not_being_numbers() -> None:
+    fault = Bench().see(np.array([np.nan, np.inf]), HOME, valid=(False, True))[1]
+    is_fault(fault, "feedback_not_finite", 1)
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+def test_a_frozen_encoder_needs_its_time_and_its_push(joint: int) -> None:
+    push = FROZEN_EFFORT * LIMITS.torque * unit(joint)
+    bench = Bench()
+    assert [bench.see(HOME, correction=0.99 * push)[1] for _ in range(1000)] == [None] * 1000
+    assert [bench.see(HOME, correction=1.01 * push)[1] for _ in range(FROZEN_CYCLES - 1)] == [None] * 19
+    is_fault(bench.see(HOME, correction=1.01 * push)[1], "frozen_encoder", joint)
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+def test_a_position_that_changes_now_and_then_is_not_frozen(joint: int) -> None:
+    # An axis held by dry friction follows in small slips.
+    bench, push = Bench(), 5.0 * FROZEN_EFFORT * LIMITS.torque * unit(joint)
+    for cycle in range(200):
+        position = HOME + 1e-5 * (cycle // (FROZEN_CYCLES - 1))
+        assert bench.see(position, correction=push)[1] is None
+
+
+def test_losing_an_axis_does_not_excuse_a_frozen_one() -> None:
+    bench, push = Bench(), 1.01 * FROZEN_EFFORT * LIMITS.torque * unit(1)
+    for cycle in range(FROZEN_CYCLES - 1):
+        fault = bench.see(HOME, correction=push, valid=(True, cycle % 3 != 0))[1]
+        assert fault is None or fault.code == "lost_feedback"
+    is_fault(bench.see(HOME, correction=push)[1], "frozen_encoder", 1)
+
+
+def test_the_most_severe_fault_wins() -> None:
+    fast, faster = ((times * 1.01 * LIMITS.velocity) * unit(0) for times in (VELOCITY_STOP, VELOCITY_OFF))
+    jump = HOME + 0.5 * unit(1)
+    # A jump with a warning's weight beside ever worse things.
+    is_fault(Bench().see(jump, HOME, fast)[1], "over_velocity", 0)
+    is_fault(Bench().see(jump, HOME, faster)[1], "runaway", 0)
+    is_fault(Bench().see(np.array([np.nan, 0.5]), HOME, faster)[1], "feedback_not_finite", 0)
+    away = HOME + 1.5 * LIMITS.following_error * unit(0)
+    is_fault(Bench().see(HOME + 1e-5, away, fast, (True, False))[1], "over_velocity", 0)
+    is_fault(Bench().see(HOME + 1e-5, away, STILL, (True, False))[1], "following_error", 0)
+
+
+def anything() -> st.SearchStrategy[float]:
+    return st.floats(allow_nan=True, allow_infinity=True, width=64)
+
+
+@given(arrays(float, 2, elements=anything()))
+def test_whatever_is_wanted_what_leaves_is_finite_and_limited(wanted: Array) -> None:
+    kept = wanted.copy()
+    leaves, fault = Bench().guard.torque(wanted)
+    assert np.isfinite(leaves).all()
+    assert (np.abs(leaves) <= LIMITS.torque).all()
+    np.testing.assert_array_equal(wanted, kept)
+    if fault is None:
+        np.testing.assert_array_equal(leaves, wanted)
+    elif fault.reaction is OFF:
+        np.testing.assert_array_equal(leaves, 0.0)
+
+
+@given(
+    arrays(float, 2, elements=anything()),
+    arrays(float, 2, elements=anything()),
+    arrays(float, 2, elements=anything()),
+    st.tuples(st.booleans(), st.booleans()),
+)
+def test_whatever_is_seen_the_guard_does_not_fall_over(
+    position: Array, reference: Array, velocity: Array, valid: tuple[bool, bool]
+) -> None:
+    bench = Bench()
+    with np.errstate(all="ignore"):
+        usable, fault = bench.see(position, reference, velocity, valid)
+    bad = ~np.isfinite(position) & np.array(valid)
+    if bad.any():
+        is_fault(fault, "feedback_not_finite", int(np.argmax(bad)))
+    else:
+        assert not np.array(usable)[~np.array(valid)].any()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_torque_that_is_no_number_becomes_none(bad: float) -> None:
+    leaves, fault = Bench().guard.torque(np.array([1.0, bad]))
+    np.testing.assert_array_equal(leaves, 0.0)
+    is_fault(fault, "torque_not_finite", 1)
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_thresholds_of_torque(joint: int, side: float) -> None:
+    guard = Bench().guard
+    limit = side * LIMITS.torque * unit(joint)
+    assert guard.torque(limit)[1] is None
+    for times in (1.001, 0.999 * ABSURD):
+        leaves, fault = guard.torque(times * limit)
+        is_fault(fault, "torque_saturated", joint)
+        np.testing.assert_array_equal(leaves, limit)
+    leaves, fault = guard.torque(1.001 * ABSURD * limit)
+    is_fault(fault, "torque_absurd", joint)
+    np.testing.assert_array_equal(leaves, 0.0)
+    assert guard.warnings == {"torque_saturated": 2}
+
+
+def test_a_moving_reference_is_compared_by_its_position_only() -> None:
+    moving = Setpoint(HOME, LIMITS.velocity, LIMITS.acceleration)
+    sample = Sample(0, 0, HOME.copy(), None, np.zeros(2), np.ones(2, dtype=bool), np.zeros(2, dtype=np.int64))
+    assert Bench().guard.feedback(sample, moving, STILL, STILL)[1] is None

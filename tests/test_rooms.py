@@ -1,0 +1,239 @@
+"""The house's rules: which room imports which, one door per large library, short files, a light front door."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("ident_service", "drivers", "sim_backend")
+MAX_LINES = 400
+
+MAY_IMPORT: dict[str, set[str]] = {
+    "package": set(),
+    "errors": set(),
+    "config": {"errors"},
+    "drivers": {"errors"},
+    "model": {"errors", "config"},
+    "sim_backend": {"errors", "config", "model", "drivers"},
+    "record": {"errors", "config"},
+    "excitation": {"errors", "config", "model"},
+    "motion": {"errors", "config", "model", "excitation", "drivers", "record"},
+    "estimation": {"errors", "config", "model", "record"},
+    "results": {"errors", "config", "model", "estimation", "record"},
+}
+MAY_IMPORT["service"] = set(MAY_IMPORT)
+MAY_IMPORT["cli"] = {*MAY_IMPORT, "service"}
+
+# Large library: the rooms, or single files, that may import it.
+DOORS: dict[str, set[str]] = {
+    "pinocchio": {"model", "sim_backend/plant.py"},
+    "ruckig": {"motion"},
+    "cvxpy": {"estimation"},
+    "clarabel": {"estimation"},
+    "mcap": {"record"},
+    "zstandard": {"record"},
+    "lz4": {"record"},
+    "canopen": {"drivers", "sim_backend"},
+    "can": {"drivers", "sim_backend"},
+    "fastapi": {"service"},
+}
+HEAVY = ("pinocchio", "ruckig", "cvxpy", "clarabel", "mcap", "canopen", "can", "fastapi")
+
+
+@dataclass(frozen=True)
+class Import:
+    """One imported module, and where."""
+
+    module: str
+    line: int
+
+
+def room_of(file: str) -> str:
+    """The room a file of the checkout lies in, by its path below the root."""
+    parts = Path(file).with_suffix("").parts
+    if parts[0] != "ident_service":
+        return parts[0]
+    if parts[1] == "__init__":
+        return "package"
+    return "cli" if parts[1] == "__main__" else parts[1]
+
+
+def room_of_module(module: str) -> str | None:
+    """The room a module belongs to, None for foreign ones."""
+    parts = module.split(".")
+    if parts[0] not in PACKAGES:
+        return None
+    return room_of("/".join([*parts, "__init__.py"]) if len(parts) == 1 else "/".join(parts) + ".py")
+
+
+def imports_in(source: str, file: str) -> Iterator[Import]:
+    """Everything a file imports, inside functions and under conditions too."""
+    package = list(Path(file).parent.parts)
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield Import(alias.name, node.lineno)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            module = ".".join([*base, *([node.module] if node.module else [])])
+            # `from ident_service import x` may bring in a whole room.
+            for alias in node.names:
+                yield Import(f"{module}.{alias.name}" if module in PACKAGES else module, node.lineno)
+        elif isinstance(node, ast.Call) and _is_import_call(node.func) and node.args:
+            if isinstance(node.args[0], ast.Constant) and isinstance(node.args[0].value, str):
+                yield Import(node.args[0].value, node.lineno)
+            else:
+                yield Import("?", node.lineno)
+
+
+def _is_import_call(function: ast.expr) -> bool:
+    name = (
+        function.id if isinstance(function, ast.Name) else function.attr if isinstance(function, ast.Attribute) else ""
+    )
+    return name in ("import_module", "__import__")
+
+
+def violations(source: str, file: str) -> list[str]:
+    """What a file imports that it may not."""
+    room = room_of(file)
+    if room not in MAY_IMPORT:
+        return [f"{file}: no room is called {room!r}"]
+    found = []
+    for imported in imports_in(source, file):
+        place, top = f"{file}:{imported.line}", imported.module.split(".")[0]
+        other = room_of_module(imported.module)
+        if imported.module == "?":
+            found.append(f"{place}: imports a module whose name is computed")
+        elif imported.module.removeprefix("ident_service.") in ("__version__", "annotations"):
+            continue
+        elif other is not None and other not in {room, "package", *MAY_IMPORT[room]}:
+            found.append(f"{place}: {room} imports {other}")
+        elif top in DOORS and not {room, file} & DOORS[top]:
+            found.append(f"{place}: {top} may only be imported in {', '.join(sorted(DOORS[top]))}")
+    return found
+
+
+def python_files() -> list[str]:
+    return sorted(path.relative_to(ROOT).as_posix() for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+
+
+@pytest.mark.parametrize("file", python_files())
+def test_a_file_imports_only_what_its_room_may(file: str) -> None:
+    assert violations((ROOT / file).read_text(encoding="utf-8"), file) == []
+
+
+def test_the_files_are_where_this_test_looks() -> None:
+    files = python_files()
+    assert {room_of(file) for file in files} >= {
+        "errors",
+        "config",
+        "drivers",
+        "model",
+        "sim_backend",
+        "record",
+        "motion",
+    }
+    assert len(files) > 50
+
+
+@pytest.mark.parametrize("file", python_files())
+def test_a_file_is_short_enough_to_read(file: str) -> None:
+    assert len((ROOT / file).read_text(encoding="utf-8").splitlines()) <= MAX_LINES
+
+
+@pytest.mark.parametrize(
+    ("file", "source", "complaint"),
+    [
+        ("ident_service/model/x.py", "from ident_service.motion.run import run", "model imports motion"),
+        ("ident_service/model/x.py", "import ident_service.record.open as o", "model imports record"),
+        ("ident_service/model/x.py", "from ident_service import estimation", "model imports estimation"),
+        ("ident_service/model/x.py", "from ..excitation import plan", "model imports excitation"),
+        ("ident_service/model/x.py", "from .. import results", "model imports results"),
+        ("ident_service/config/x.py", "def f():\n    from ident_service.model import base", ":2: config imports model"),
+        ("ident_service/config/x.py", "if TYPE_CHECKING:\n    import drivers.arm", "config imports drivers"),
+        ("ident_service/motion/x.py", "from sim_backend.arm import SimulatedArm", "motion imports sim_backend"),
+        ("ident_service/motion/x.py", "importlib.import_module('sim_backend.arm')", "motion imports sim_backend"),
+        ("ident_service/motion/x.py", "importlib.import_module(name)", "name is computed"),
+        ("ident_service/record/x.py", "from ident_service.model.chain import Chain", "record imports model"),
+        ("ident_service/service/x.py", "from ident_service.cli import main", "service imports cli"),
+        ("ident_service/results/x.py", "from ident_service.service.score import score", "results imports service"),
+        ("ident_service/errors.py", "from ident_service.config.schema import ArmConfig", "errors imports config"),
+        ("ident_service/__init__.py", "from ident_service.errors import IdentError", "package imports errors"),
+        ("drivers/x.py", "from ident_service.config.schema import ArmConfig", "drivers imports config"),
+        ("drivers/x.py", "import pinocchio", "pinocchio may only"),
+        ("sim_backend/x.py", "import pinocchio as pin", "pinocchio may only"),
+        ("sim_backend/x.py", "from ident_service.motion.run import run", "sim_backend imports motion"),
+        ("ident_service/model/x.py", "try:\n    import clarabel\nexcept ImportError:\n    pass", "clarabel may only"),
+        ("ident_service/estimation/x.py", "from mcap.reader import make_reader", "mcap may only"),
+        ("ident_service/cli.py", "import fastapi", "fastapi may only"),
+        ("ident_service/motion/x.py", "from can import Bus", "can may only"),
+        ("ident_service/attic/x.py", "import json", "no room is called 'attic'"),
+    ],
+)
+def test_the_checker_sees_what_is_forbidden(file: str, source: str, complaint: str) -> None:
+    (found,) = violations(source, file)
+    assert complaint in found
+    assert found.startswith(f"{file}:")
+
+
+@pytest.mark.parametrize(
+    ("file", "source"),
+    [
+        ("ident_service/model/x.py", "import pinocchio as pin\nfrom ident_service.config.schema import ArmConfig"),
+        ("ident_service/model/x.py", "from .chain import Chain\nfrom ..errors import ModelError"),
+        ("ident_service/results/x.py", "from ident_service import __version__"),
+        ("sim_backend/plant.py", "import pinocchio"),
+        ("ident_service/record/x.py", "import canary, mcap.reader, lz4.frame"),
+        (
+            "ident_service/service/x.py",
+            "import fastapi\nimport sim_backend.arm\nfrom ident_service.results import files",
+        ),
+        ("ident_service/cli.py", "from ident_service.service import commission"),
+        ("ident_service/__main__.py", "from ident_service.cli import main"),
+    ],
+)
+def test_the_checker_lets_pass_what_is_allowed(file: str, source: str) -> None:
+    assert violations(source, file) == []
+
+
+def loaded_after(code: str) -> set[str]:
+    """Large libraries that a fresh interpreter has loaded after some code."""
+    script = f"import sys\n{code}\nprint('LOADED', *[name for name in {HEAVY!r} if name in sys.modules])"
+    result = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60, cwd=ROOT
+    )
+    return set(result.stdout.splitlines()[-1].split()[1:])
+
+
+def test_the_package_loads_no_large_library() -> None:
+    assert loaded_after("import ident_service") == set()
+
+
+def test_the_probe_would_see_a_large_library() -> None:
+    assert loaded_after("import ident_service.model.rigid_body") == {"pinocchio"}
+
+
+def test_the_command_line_loads_no_large_library() -> None:
+    assert loaded_after("import ident_service.cli") == set()
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["base", "--help"]])
+def test_asking_for_help_loads_no_large_library(arguments: list[str]) -> None:
+    code = (
+        "import runpy\n"
+        f"sys.argv = ['ident', *{arguments!r}]\n"
+        "try:\n"
+        "    runpy.run_module('ident_service', run_name='__main__')\n"
+        "except SystemExit as end:\n"
+        "    assert not end.code, end.code\n"
+        "else:\n"
+        "    raise AssertionError('help did not end the command')"
+    )
+    assert loaded_after(code) == set()
