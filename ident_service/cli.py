@@ -93,7 +93,9 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--feasible-set", choices=[*_SETS, "none"])
 
     sub = verb("identify", _identify, "recordings to parameters.json, URDF and report")
-    sub.add_argument("recordings", nargs="+", type=Path, metavar="RECORDING", help="MCAP or CSV")
+    sub.add_argument(
+        "recordings", nargs="+", type=Path, metavar="RECORDING", help="MCAP or CSV; FILE@2:1.5 leaves out 2 s and 1.5 s"
+    )
     sub.add_argument("--arm", required=True, metavar="ARM", help="description file, or the name of a shipped one")
     sub.add_argument(
         "--validate", action="append", default=[], type=Path, metavar="RECORDING", help="judge on this one too"
@@ -228,8 +230,8 @@ def _identify(arguments: argparse.Namespace) -> Answer:
     folder = arguments.out or new_run_folder(_state_folder(arguments), load_arm(arguments.arm).name)
     result = identify_files(request, folder, lambda line: _tell(arguments, line))
     estimate = result.estimate
-    text = "".join(f"warning: {line}\n" for line in result.warnings) + summary(estimate)
-    text += f"\nfiles: {folder}\n" + "".join(f"  {name}\n" for name in result.files)
+    sys.stderr.write("".join(f"ident: {line}\n" for line in result.warnings))
+    text = summary(estimate) + f"\nfiles: {folder}\n" + "".join(f"  {name}\n" for name in result.files)
     code = DONE if estimate.feasible or not estimate.constrained else VERDICT_NO
     document = {"folder": str(folder), "files": list(result.files), "warnings": list(result.warnings)}
     return code, text, document | _estimate_document(estimate)

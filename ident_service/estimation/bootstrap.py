@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from ident_service.errors import ModelError, SolverError
 from ident_service.estimation.equations import Equations
-from ident_service.estimation.feasibility import constrained_least_squares
-from ident_service.estimation.feasible_set import FeasibleSet
+from ident_service.estimation.feasible.feasibility import constrained_least_squares
+from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array

@@ -16,13 +16,13 @@ from ident_service.config.schema import Method
 from ident_service.estimation.delay import Delay, estimate_delay, with_delay
 from ident_service.estimation.doubt import block_covariance
 from ident_service.estimation.equations import Equations, equations
-from ident_service.estimation.feasibility import constrained_least_squares
-from ident_service.estimation.feasible_set import FeasibleSet
+from ident_service.estimation.feasible.feasibility import constrained_least_squares
+from ident_service.estimation.feasible.feasible_set import FeasibleSet
+from ident_service.estimation.feasible.torque_scales import constrained_least_squares_with_scales, scale_bounds
 from ident_service.estimation.friction_fit import fit_friction
 from ident_service.estimation.instruments import instrumental_variables
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares, weighted_least_squares
 from ident_service.estimation.robust import huber
-from ident_service.estimation.torque_scales import constrained_least_squares_with_scales, scale_bounds
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array

@@ -1,17 +1,22 @@
 """The numbers in the friction that are not linear, fitted outside the convex problem.
 
 The way of pre-sliding x0 and the Stribeck velocity v_s belong to one drive each, and act on that drive's own rows. So
-one value is tried for all drives at once, each drive keeps the value that leaves it the smallest residual, and a finer
-grid around the best follows. Nothing but the recordings that are fitted to is looked at.
+one value is tried for all drives at once, and each drive keeps the one that leaves it the smallest residual. Two
+searches begin differently, the numbers taking turns or all their pairs at once, because the residual has several minima.
+Between their results decides what predicts better: the recordings are cut into thirds, and each third's torque is
+predicted by friction fitted to the other two, inertias being those of the whole. A shape that only explains what it has
+seen, such as a spike at a few reversals, loses there. Nothing but the recordings that are fitted to is looked at.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import reduce
+from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ident_service.config.schema import FrictionShape
 from ident_service.estimation.equations import Equations, equations
@@ -19,13 +24,18 @@ from ident_service.estimation.least_squares import weighted_least_squares
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
+from ident_service.model.information import Information
+from ident_service.model.layout import INERTIAL
 from ident_service.record.recording import Recording
 
+# No gear gives by more than three degrees before it slips; a Stribeck velocity is a small share of full speed.
 _GRIDS: dict[str, Array] = {
-    "presliding": np.array([0.0, *np.geomspace(3e-4, 0.1, 8)]),
+    "presliding": np.array([0.0, *np.geomspace(3e-4, 0.05, 8)]),
     "stribeck_velocity": np.geomspace(0.02, 0.8, 8),
 }
 _FINER = np.array([0.6, 0.8, 1.0, 1.25, 1.6])
+_ROUNDS = 2
+_FOLDS = 3
 _RATE = 125.0  # Hz; friction changes slowly enough to be fitted on fewer rows
 
 
@@ -35,10 +45,10 @@ def with_friction(model: ArmModel, shape: FrictionShape) -> ArmModel:
     config = model.config.model_copy(update={"identification": options})
     velocity = 0.1 if shape.stribeck_velocity == "fit" else shape.stribeck_velocity
     joints = model.chain.joints
-    layout = replace(
-        model.layout, stribeck_velocity=tuple(float(v) for v in np.broadcast_to(np.asarray(velocity), (joints,)))
-    )
-    return replace(model, config=config, layout=layout)
+    if "stribeck" not in model.layout.terms:
+        return replace(model, config=config)
+    velocities = tuple(float(v) for v in np.broadcast_to(np.asarray(velocity), (joints,)))
+    return replace(model, config=config, layout=replace(model.layout, stribeck_velocity=velocities))
 
 
 def fit_friction(recordings: Sequence[Recording], model: ArmModel, base: BaseParameters) -> ArmModel:
@@ -64,34 +74,87 @@ def fit_friction(recordings: Sequence[Recording], model: ArmModel, base: BasePar
         for key in _GRIDS
     }
     if wanted:
-        thinned = _thinned(model, recordings)
-        for grids in (_GRIDS, None):
-            for key in wanted:
-                trials = (
-                    [np.full(joints, value) for value in grids[key]]
-                    if grids is not None
-                    else [values[key] * factor for factor in _FINER]
-                )
-                values[key] = _best(recordings, thinned, base, values, key, trials)
+        search = _Search(recordings, _thinned(model, recordings), base)
+        found = [
+            search.finer(start, wanted) for start in (search.in_turn(values, wanted), search.pairs(values, wanted))
+        ]
+        values = search.best(values, found, predicting=True)
     return with_friction(model, _shape(values))
 
 
-def _best(
-    recordings: Sequence[Recording],
-    model: ArmModel,
-    base: BaseParameters,
-    values: dict[str, Array],
-    key: str,
-    trials: Sequence[Array],
-) -> Array:
-    """Per drive, the trial value that leaves its joint the smallest residual."""
-    left = []
-    for trial in trials:
-        tried = with_friction(model, _shape({**values, key: trial}))
-        gathered = reduce(Equations.joined, (equations(recording, tried, base) for recording in recordings))
-        left.append(gathered.total.squared_residuals(weighted_least_squares(gathered.total).beta))
-    choice = np.argmin(np.array(left), axis=0)
-    return np.array([trials[index][drive] for drive, index in enumerate(choice)])
+_Numbers = dict[str, Array]
+
+
+@dataclass(frozen=True)
+class _Search:
+    recordings: Sequence[Recording]
+    model: ArmModel
+    base: BaseParameters
+
+    def in_turn(self, values: _Numbers, wanted: Sequence[str]) -> _Numbers:
+        """One number after the other over its whole grid."""
+        for key in wanted:
+            trials = [{key: np.full(self.model.chain.joints, value)} for value in _GRIDS[key]]
+            values = self.best(values, trials)
+        return values
+
+    def pairs(self, values: _Numbers, wanted: Sequence[str]) -> _Numbers:
+        """Every combination of the grids' values."""
+        joints = self.model.chain.joints
+        grids = product(*(_GRIDS[key].tolist() for key in wanted))
+        return self.best(
+            values,
+            [{key: np.full(joints, value) for key, value in zip(wanted, pair, strict=True)} for pair in grids],
+        )
+
+    def finer(self, values: _Numbers, wanted: Sequence[str]) -> _Numbers:
+        """Around the values, inside the grids."""
+        for key in [*wanted] * _ROUNDS:
+            low, high = _GRIDS[key][0], _GRIDS[key][-1]
+            values = self.best(values, [{key: np.clip(values[key] * factor, low, high)} for factor in _FINER])
+        return values
+
+    def best(self, values: _Numbers, trials: Sequence[_Numbers], *, predicting: bool = False) -> _Numbers:
+        """Per drive, the trial that leaves its joint the smallest residual, or predicts its torque best."""
+        left = []
+        for trial in trials:
+            tried = with_friction(self.model, _shape(values | trial))
+            gathered = reduce(Equations.joined, (equations(one, tried, self.base) for one in self.recordings))
+            beta = weighted_least_squares(gathered.total).beta
+            terms = _own_terms(self.model, self.base)
+            left.append(_unpredicted(gathered, beta, terms) if predicting else gathered.total.squared_residuals(beta))
+        choice = np.argmin(np.array(left), axis=0)
+        return values | {
+            key: np.array([trials[index][key][drive] for drive, index in enumerate(choice)]) for key in trials[0]
+        }
+
+
+def _own_terms(model: ArmModel, base: BaseParameters) -> NDArray[np.bool_]:
+    """Which base parameters are joint terms, shape (base,)."""
+    return np.asarray(base.base % model.layout.per_link >= len(INERTIAL))
+
+
+def _unpredicted(gathered: Equations, beta: Array, terms: NDArray[np.bool_]) -> Array:
+    """Per joint, the squared errors of each third as predicted from the other two, shape (joints,)."""
+    thirds = [part for part in np.array_split(np.arange(len(gathered.blocks)), _FOLDS) if len(part)]
+    if len(thirds) < _FOLDS:
+        return gathered.total.squared_residuals(beta)
+    merged = [reduce(Information.merged, [gathered.blocks[index] for index in part]) for part in thirds]
+    total = np.zeros(gathered.total.joints)
+    for joint, support in enumerate(gathered.total.supports):
+        own = terms[support]
+        # What is left of the torque when the rest of the arm has had its share: columns of the joint's terms, and it.
+        left = []
+        for part in merged:
+            factor = part.factors[joint]
+            rest = factor[:, -1] - factor[:, :-1][:, ~own] @ beta[support[~own]]
+            left.append((factor[:, :-1][:, own], rest))
+        for number, (columns, rest) in enumerate(left):
+            others = [pair for other, pair in enumerate(left) if other != number]
+            told, torque = (np.concatenate(parts) for parts in zip(*others, strict=True))
+            friction = np.linalg.lstsq(told, torque, rcond=None)[0]
+            total[joint] += float(np.sum((rest - columns @ friction) ** 2))
+    return total
 
 
 def _shape(values: dict[str, Array]) -> FrictionShape:

@@ -13,14 +13,15 @@ from ident_service.config.schema import FeasibleSetName, Method
 from ident_service.errors import UsageError
 from ident_service.estimation.doubt import Verdict, verdicts
 from ident_service.estimation.equations import Equations, equations
-from ident_service.estimation.feasibility import (
+from ident_service.estimation.feasible.feasibility import (
     FeasibilityTest,
     FeasibleEstimate,
     constrained_least_squares,
     feasibility_correction,
     feasibility_test,
 )
-from ident_service.estimation.feasible_set import FeasibleSet, SetName, feasible_set
+from ident_service.estimation.feasible.feasible_set import FeasibleSet, SetName, feasible_set
+from ident_service.estimation.feasible.priors import Prior, choose_weight
 from ident_service.estimation.fit import Fit, Prepared, prepare, unconstrained
 from ident_service.estimation.least_squares import (
     LeastSquares,
@@ -28,7 +29,6 @@ from ident_service.estimation.least_squares import (
     ordinary_least_squares,
     torque_error,
 )
-from ident_service.estimation.priors import Prior, choose_weight
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters, base_parameters
 from ident_service.model.chain import Array
@@ -44,11 +44,12 @@ METHODS: tuple[Method, ...] = get_args(Method)
 
 @dataclass(frozen=True)
 class Scored:
-    """Torque errors on one recording."""
+    """Torque errors on one recording: on all its rows, and on those of joints that move."""
 
     recording: str
     sha256: str
     error: TorqueError
+    moving: TorqueError
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,7 @@ class Candidate:
         beta: base parameters, shape (base,).
         margin: of the feasibility test under the arm's conditions; its sign is the verdict.
         identification: error on all rows of the recordings it was fitted to.
+        moving: error on the rows that were fitted to, those near a velocity reversal left out.
         validation: errors on recordings that it never saw.
     """
 
@@ -67,6 +69,7 @@ class Candidate:
     beta: Array
     margin: float
     identification: TorqueError
+    moving: TorqueError
     validation: tuple[Scored, ...]
 
 
@@ -164,12 +167,15 @@ def identify(
     corrected = feasibility_correction(found.fit.beta, base, conditions)
     held = {name: constrained_least_squares(found.fit, base, conditions, prior) for name, conditions in sets.items()}
 
-    everything = prepared.equations.everything
+    everything, total = prepared.equations.everything, prepared.equations.total
     label = method.upper()
 
     def candidate(name: str, beta: Array, margin: float) -> Candidate:
-        scores = tuple(Scored(one.path.name, one.sha256, torque_error(rows, beta)) for one, rows in unseen)
-        return Candidate(name, beta, margin, torque_error(everything, beta), scores)
+        scores = tuple(
+            Scored(one.path.name, one.sha256, torque_error(rows.everything, beta), torque_error(rows.total, beta))
+            for one, rows in unseen
+        )
+        return Candidate(name, beta, margin, torque_error(everything, beta), torque_error(total, beta), scores)
 
     def tested(name: FeasibleSetName, estimate: FeasibleEstimate) -> float:
         return estimate.margin if name == kind else feasibility_test(estimate.beta, base, conditions).margin
@@ -223,8 +229,8 @@ def _check(method: str, recordings: Sequence[Recording], validation: Sequence[Re
         raise UsageError(f"{', '.join(seen)}: a recording that is fitted to cannot validate the fit")
 
 
-def _unseen(recording: Recording, prepared: Prepared, base: BaseParameters) -> Information:
-    return equations(recording, prepared.model, base).with_torques_times(prepared.torque_scales).everything
+def _unseen(recording: Recording, prepared: Prepared, base: BaseParameters) -> Equations:
+    return equations(recording, prepared.model, base).with_torques_times(prepared.torque_scales)
 
 
 def _prior(model: ArmModel, found: Fit, base: BaseParameters, conditions: FeasibleSet) -> Prior | None:

@@ -35,8 +35,8 @@ from numpy.typing import NDArray
 
 from ident_service.errors import ModelError
 from ident_service.estimation.equations import MAX_BLOCKS, Rows, equation_rows
-from ident_service.estimation.feasibility import constrained_least_squares
-from ident_service.estimation.feasible_set import FeasibleSet
+from ident_service.estimation.feasible.feasibility import constrained_least_squares
+from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.least_squares import LeastSquares
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters

@@ -67,8 +67,9 @@ def averaged(
     fmt = fmt or RecordingFormat()
     stamps = grid(recording, fmt)
     step = stamps.period_s
-    length = round(period / step)
-    total = int((stamps.last_ns - stamps.first_ns) * 1e-9 / period)
+    length = max(round(period / step), 1)
+    # The first and the last sample count both: n periods end one step before the next one would begin.
+    total = (round((stamps.last_ns - stamps.first_ns) * 1e-9 / step) + 1) // length
     if total < 2:
         raise RecordingError(recording.path, f"holds {total} whole periods of {period:g} s; averaging needs two")
     if abs(period / step - length) * total > max(_WHOLE * length, 0.5):
@@ -114,6 +115,8 @@ def _motion(
     position, velocity, acceleration = (np.fft.irfft(spectrum * harmonics**order, length, axis=0) for order in range(3))
     if held:
         torque = 0.5 * (torque + np.roll(torque, 1, axis=0))
+    if options.delay != "estimate" and options.delay:
+        torque = np.fft.irfft(np.fft.rfft(torque, axis=0) * np.exp(harmonics * float(options.delay)), length, axis=0)
     C = np.eye(joints) if coupling is None else coupling
     rate = velocity @ C.T
     near = np.abs(rate) <= options.reversal.speed

@@ -122,7 +122,7 @@ def windows(
     shortest = max(2.0 * options.edge + 1.0, 2 * margin * period)
     pieces = uniform(recording, fmt, stamps, shortest_s=shortest, samples=_WINDOW)
     for window, start, stop, opens, closes in _overlapping(pieces, margin):
-        motion = smoother(window, stamps.first_ns, opens, stop - margin)
+        motion = smoother(window, stamps.first_ns, opens, slice(max(stop - margin, 0), stop))
         # At the edges of a stretch the filter has only one side to look at.
         low = max(start, edge) if opens else start
         high = min(stop, len(window.stamp_ns) - edge) if closes else stop
@@ -147,7 +147,7 @@ class _Smoother:
         if presliding == "fit":
             presliding = 0.0
         self._presliding = np.broadcast_to(np.asarray(presliding, dtype=float), (recording.joints,))
-        self._direction: Array | None = None
+        self._direction = np.zeros((0, recording.joints))
         self._delay = 0.0 if options.delay == "estimate" else float(options.delay)
         self._sos = scipy.signal.butter(smoothing.order, smoothing.cutoff, fs=1.0 / period, output="sos")
         slowest = 2.0 * np.pi * smoothing.cutoff * np.sin(np.pi / (2 * smoothing.order))
@@ -160,8 +160,8 @@ class _Smoother:
         reach = options.reversal.window + abs(self._delay)
         self.margin = int(np.ceil(memory / period)) + int(np.ceil(reach / period)) + 4
 
-    def __call__(self, window: Block, first_ns: int, opens: bool, next_begin: int) -> Motion:
-        """Smooth a window; the next one of this stretch will start at `next_begin` of this one."""
+    def __call__(self, window: Block, first_ns: int, opens: bool, again: slice) -> Motion:
+        """Smooth a window; the next one of this stretch begins with the samples `again` of this one."""
         options = self._options
         position, velocity, acceleration = self._derivatives(window.position)
         torque = window.torque
@@ -181,8 +181,11 @@ class _Smoother:
         if reach:
             near = scipy.ndimage.binary_dilation(near, np.ones((2 * reach + 1, 1), dtype=bool))
         keep = ~(near @ (self._coupling != 0.0))
-        way = direction(rate, self._period, self._presliding, None if opens else self._direction)
-        self._direction = way[max(next_begin - 1, 0)]
+        # What the window before knew better, because it had both sides to look at, stands.
+        known = self._direction[:0] if opens else self._direction
+        start = known[-1] if len(known) else None
+        way = np.vstack([known, direction(rate[len(known) :], self._period, self._presliding, start)])
+        self._direction = way[again]
         time = np.asarray((window.stamp_ns - first_ns) * 1e-9, dtype=np.float64)
         return Motion(time, position, velocity, acceleration, torque, keep, way)
 

@@ -31,7 +31,7 @@ class Symbol:
             return self.tape.step("mul", first, second)
         if other == 0.0:
             return 0.0
-        return self if other == 1.0 else -self if other == -1.0 else self.tape.step("mul", self.index, other)
+        return self if other == 1.0 else -self if other == -1.0 else self.tape.step("mul", self.index, float(other))
 
     __rmul__ = __mul__
 
@@ -39,17 +39,17 @@ class Symbol:
         if isinstance(other, Symbol):
             first, second = sorted((self.index, other.index))
             return self.tape.step("add", first, second)
-        return self if other == 0.0 else self.tape.step("add", self.index, other)
+        return self if other == 0.0 else self.tape.step("add", self.index, float(other))
 
     __radd__ = __add__
 
     def __sub__(self, other: Value) -> Value:
         if isinstance(other, Symbol):
             return self.tape.step("sub", self.index, other.index) if other is not self else 0.0
-        return self if other == 0.0 else self.tape.step("add", self.index, -other)
+        return self if other == 0.0 else self.tape.step("add", self.index, -float(other))
 
     def __rsub__(self, other: float) -> Value:
-        return -self if other == 0.0 else self.tape.step("sub", other, self.index)
+        return -self if other == 0.0 else self.tape.step("sub", float(other), self.index)
 
     def __neg__(self) -> Symbol:
         return self.tape.step("neg", self.index, None)
@@ -64,7 +64,7 @@ class Tape:
 
     def __init__(self) -> None:
         self.steps: list[tuple[str, _Operand, _Operand]] = []
-        self._known: dict[tuple[str, _Operand, _Operand], Symbol] = {}
+        self._known: dict[tuple[object, ...], Symbol] = {}
 
     def input(self) -> Symbol:
         """A value that is given when the program runs, in the order of these calls."""
@@ -76,10 +76,11 @@ class Tape:
 
     def step(self, operation: str, a: _Operand, b: _Operand) -> Symbol:
         """One operation on indices of earlier steps (int) or constants (float)."""
-        key = (operation, a, b)
+        # The types tell step 2 from the constant 2.0, which are equal.
+        key = (operation, a, type(a), b, type(b))
         if (known := self._known.get(key)) is None:
             known = self._known[key] = Symbol(self, len(self.steps))
-            self.steps.append(key)
+            self.steps.append((operation, a, b))
         return known
 
 

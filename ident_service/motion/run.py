@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from drivers.arm import Arm, Sample, StopKind, Vector
 from ident_service.config.limits import MotionLimits, motion_limits
 from ident_service.errors import ArmFault, DriverError, MotionRefused
+from ident_service.excitation.demands import require_within_limits
 from ident_service.excitation.fourier import Excitation
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.rigid_body import InverseDynamics
@@ -122,8 +123,17 @@ class _Run:
         limits = motion_limits(self.model.config)
         if self.model.prior is None:
             raise MotionRefused(f"{self.model.config.name}: computed torque needs prior parameters")
+        described = self.arm.describe()
+        if described.joint_names != self.model.chain.names:
+            raise MotionRefused(
+                f"the arm on the bus has the joints {', '.join(described.joint_names)}, "
+                f"the description {', '.join(self.model.chain.names)}"
+            )
+        if self.excitation.arm_sha256 != self.model.config.sha256:
+            raise MotionRefused(f"the {self.excitation.name} motion was made for another description of the arm")
+        require_within_limits(self.excitation.series, self.model, limits)
         dynamics = InverseDynamics(self.model.chain, self.model.layout, self.model.prior)
-        period = 1.0 / self.arm.describe().rate
+        period = 1.0 / described.rate
         sample = self._look(limits, period)
         home = sample.position.copy()
         ways = self._ways(home, limits)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from ident_service.estimation.doubt import IDENTIFIED_BELOW, WEAK_BELOW
-from ident_service.estimation.identify import Estimate
+from ident_service.estimation.identify import Candidate, Estimate
+from ident_service.estimation.least_squares import TorqueError
 
 
 def summary(estimate: Estimate) -> str:
     """Several lines of plain text, no wider than a terminal."""
     names = estimate.model.chain.names
     own = estimate.candidates[estimate.chosen]
+    columns = ["identification", *(score.recording for score in own.validation)]
     lines = [
         f"{estimate.model.config.name}: {estimate.base.size} base parameters of {len(estimate.base.names)} link "
         f"parameters, from {estimate.samples} samples",
@@ -17,24 +21,22 @@ def summary(estimate: Estimate) -> str:
         "",
         _feasibility(estimate),
         "",
-        "relative torque error in percent (eq. 84)",
-        _row(f"  verdict by {estimate.conditions.kind}", ["identification", *(s.recording for s in own.validation)]),
+        "relative torque error in percent (eq. 84): of all rows, and of joints away from standstill",
+        _row(f"  verdict by {estimate.conditions.kind}", columns),
     ]
     for candidate in estimate.candidates:
-        errors = [candidate.identification, *(score.error for score in candidate.validation)]
         mark = "*" if candidate is own else " "
         verdict = "feasible" if candidate.margin > 0.0 else "infeasible"
-        label = f"{mark} {candidate.name} ({verdict})"
-        lines.append(_row(label, [f"{error.relative_percent:.3f}" for error in errors]))
-    lines += [
-        "",
-        "per joint, the estimate marked *",
-        _row("", ["identification", *(s.recording for s in own.validation)]),
-    ]
+        cells = [f"{whole.relative_percent:.3f}  {moving.relative_percent:.3f}" for whole, moving in _errors(candidate)]
+        lines.append(_row(f"{mark} {candidate.name} ({verdict})", cells))
+    lines += ["", "per joint, the estimate marked *", _row("", columns)]
     for k, name in enumerate(names):
-        errors = [own.identification, *(score.error for score in own.validation)]
-        cells = [f"{error.joint_relative_percent[k]:.2f} % {error.joint_rms[k]:.4f}" for error in errors]
+        cells = [
+            f"{whole.joint_relative_percent[k]:.2f}  {moving.joint_relative_percent[k]:.2f}"
+            for whole, moving in _errors(own)
+        ]
         lines.append(_row(f"  {name}", cells))
+    lines += _found_before(estimate)
     counts = {word: estimate.verdicts.count(word) for word in ("identified", "weak", "unidentified")}
     lines += [
         "",
@@ -48,6 +50,31 @@ def summary(estimate: Estimate) -> str:
             f"+- {estimate.standard_deviations[i]:.2g} {estimate.base.units[i]}"
         )
     return "\n".join(lines) + "\n"
+
+
+def _errors(candidate: Candidate) -> list[tuple[TorqueError, TorqueError]]:
+    scores = [(score.error, score.moving) for score in candidate.validation]
+    return [(candidate.identification, candidate.moving), *scores]
+
+
+def _found_before(estimate: Estimate) -> list[str]:
+    """What the recordings said before the parameters: delay, shape of the friction, torque constants, prior."""
+    model, prepared = estimate.model, estimate.prepared
+    lines = []
+    if prepared.delay is not None:
+        seconds, deviation = 1e3 * prepared.delay.seconds, 1e3 * prepared.delay.deviation
+        lines.append(f"torque is stamped {seconds:.3f} +- {deviation:.3f} ms later than the position")
+    presliding = np.atleast_1d(np.asarray(model.config.identification.friction.presliding, dtype=float))
+    if presliding.any():
+        lines.append("pre-sliding way [rad or m]: " + " ".join(f"{value:.2g}" for value in presliding))
+    if model.layout.stribeck_velocity:
+        velocities = " ".join(f"{value:.2g}" for value in model.layout.stribeck_velocity)
+        lines.append(f"Stribeck velocity [rad/s or m/s]: {velocities}")
+    if (prepared.torque_scales != 1.0).any():
+        lines.append("measured torques multiplied by: " + " ".join(f"{value:.4g}" for value in prepared.torque_scales))
+    if estimate.prior is not None:
+        lines.append(f"drawn to the {estimate.prior.kind} prior with weight {estimate.prior.weight:g}")
+    return ["", *lines] if lines else []
 
 
 def parameter_table(estimate: Estimate) -> str:

@@ -13,7 +13,7 @@ from drivers.clock import Clock
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import ArmError, UsageError
 from ident_service.estimation.equations import equations
-from ident_service.estimation.feasible_set import SetName
+from ident_service.estimation.feasible.feasible_set import SetName
 from ident_service.estimation.identify import Estimate, identify
 from ident_service.excitation.fourier import Excitation
 from ident_service.excitation.plan import excitation

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +15,12 @@ from ident_service.config.schema import ArmConfig, Method
 from ident_service.errors import UsageError
 from ident_service.estimation.bootstrap import bootstrap
 from ident_service.estimation.essential import essential_parameters
-from ident_service.estimation.feasible_set import SetName
+from ident_service.estimation.feasible.feasible_set import SetName
 from ident_service.estimation.identify import Estimate, identify
-from ident_service.estimation.sdpa import bpfc_sdpa, bpft_sdpa, fbpe_sdpa
+from ident_service.estimation.proof.sdpa import bpfc_sdpa, bpft_sdpa, fbpe_sdpa
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.record.open import open_recording
+from ident_service.record.part import TrimmedRecording
 from ident_service.record.quality import quality
 from ident_service.record.recording import Recording
 from ident_service.results.files import appearing_folder, write_atomically
@@ -31,8 +33,8 @@ class Request:
 
     Attributes:
         arm: description file or name of a shipped one.
-        recordings: to fit to.
-        validation: to judge on.
+        recordings: to fit to; a path may end in `@START:END`, seconds to leave out of that recording.
+        validation: to judge on; likewise.
         columns: a YAML file with the keys of the arm's `recording` section, instead of it.
         method: estimator, the arm's when None.
         set_name: feasible set, the arm's when None.
@@ -56,6 +58,9 @@ class Request:
     replicates: int = 0
     essential: bool = False
     sdpa: bool = False
+
+
+_TRIMMED = re.compile(r"^(?P<path>.+)@(?P<start>\d+(?:\.\d*)?):(?P<end>\d+(?:\.\d*)?)$")
 
 
 @dataclass(frozen=True)
@@ -125,11 +130,16 @@ def _config(request: Request) -> ArmConfig:
 
 
 def _open(path: Path, model: ArmModel) -> Recording:
-    return open_recording(path, model.chain.names, fmt=model.config.recording, transmission=model.config.transmission)
+    start, end = 0.0, 0.0
+    if not path.exists() and (match := _TRIMMED.match(str(path))):
+        path, start, end = Path(match["path"]), float(match["start"]), float(match["end"])
+    form, gears = model.config.recording, model.config.transmission
+    recording = open_recording(path, model.chain.names, fmt=form, transmission=gears)
+    return TrimmedRecording(recording, start, end) if start or end else recording
 
 
 def _warnings(recording: Recording, model: ArmModel) -> list[str]:
-    torn = [f"{recording.path.name}: torn; read up to the tear"] if recording.torn else []
+    torn = [f"{recording.path}: torn; read up to the tear"] if recording.torn else []
     limits = np.array(
         [
             np.nan if (joint := model.config.joints.get(name)) is None or joint.torque is None else joint.torque
@@ -137,7 +147,7 @@ def _warnings(recording: Recording, model: ArmModel) -> list[str]:
         ]
     )
     found = quality(recording, model.config.recording, limits)
-    return [*torn, *(f"{recording.path.name}: {line}" for line in found.warnings())]
+    return [*torn, *(f"{recording.path}: {line}" for line in found.warnings())]
 
 
 def _bootstrap(estimate: Estimate, replicates: int) -> dict[str, Any]:

@@ -9,14 +9,14 @@ from pathlib import Path
 from ident_service.config.load import load_arm
 from ident_service.config.schema import FeasibleSetName
 from ident_service.errors import ParameterError
-from ident_service.estimation.certificate import certify
-from ident_service.estimation.feasibility import (
+from ident_service.estimation.feasible.feasibility import (
     FeasibilityTest,
     FeasibleEstimate,
     feasibility_correction,
     feasibility_test,
 )
-from ident_service.estimation.feasible_set import FeasibleSet, feasible_set
+from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
+from ident_service.estimation.proof.certificate import certify
 from ident_service.model.arm_model import arm_model
 from ident_service.results.parameter_file import ParameterFile, read_parameters, write_parameters
 

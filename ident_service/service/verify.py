@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from ident_service.errors import UsageError
-from ident_service.estimation.certificate_exact import Verification, verify
-from ident_service.estimation.certificate_reader import MAX_CHARACTERS
+from ident_service.estimation.proof.certificate_exact import Verification, verify
+from ident_service.estimation.proof.certificate_reader import MAX_CHARACTERS
 
 
 def verify_file(path: Path) -> Verification:

@@ -8,9 +8,9 @@ from certificate_samples import parameter_file, random_bodies, random_config, te
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident_service.estimation.certificate import certify
-from ident_service.estimation.certificate_exact import verify
-from ident_service.estimation.feasible_set import FeasibleSet, feasible_set
+from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
+from ident_service.estimation.proof.certificate import certify
+from ident_service.estimation.proof.certificate_exact import verify
 from ident_service.model.arm_model import arm_model
 from ident_service.model.base import base_from_expressions, base_parameters
 from ident_service.model.layout import INERTIAL

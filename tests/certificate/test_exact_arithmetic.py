@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ident_service.errors import ParameterError
-from ident_service.estimation.certificate_rounding import exact_block
-from ident_service.estimation.exact import (
+from ident_service.estimation.feasible.feasible_set import feasible_set
+from ident_service.estimation.proof.certificate_rounding import exact_block
+from ident_service.estimation.proof.exact import (
     Matrix,
     is_positive_definite,
     is_positive_semidefinite,
@@ -19,8 +20,7 @@ from ident_service.estimation.exact import (
     rational_text,
     repair,
 )
-from ident_service.estimation.exact_blocks import Affine, Kind, set_blocks
-from ident_service.estimation.feasible_set import feasible_set
+from ident_service.estimation.proof.exact_blocks import Affine, Kind, set_blocks
 from ident_service.model.layout import INERTIAL
 
 small = st.fractions(min_value=-3, max_value=3, max_denominator=7)

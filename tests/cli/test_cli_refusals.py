@@ -274,10 +274,10 @@ def test_a_motion_beyond_the_limits_is_a_no(place: Path, ident: Ident) -> None:
 
 
 def test_a_fault_stops_the_arm(place: Path, ident: Ident) -> None:
-    # An elbow a hundred times as sticky as the controller's model has it cannot follow.
+    # An elbow a hundred times as sticky as the controller's model has it stands still however hard it is pushed.
     arm = quick_arm(place, ("fc2: 0.3", "fc2: 30"))
     ended = refused(place, ident, ("simulate", arm, "--out", place / "run"), 4, "elbow")
-    assert "following" in ended.err
+    assert "stands still" in ended.err
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,8 @@ from helpers.random_arms import model_around, random_delta
 from ident_service.errors import ModelError
 from ident_service.estimation.doubt import block_covariance
 from ident_service.estimation.equations import equation_rows, equations
-from ident_service.estimation.feasibility import constrained_least_squares
-from ident_service.estimation.feasible_set import feasible_set
+from ident_service.estimation.feasible.feasibility import constrained_least_squares
+from ident_service.estimation.feasible.feasible_set import feasible_set
 from ident_service.estimation.instruments import InstrumentalEstimate, instrumental_variables, simulated
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares
 from ident_service.model.arm_model import ArmModel

@@ -17,13 +17,13 @@ from hypothesis import strategies as st
 from ident_service.config.schema import ArmConfig, Constraints, FeasibleSetName, Identification, Smoothing
 from ident_service.errors import ParameterError, SolverError
 from ident_service.estimation.equations import equations
-from ident_service.estimation.feasibility import (
+from ident_service.estimation.feasible.feasibility import (
     EPSILON,
     constrained_least_squares,
     feasibility_correction,
     feasibility_test,
 )
-from ident_service.estimation.feasible_set import FeasibleSet, feasible_set
+from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares, torque_error
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters, base_from_expressions, base_parameters

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ident_service.config.schema import ArmConfig
-from ident_service.estimation.feasible_set import FeasibleSet, feasible_set, symmetric
+from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set, symmetric
 from ident_service.model.layout import INERTIAL
 
 NAMES = tuple(f"{symbol}{link}" for link in (1, 2) for symbol in (*INERTIAL, "Ia", "fv", "fc", "fo"))

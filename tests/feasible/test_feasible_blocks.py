@@ -10,8 +10,12 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from ident_service.errors import ParameterError
-from ident_service.estimation.feasibility import constrained_least_squares, feasibility_correction, feasibility_test
-from ident_service.estimation.feasible_set import FeasibleSet, feasible_set
+from ident_service.estimation.feasible.feasibility import (
+    constrained_least_squares,
+    feasibility_correction,
+    feasibility_test,
+)
+from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
 from ident_service.estimation.least_squares import LeastSquares
 from ident_service.model.base import base_from_expressions
 from ident_service.model.layout import INERTIAL

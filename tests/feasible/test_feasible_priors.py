@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 
 from ident_service.config.schema import FeasibleSetName
 from ident_service.errors import ParameterError
-from ident_service.estimation.feasibility import EPSILON, FeasibleEstimate, constrained_least_squares
-from ident_service.estimation.feasible_set import feasible_set, symmetric
-from ident_service.estimation.priors import Prior, choose_weight, residual_deviation
+from ident_service.estimation.feasible.feasibility import EPSILON, FeasibleEstimate, constrained_least_squares
+from ident_service.estimation.feasible.feasible_set import feasible_set, symmetric
+from ident_service.estimation.feasible.priors import Prior, choose_weight, residual_deviation
 from ident_service.model.base import BaseParameters
 from ident_service.model.layout import INERTIAL
 

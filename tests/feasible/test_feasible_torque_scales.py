@@ -11,10 +11,10 @@ from pydantic import ValidationError
 
 from ident_service.config.schema import Constraints
 from ident_service.errors import ParameterError
-from ident_service.estimation.feasibility import constrained_least_squares
-from ident_service.estimation.feasible_set import feasible_set
+from ident_service.estimation.feasible.feasibility import constrained_least_squares
+from ident_service.estimation.feasible.feasible_set import feasible_set
+from ident_service.estimation.feasible.torque_scales import constrained_least_squares_with_scales, scale_bounds
 from ident_service.estimation.least_squares import ordinary_least_squares
-from ident_service.estimation.torque_scales import constrained_least_squares_with_scales, scale_bounds
 from ident_service.model.information import Information
 
 

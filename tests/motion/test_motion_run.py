@@ -592,13 +592,20 @@ def test_no_run_begins_without_its_limits(make: Callable[..., Bench], key: str) 
 
 def test_no_run_begins_that_cannot_reach_its_motion(make: Callable[..., Bench]) -> None:
     series = replace(MOTION.series.scaled(0.0), q0=LIMITS.upper + 0.1)
-    _refused(make(), "outside", replace(MOTION, series=series))
+    _refused(make(), "leaves the arm's limits", replace(MOTION, series=series))
 
 
 def test_no_run_begins_where_the_arm_cannot_be_held(make: Callable[..., Bench]) -> None:
     bench = make()
     bench.model = bench_model(prior=PRIOR | {"m2": 10.0, "lx2": -2.5, "Lyy2": 0.84, "Lzz2": 0.84})
-    _refused(bench, "cannot be held")
+    # A motion that the arm could make if it were light enough where it stands now.
+    series = replace(MOTION.series.scaled(0.0), q0=np.array([0.0, np.pi / 2]))
+    motion = replace(MOTION, arm_sha256=bench.model.config.sha256, series=series)
+    _refused(bench, "cannot be held|leaves the arm's limits: .*torque", motion)
+
+
+def test_no_run_begins_with_a_motion_made_for_another_arm(make: Callable[..., Bench]) -> None:
+    _refused(make(), "made for another description", replace(MOTION, arm_sha256="0" * 64))
 
 
 def test_a_bus_that_is_silent_from_the_start_is_told_as_such(make: Callable[..., Bench]) -> None:

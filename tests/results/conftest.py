@@ -8,7 +8,7 @@ from estimation.synthetic import SampledRecording, serial_chain, stamps, waves, 
 from helpers.random_arms import model_around, random_delta
 
 from ident_service.config.schema import Identification, Smoothing
-from ident_service.estimation.feasible_set import SetName
+from ident_service.estimation.feasible.feasible_set import SetName
 from ident_service.estimation.identify import Estimate, identify
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.regressor import joint_regressor

@@ -12,8 +12,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ident_service.errors import ParameterError, SolverError
-from ident_service.estimation.conic import ConicProblem, Solution
-from ident_service.estimation.feasible_set import Block, FeasibleSet
+from ident_service.estimation.feasible.conic import ConicProblem, Solution
+from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 

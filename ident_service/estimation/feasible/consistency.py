@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from ident_service.errors import ParameterError, SolverError
-from ident_service.estimation.conic import ConicProblem
-from ident_service.estimation.feasible_set import FeasibleSet
-from ident_service.estimation.posing import EPSILON, constrain, minimise
+from ident_service.estimation.feasible.conic import ConicProblem
+from ident_service.estimation.feasible.feasible_set import FeasibleSet
+from ident_service.estimation.feasible.posing import EPSILON, constrain, minimise
 
 _LARGEST_MARGIN = 1.0
 _SHARE = 1e-3

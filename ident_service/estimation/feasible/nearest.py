@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident_service.errors import SolverError
-from ident_service.estimation.conic import ConicProblem, Solution
-from ident_service.estimation.consistency import ConditionsError, contradiction
-from ident_service.estimation.feasible_set import FeasibleSet
-from ident_service.estimation.posing import EPSILON, Lift, constrain, minimise, pressing, project
+from ident_service.estimation.feasible.conic import ConicProblem, Solution
+from ident_service.estimation.feasible.consistency import ConditionsError, contradiction
+from ident_service.estimation.feasible.feasible_set import FeasibleSet
+from ident_service.estimation.feasible.posing import EPSILON, Lift, constrain, minimise, pressing, project
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 

@@ -22,13 +22,13 @@ import numpy as np
 import scipy.linalg
 
 from ident_service.errors import ParameterError, SolverError
-from ident_service.estimation.certificate_dual import dual_candidates
-from ident_service.estimation.certificate_exact import verify
-from ident_service.estimation.certificate_rounding import Statement, counts, exact_block, printed, prove, trace
-from ident_service.estimation.exact import rational_text, repair
-from ident_service.estimation.exact_blocks import ExactBlock, set_blocks
-from ident_service.estimation.feasibility import feasibility_test
-from ident_service.estimation.feasible_set import Block, FeasibleSet
+from ident_service.estimation.feasible.feasibility import feasibility_test
+from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet
+from ident_service.estimation.proof.certificate_dual import dual_candidates
+from ident_service.estimation.proof.certificate_exact import verify
+from ident_service.estimation.proof.certificate_rounding import Statement, counts, exact_block, printed, prove, trace
+from ident_service.estimation.proof.exact import rational_text, repair
+from ident_service.estimation.proof.exact_blocks import ExactBlock, set_blocks
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.grammar import parse_exactly

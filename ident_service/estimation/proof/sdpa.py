@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ident_service.errors import ParameterError
-from ident_service.estimation.conic import triangle_entries
-from ident_service.estimation.feasible_set import FeasibleSet
+from ident_service.estimation.feasible.conic import triangle_entries
+from ident_service.estimation.feasible.feasible_set import FeasibleSet
+from ident_service.estimation.feasible.posing import EPSILON, Lift, check
 from ident_service.estimation.least_squares import LeastSquares
-from ident_service.estimation.posing import EPSILON, Lift, check
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 

@@ -12,8 +12,8 @@ from fractions import Fraction
 from typing import NoReturn
 
 from ident_service.errors import ParameterError
-from ident_service.estimation.exact import rational
-from ident_service.estimation.exact_blocks import Affine, ExactBlock, Kind, set_blocks
+from ident_service.estimation.proof.exact import rational
+from ident_service.estimation.proof.exact_blocks import Affine, ExactBlock, Kind, set_blocks
 from ident_service.model.grammar import parse_exactly
 
 MAX_CHARACTERS = 64 * 2**20

@@ -18,7 +18,7 @@ import numpy as np
 import scipy.sparse
 
 from ident_service.errors import SolverError
-from ident_service.estimation.restate import Columns, Pose, Rows, restated
+from ident_service.estimation.feasible.restate import Columns, Pose, Rows, restated
 from ident_service.model.chain import Array
 
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ident_service.config.schema import ArmConfig, FeasibleSetName
-from ident_service.estimation.blocks import (
+from ident_service.estimation.feasible.blocks import (
     REFERENCE_INERTIA,
     REFERENCE_MASS,
     Block,
@@ -26,7 +26,7 @@ from ident_service.estimation.blocks import (
     matrix_block,
     symmetric,
 )
-from ident_service.estimation.constraints import configured, symmetries
+from ident_service.estimation.feasible.constraints import configured, symmetries
 from ident_service.model.chain import Array
 from ident_service.model.layout import INERTIAL
 

@@ -22,12 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident_service.errors import ParameterError
-from ident_service.estimation.blocks import reference, symmetric
-from ident_service.estimation.conic import ConicProblem, triangle_entries
-from ident_service.estimation.feasible_set import Block, FeasibleSet, feasible_set
+from ident_service.estimation.feasible.blocks import reference, symmetric
+from ident_service.estimation.feasible.conic import ConicProblem, triangle_entries
+from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet, feasible_set
+from ident_service.estimation.feasible.nearest import FeasibleEstimate, hold, solve_inside
+from ident_service.estimation.feasible.posing import pressing
 from ident_service.estimation.least_squares import LeastSquares
-from ident_service.estimation.nearest import FeasibleEstimate, hold, solve_inside
-from ident_service.estimation.posing import pressing
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.layout import INERTIAL

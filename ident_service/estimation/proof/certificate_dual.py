@@ -19,9 +19,9 @@ import scipy.optimize
 import scipy.sparse
 
 from ident_service.errors import SolverError
-from ident_service.estimation.conic import ConicProblem, triangle_entries
-from ident_service.estimation.dual_cone import Part, central_path, colouring, identity, split
-from ident_service.estimation.feasible_set import Block
+from ident_service.estimation.feasible.conic import ConicProblem, triangle_entries
+from ident_service.estimation.feasible.feasible_set import Block
+from ident_service.estimation.proof.dual_cone import Part, central_path, colouring, identity, split
 from ident_service.model.chain import Array
 
 _RANK = 1e-11

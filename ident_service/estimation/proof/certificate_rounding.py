@@ -11,9 +11,9 @@ from fractions import Fraction
 
 import numpy as np
 
-from ident_service.estimation.exact import is_positive_semidefinite, repair, symmetric, triangle
-from ident_service.estimation.exact_blocks import Affine, ExactBlock
-from ident_service.estimation.feasible_set import Block
+from ident_service.estimation.feasible.feasible_set import Block
+from ident_service.estimation.proof.exact import is_positive_semidefinite, repair, symmetric, triangle
+from ident_service.estimation.proof.exact_blocks import Affine, ExactBlock
 from ident_service.model.chain import Array
 
 _SPARE_DIGITS = 5

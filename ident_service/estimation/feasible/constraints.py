@@ -18,7 +18,14 @@ from scipy.spatial import ConvexHull, QhullError
 from ident_service.config.quantities import Vector3
 from ident_service.config.schema import ArmConfig, Body, Box, Ellipsoid
 from ident_service.errors import ParameterError
-from ident_service.estimation.blocks import REFERENCE_MASS, REFERENCE_MOMENT, Block, Row, linear_block, reference
+from ident_service.estimation.feasible.blocks import (
+    REFERENCE_MASS,
+    REFERENCE_MOMENT,
+    Block,
+    Row,
+    linear_block,
+    reference,
+)
 from ident_service.model.layout import TERM_SYMBOLS
 
 Index = dict[str, int]

@@ -22,7 +22,7 @@ from typing import Literal
 import numpy as np
 
 from ident_service.config.schema import FeasibleSetName
-from ident_service.estimation.conic import triangle_entries
+from ident_service.estimation.feasible.conic import triangle_entries
 from ident_service.model.chain import Array
 
 SetName = FeasibleSetName | Literal["none"]

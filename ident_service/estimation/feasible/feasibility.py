@@ -10,15 +10,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ident_service.estimation.conic import ConicProblem, Solution
-from ident_service.estimation.consistency import ConditionsError
-from ident_service.estimation.feasible_set import FeasibleSet
+from ident_service.estimation.feasible.conic import ConicProblem, Solution
+from ident_service.estimation.feasible.consistency import ConditionsError
+from ident_service.estimation.feasible.feasible_set import FeasibleSet
+from ident_service.estimation.feasible.metric import whitening
+from ident_service.estimation.feasible.nearest import FeasibleEstimate, nearest
+from ident_service.estimation.feasible.posing import EPSILON, Lift, check, constrain, minimise, pressing
+from ident_service.estimation.feasible.priors import Prior, towards_prior
+from ident_service.estimation.feasible.torque_scales import constrained_least_squares_with_scales
 from ident_service.estimation.least_squares import LeastSquares
-from ident_service.estimation.metric import whitening
-from ident_service.estimation.nearest import FeasibleEstimate, nearest
-from ident_service.estimation.posing import EPSILON, Lift, check, constrain, minimise, pressing
-from ident_service.estimation.priors import Prior, towards_prior
-from ident_service.estimation.torque_scales import constrained_least_squares_with_scales
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 

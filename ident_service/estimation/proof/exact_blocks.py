@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Literal
 
-from ident_service.estimation.exact import is_positive_definite, rational_text, symmetric, triangle
+from ident_service.estimation.proof.exact import is_positive_definite, rational_text, symmetric, triangle
 
 Kind = Literal["inertia", "pseudo_inertia"]
 

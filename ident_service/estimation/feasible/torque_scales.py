@@ -14,10 +14,10 @@ import numpy as np
 
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import ParameterError
-from ident_service.estimation.conic import ConicProblem
-from ident_service.estimation.feasible_set import FeasibleSet
-from ident_service.estimation.nearest import FeasibleEstimate, hold, solve_inside
-from ident_service.estimation.posing import Lift, check, pressing
+from ident_service.estimation.feasible.conic import ConicProblem
+from ident_service.estimation.feasible.feasible_set import FeasibleSet
+from ident_service.estimation.feasible.nearest import FeasibleEstimate, hold, solve_inside
+from ident_service.estimation.feasible.posing import Lift, check, pressing
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.information import Information, triangle

@@ -20,7 +20,7 @@ from fractions import Fraction
 from typing import Literal
 
 from ident_service.errors import ParameterError
-from ident_service.estimation.certificate_reader import (
+from ident_service.estimation.proof.certificate_reader import (
     Claim,
     Row,
     as_list,
@@ -33,8 +33,8 @@ from ident_service.estimation.certificate_reader import (
     load,
     read_claim,
 )
-from ident_service.estimation.exact import is_positive_semidefinite, symmetric, triangle
-from ident_service.estimation.exact_blocks import Affine, ExactBlock
+from ident_service.estimation.proof.exact import is_positive_semidefinite, symmetric, triangle
+from ident_service.estimation.proof.exact_blocks import Affine, ExactBlock
 
 _PRINTED_TOLERANCE = Fraction(1, 10**6)
 

@@ -1,0 +1,123 @@
+"""Real recordings: what each estimate reaches on recordings it was not fitted to, joint by joint.
+
+Read in place from `shared/data` beside the checkout, written as a table to `docs/real-data.md`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.harness import Row
+from ident_service.config.load import load_arm
+from ident_service.config.quantities import TextFile
+from ident_service.config.schema import Method, PriorPull
+from ident_service.errors import ParameterError
+from ident_service.estimation.identify import Candidate, Estimate, identify
+from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.record.open import open_recording
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@dataclass(frozen=True)
+class Case:
+    """One arm's recordings; without a validation recording, errors are on the recording fitted to."""
+
+    arm: str
+    folder: str
+    fitted: str
+    judged: str | None
+    target: float
+    urdf: str | None = None  # whose inertias are the prior
+
+
+CASES = (
+    Case("kuka_lwr4", "kuka_lwr4", "recording_1.csv.gz", "recording_2.csv.gz", 2.35, "kuka_lwr4.urdf"),
+    Case("ur10", "ur10_unisa", "ident.csv.gz", "valid.csv.gz", 6.5, "ur10.urdf"),
+    Case("tx40", "tx40", "run.csv.gz", None, 10.5, "tx40.urdf"),
+)
+
+
+def case_model(case: Case) -> ArmModel:
+    """The arm of a case, with the inertias of the data's URDF as prior where they are those of real links."""
+    model = arm_model(load_arm(case.arm))
+    if case.urdf is None:
+        return model
+    from ident_service.model.rigid_body import read_urdf
+
+    text = (DATA / case.folder / case.urdf).read_text(encoding="utf-8")
+    chain, inertias = read_urdf(TextFile(name=case.urdf, text=text), model.config.gravity)
+    if chain.names != model.chain.names or not np.all(inertias[:, 9] > 0.0):
+        return model
+    prior = np.zeros(model.layout.size)
+    for link in range(model.layout.joints):
+        prior[model.layout.inertial(link)] = inertias[link]
+    return replace(model, prior=prior)
+
+
+def case_estimate(case: Case, method: Method, prior: str = "none", model: ArmModel | None = None) -> Estimate:
+    """Identify a case."""
+    model = model or case_model(case)
+    pull = PriorPull(kind=prior)  # type: ignore[arg-type]  # a literal by the callers below
+    options = model.config.identification.model_copy(update={"prior": pull})
+    model = replace(model, config=model.config.model_copy(update={"identification": options}))
+    config = model.config
+
+    def opened(name: str) -> object:
+        return open_recording(
+            DATA / case.folder / name, model.chain.names, fmt=config.recording, transmission=config.transmission
+        )
+
+    validation = [] if case.judged is None else [opened(case.judged)]
+    return identify(model, [opened(case.fitted)], validation, method=method)  # type: ignore[list-item]
+
+
+def violations(estimate: Estimate) -> int:
+    """Links of the estimate whose 4x4 pseudo-inertia is not positive definite."""
+    if estimate.delta is None:
+        return estimate.base.size
+    return sum(
+        block.smallest(estimate.delta) <= 0.0 for block in estimate.conditions.blocks if "distribution" in block.name
+    )
+
+
+def judged(case: Case, candidate: Candidate) -> tuple[float, list[float]]:
+    """Relative error of a candidate, whole and per joint [percent], on what the case judges on."""
+    error = candidate.validation[0].error if case.judged is not None else candidate.identification
+    return error.relative_percent, error.joint_relative_percent.tolist()
+
+
+def measure() -> tuple[list[Row], str]:
+    """Rows for the benchmark table, and the table of all estimates in Markdown."""
+    rows: list[Row] = []
+    lines = [
+        "# Real recordings",
+        "",
+        "Relative torque error (eq. 84) in percent of all rows, on recordings that were not fitted to; of the TX40",
+        "there is one recording only, so its figures are on the recording fitted to. Written by `make bench`.",
+        "",
+        "| arm | estimate | whole | per joint | links violating the 4x4 condition |",
+        "|---|---|---|---|---|",
+    ]
+    for case in CASES:
+        model = case_model(case)
+        runs: list[tuple[str, Estimate, int]] = []
+        ols = case_estimate(case, "ols", model=model)
+        wls = case_estimate(case, "wls", model=model)
+        runs += [("OLS", ols, 0), ("WLS", wls, 0), ("WLS inertia", wls, 2), ("WLS pseudo_inertia", wls, 3)]
+        if model.prior is not None:
+            try:
+                runs.append(("WLS pseudo_inertia, entropic prior", case_estimate(case, "wls", "entropic", model), 3))
+            except ParameterError as error:
+                lines.append(f"| {case.arm} | WLS pseudo_inertia, entropic prior | refused: {error} | | |")
+        for name, estimate, index in runs:
+            whole, joints = judged(case, estimate.candidates[index])
+            count = str(violations(estimate)) if index == 3 else "-"
+            per_joint = " ".join(f"{value:.1f}" for value in joints)
+            lines.append(f"| {case.arm} | {name} | {whole:.2f} | {per_joint} | {count} |")
+            if index == 3:
+                rows.append(Row(f"{case.arm}: {name}", whole, "%", f"<= {case.target:g}"))
+    return rows, "\n".join(lines) + "\n"

@@ -1,0 +1,1 @@
+"""The feasible set and the optimisation problems over it: test, correction, constrained regression, priors."""

@@ -1,0 +1,213 @@
+"""What has to be found before the equations are linear: delay between the channels, shape of the friction."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from estimation.synthetic import SampledRecording, Waves, exact_torque, serial_chain, stamps, waves, with_options
+from helpers.random_arms import model_around, random_delta
+
+from ident_service.config.schema import FrictionShape, Identification, Reversal, Smoothing
+from ident_service.errors import RecordingError
+from ident_service.estimation.delay import Delay, estimate_delay, with_delay
+from ident_service.estimation.direction import direction
+from ident_service.estimation.equations import equations
+from ident_service.estimation.friction_fit import fit_friction, with_friction
+from ident_service.estimation.least_squares import torque_error, weighted_least_squares
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.base import BaseParameters, base_parameters
+from ident_service.model.layout import Layout
+from ident_service.model.regressor import joint_regressor
+
+RATE = 250.0
+
+
+@cache
+def two_links() -> tuple[ArmModel, BaseParameters, np.ndarray]:
+    model = with_options(model_around(serial_chain(21, 2)), Identification(smoothing=Smoothing(cutoff=20.0)))
+    return model, base_parameters(model.chain, model.layout), random_delta(np.random.default_rng(5), model.layout)
+
+
+def late(seconds: float, noise: float = 0.1, seed: int = 1) -> SampledRecording:
+    """A recording whose torque at each stamp is what acted so long before."""
+    model, _, delta = two_links()
+    time = np.arange(7500) / RATE
+    motion, rng = waves(seed, 2), np.random.default_rng(seed)
+    torque = exact_torque(model, delta, *(motion.derivative(time - seconds, order) for order in range(3)))
+    return SampledRecording(
+        stamps(len(time), RATE), motion.derivative(time, 0), torque + noise * rng.normal(size=torque.shape)
+    )
+
+
+# Delay.
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.0013, 0.0092, -0.0057, 0.041])
+def test_a_delay_is_found_to_a_fraction_of_a_sample(seconds: float) -> None:
+    model, base, _ = two_links()
+    found = estimate_delay([late(seconds)], model, base)
+    # The filter makes neighbours alike, so that the white deviation is too small by a few times.
+    assert abs(found.seconds - seconds) < 0.1 / RATE
+    assert abs(found.seconds - seconds) < 12.0 * found.deviation
+    assert 0.0 < found.deviation < 0.05 / RATE
+
+
+def test_the_deviation_is_that_of_many_recordings() -> None:
+    model, base, _ = two_links()
+    found = [estimate_delay([late(0.003, noise=0.5, seed=seed)], model, base) for seed in range(6)]
+    off = np.array([one.seconds - 0.003 for one in found])
+    size = np.sqrt(np.mean(off**2)) / np.mean([one.deviation for one in found])
+    assert 0.3 < size < 10.0
+
+
+def test_two_recordings_share_one_delay() -> None:
+    model, base, _ = two_links()
+    both = estimate_delay([late(0.006), late(0.006, seed=2)], model, base)
+    alone = estimate_delay([late(0.006)], model, base)
+    assert both.seconds == pytest.approx(0.006, abs=4e-4)
+    assert both.deviation < alone.deviation
+
+
+def test_a_delay_applied_improves_the_residual() -> None:
+    model, base, delta = two_links()
+    recording = late(0.01)
+    found = estimate_delay([recording], model, base)
+
+    def left(arm: ArmModel) -> float:
+        total = equations(recording, arm, base).total
+        return torque_error(total, weighted_least_squares(total).beta).rms
+
+    without, with_it = left(model), left(with_delay(model, found.seconds))
+    # Reading the torque between its samples smooths its noise a little.
+    assert 0.08 < with_it < 0.102
+    assert without > 1.3 * with_it
+    assert left(with_delay(model, -found.seconds)) > without
+    total = equations(recording, with_delay(model, found.seconds), base).total
+    fit = weighted_least_squares(total)
+    truth = base.K @ delta
+    assert np.linalg.norm(fit.R1 @ (fit.beta - truth)) < 0.01 * np.linalg.norm(fit.R1 @ truth)
+
+
+def test_with_delay_changes_nothing_else() -> None:
+    model, _, _ = two_links()
+    shifted = with_delay(model, 0.004)
+    assert shifted.config.identification.delay == 0.004
+    assert with_delay(shifted, 0.0).config == model.config
+    assert model.config.identification.delay == 0.0
+
+
+def test_torque_of_another_motion_has_no_delay() -> None:
+    model, base, _ = two_links()
+    foreign = replace(late(0.0), torque=late(0.0, seed=9).torque[::-1].copy())
+
+    def outcome() -> Delay | str:
+        try:
+            return estimate_delay([foreign], model, base)
+        except RecordingError as error:
+            return str(error)
+
+    found = outcome()
+    assert isinstance(found, str)
+    assert "no delay between position and torque explains the torques" in found
+
+
+def test_a_delay_beyond_reason_is_refused() -> None:
+    model, base, _ = two_links()
+    with pytest.raises(RecordingError, match="no delay between position and torque"):
+        estimate_delay([late(0.35)], model, base)
+
+
+# Friction.
+
+TERMS = ("drive_inertia", "viscous", "coulomb", "offset", "stribeck")
+PRESLIDING, STRIBECK = np.array([0.006, 0.03]), np.array([0.06, 0.25])
+FIT = FrictionShape(presliding="fit", stribeck_velocity="fit")
+NOISE = 0.05
+
+
+def rubbing(shape: FrictionShape, terms: tuple[str, ...] = TERMS) -> tuple[ArmModel, BaseParameters, np.ndarray]:
+    """An arm whose friction is known, and what is to be fitted of it."""
+    plain = model_around(serial_chain(21, 2))
+    layout = Layout(plain.chain.revolute, terms, tuple(STRIBECK) if "stribeck" in terms else ())  # type: ignore[arg-type]
+    options = Identification(smoothing=Smoothing(cutoff=20.0), reversal=Reversal(speed=0.0, window=0.0), friction=shape)
+    model = with_options(replace(plain, layout=layout), options)
+    delta = random_delta(np.random.default_rng(6), layout)
+    delta[layout.term_columns("coulomb")] = (1.0, 0.7)
+    if "stribeck" in terms:
+        delta[layout.term_columns("stribeck")] = (0.8, 0.6)
+    return model, base_parameters(model.chain, layout), delta
+
+
+def slow_waves() -> Waves:
+    """Two joints that turn round often and not fast."""
+    rng = np.random.default_rng(12)
+    return Waves(rng.uniform(0.05, 0.4, (2, 4)), rng.uniform(0.0, 6.3, (2, 4)), rng.uniform(0.05, 0.3, (2, 4)))
+
+
+def rubbed(model: ArmModel, delta: np.ndarray, presliding: np.ndarray, seconds: float = 40.0) -> SampledRecording:
+    time = np.arange(round(seconds * RATE)) / RATE
+    q, dq, ddq = (slow_waves().derivative(time, order) for order in range(3))
+    s = direction(dq, 1.0 / RATE, presliding)
+    torque = np.einsum("jps,p->sj", joint_regressor(model.chain, model.layout, q, dq, ddq, direction=s), delta)
+    return SampledRecording(
+        stamps(len(time), RATE), q, torque + NOISE * np.random.default_rng(2).normal(size=torque.shape)
+    )
+
+
+def test_presliding_and_stribeck_velocity_are_found() -> None:
+    model, base, delta = rubbing(FIT)
+    recording = rubbed(model, delta, PRESLIDING)
+    fitted = fit_friction([recording], model, base)
+    shape = fitted.config.identification.friction
+    assert isinstance(shape.presliding, tuple)
+    for found, true in ((np.array(shape.presliding), PRESLIDING), (np.array(shape.stribeck_velocity), STRIBECK)):
+        assert np.all(np.abs(np.log(found / true)) < np.log(1.35))
+    assert fitted.layout.stribeck_velocity == shape.stribeck_velocity
+
+    def left(arm: ArmModel) -> np.ndarray:
+        total = equations(recording, arm, base).total
+        return torque_error(total, weighted_least_squares(total).beta).joint_rms
+
+    np.testing.assert_allclose(left(fitted), NOISE, rtol=0.1)
+    worse = left(with_friction(model, FrictionShape(presliding=0.0, stribeck_velocity=0.1)))
+    assert np.all(worse > 1.2 * left(fitted))
+
+
+def test_a_given_number_is_kept() -> None:
+    given = FrictionShape(presliding="fit", stribeck_velocity=tuple(STRIBECK))
+    model, base, delta = rubbing(given)
+    fitted = fit_friction([rubbed(model, delta, PRESLIDING)], model, base)
+    shape = fitted.config.identification.friction
+    assert shape.stribeck_velocity == tuple(STRIBECK)
+    np.testing.assert_allclose(np.log(np.array(shape.presliding) / PRESLIDING), 0.0, atol=np.log(1.3))
+
+
+def test_a_drive_without_presliding_is_given_little_or_none() -> None:
+    model, base, delta = rubbing(FrictionShape(presliding="fit"), TERMS[:4])
+    fitted = fit_friction([rubbed(model, delta, np.array([0.0, 0.03]))], model, base)
+    first, second = fitted.config.identification.friction.presliding  # type: ignore[misc]
+    assert first < 1e-3
+    assert second == pytest.approx(0.03, rel=0.3)
+
+
+@pytest.mark.parametrize("terms", [TERMS, TERMS[:4]])
+def test_nothing_to_fit_leaves_the_numbers(terms: tuple[str, ...]) -> None:
+    shape = FrictionShape(presliding=0.01, stribeck_velocity=tuple(STRIBECK))
+    model, base, delta = rubbing(shape, terms)
+    recording = rubbed(model, delta, PRESLIDING)
+    fitted = fit_friction([recording], model, base)
+    one, other = (equations(recording, arm, base).total for arm in (model, fitted))
+    for a, b in zip(one.factors, other.factors, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert fitted.config.identification.friction.presliding == (0.01, 0.01)
+
+
+def test_the_rate_and_other_options_come_back_untouched() -> None:
+    model, base, delta = rubbing(FrictionShape(presliding="fit"), TERMS[:4])
+    before = model.config.identification
+    after = fit_friction([rubbed(model, delta, PRESLIDING)], model, base).config.identification
+    assert after.model_copy(update={"friction": before.friction}) == before
+    assert model.config.identification is before
