@@ -2,7 +2,7 @@
 
 The way of pre-sliding x0 and the Stribeck velocity v_s belong to one drive each, and act on that drive's own rows. So
 one value is tried for all drives at once, and each drive keeps the one that leaves it the smallest residual. Two
-searches begin differently, the numbers taking turns or all their pairs at once, because the residual has several minima.
+searches begin differently, the numbers in turn or all their pairs at once, because the residual has several minima.
 Between their results decides what predicts better: the recordings are cut into thirds, and each third's torque is
 predicted by friction fitted to the other two, inertias being those of the whole. A shape that only explains what it has
 seen, such as a spike at a few reversals, loses there. Nothing but the recordings that are fitted to is looked at.
