@@ -121,6 +121,7 @@ def _parser() -> argparse.ArgumentParser:
 
     sub = verb("correct", _correct, "the nearest feasible parameters")
     sub.add_argument("file", type=Path, metavar="FILE")
+    sub.add_argument("--metric", choices=["euclidean", "covariance"], default="euclidean", help="what nearest means")
     sub.add_argument("--out", type=Path, required=True, metavar="FILE")
     sub.add_argument("--feasible-set", choices=_SETS)
     sub.add_argument("--arm", metavar="ARM", help="adds the arm's mass, centre-of-mass and sign conditions")
@@ -279,11 +280,11 @@ def _feasible(arguments: argparse.Namespace) -> Answer:
 def _correct(arguments: argparse.Namespace) -> Answer:
     from ident_service.service.parameters import correct_file
 
-    corrected = correct_file(arguments.file, arguments.out, arguments.feasible_set, arguments.arm)
+    corrected = correct_file(arguments.file, arguments.out, arguments.feasible_set, arguments.arm, arguments.metric)
     result = corrected.result
     text = (
         f"{arguments.out}: feasible ({corrected.kind}), margin {result.margin:.3g}, "
-        f"{result.objective:.6g} away from {arguments.file} in the units of its parameters\n"
+        f"{result.objective:.6g} away from {arguments.file} in the {arguments.metric} metric\n"
     )
     document = {
         "file": str(arguments.out),

@@ -21,7 +21,7 @@ from ident_service.estimation.proof.sdpa import bpfc_sdpa, bpft_sdpa, fbpe_sdpa
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.record.open import open_recording
 from ident_service.record.part import TrimmedRecording
-from ident_service.record.quality import quality
+from ident_service.record.quality import Quality, quality
 from ident_service.record.recording import Recording
 from ident_service.results.files import appearing_folder, write_atomically
 from ident_service.results.run_folder import write_manifest, write_results
@@ -94,9 +94,10 @@ def identify_files(request: Request, folder: Path, tell: Callable[[str], None] =
     model = arm_model(_config(request))
     recordings = [_open(path, model) for path in request.recordings]
     validation = [_open(path, model) for path in request.validation]
-    warnings = tuple(line for recording in [*recordings, *validation] for line in _warnings(recording, model))
+    found = [(recording, _quality(recording, model)) for recording in [*recordings, *validation]]
+    warnings = tuple(f"{recording.path}: {line}" for recording, seen in found for line in seen.warnings())
     estimate = identify(model, recordings, validation, method=request.method, set_name=request.set_name)
-    more: dict[str, Any] = {}
+    more: dict[str, Any] = {"recording_quality": [_quality_document(recording, seen) for recording, seen in found]}
     if request.replicates:
         tell(f"bootstrap of {request.replicates} replicates")
         more["bootstrap"] = _bootstrap(estimate, request.replicates)
@@ -138,16 +139,26 @@ def _open(path: Path, model: ArmModel) -> Recording:
     return TrimmedRecording(recording, start, end) if start or end else recording
 
 
-def _warnings(recording: Recording, model: ArmModel) -> list[str]:
-    torn = [f"{recording.path}: torn; read up to the tear"] if recording.torn else []
-    limits = np.array(
-        [
-            np.nan if (joint := model.config.joints.get(name)) is None or joint.torque is None else joint.torque
-            for name in model.chain.names
-        ]
-    )
-    found = quality(recording, model.config.recording, limits)
-    return [*torn, *(f"{recording.path}: {line}" for line in found.warnings())]
+def _quality(recording: Recording, model: ArmModel) -> Quality:
+    joints = [model.config.joints.get(name) for name in model.chain.names]
+    limits = np.array([np.nan if joint is None or joint.torque is None else joint.torque for joint in joints])
+    return quality(recording, model.config.recording, limits)
+
+
+def _quality_document(recording: Recording, seen: Quality) -> dict[str, Any]:
+    return {
+        "recording": recording.path.name,
+        "samples": seen.samples,
+        "seconds": seen.duration_s,
+        "rate_hz": seen.rate_hz,
+        "jitter_seconds": {"standard_deviation": seen.jitter_std_s, "largest": seen.jitter_max_s},
+        "gaps": len(seen.gaps),
+        "repeats": seen.repeats,
+        "torn": seen.torn,
+        "per_joint": [
+            {"joint": joint.name, "saturated": joint.saturated, "standstill": joint.standstill} for joint in seen.joints
+        ],
+    }
 
 
 def _bootstrap(estimate: Estimate, replicates: int) -> dict[str, Any]:

@@ -5,6 +5,10 @@ from __future__ import annotations
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ident_service.config.load import load_arm
 from ident_service.config.schema import FeasibleSetName
@@ -53,17 +57,33 @@ def check_file(path: Path, kind: FeasibleSetName | None = None, arm: str | None 
     return CheckedFile(conditions.kind, feasibility_test(file.values, file.base, conditions))
 
 
-def correct_file(path: Path, out: Path, kind: FeasibleSetName | None = None, arm: str | None = None) -> CorrectedFile:
+def correct_file(
+    path: Path,
+    out: Path,
+    kind: FeasibleSetName | None = None,
+    arm: str | None = None,
+    metric: Literal["euclidean", "covariance"] = "euclidean",
+) -> CorrectedFile:
     """Write the nearest feasible parameters of a file (BPFC, eq. 55) into another; everything else stays as it was.
 
     What no longer holds for the new values is left out: covariances, verdicts, fit and validation.
+
+    Args:
+        path: the file.
+        out: where the corrected one goes.
+        kind: feasible set; the file's own when None, or else `pseudo_inertia`.
+        arm: a description whose physical constraints are added.
+        metric: what nearest means: the paper's, in the units of the parameters, or that of the file's covariance, which
+            does not depend on the choice of base columns.
 
     Raises:
         UsageError, ConfigError, ParameterError: the file or the arm cannot be used, or `out` not written.
         SolverError: the solver stopped without an optimum.
     """
     file, conditions = _read(path, kind, arm)
-    result = feasibility_correction(file.values, file.base, conditions)
+    result = feasibility_correction(
+        file.values, file.base, conditions, _covariance(path, file) if metric == "covariance" else None
+    )
     content = deepcopy(file.content)
     for stale in ("fit", "validation"):
         content.pop(stale, None)
@@ -82,6 +102,15 @@ def correct_file(path: Path, out: Path, kind: FeasibleSetName | None = None, arm
     }
     write_parameters(out, content)
     return CorrectedFile(conditions.kind, result)
+
+
+def _covariance(path: Path, file: ParameterFile) -> NDArray[np.float64]:
+    rows = file.content["base_parameters"].get("covariance")
+    if rows is None or any(len(row) != file.base.size for row in rows):
+        raise ParameterError(
+            f"{path}: has no covariance of its {file.base.size} base parameters to measure distance with"
+        )
+    return np.array([[np.inf if value is None else value for value in row] for row in rows], dtype=float)
 
 
 def _read(path: Path, kind: FeasibleSetName | None, arm: str | None) -> tuple[ParameterFile, FeasibleSet]:

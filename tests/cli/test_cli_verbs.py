@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli.conftest import Commissioned, Ident, Samples, left_over, quick_arm
+from cli.conftest import Commissioned, Ended, Ident, Samples, left_over, quick_arm
 
 from ident_service import __version__
 from ident_service.cli import main
@@ -126,7 +126,7 @@ def test_a_torn_recording_is_read_up_to_the_tear(quick: Commissioned, ident: Ide
     torn.write_bytes(whole[: int(0.9 * len(whole))])
     ended = ident("identify", torn, "--arm", quick.arm, "--out", tmp_path / "out", "--json")
     assert ended.code == 0
-    assert f"ident: {torn}: torn; read up to the tear\n" in ended.err
+    assert f"ident: {torn}: the file is torn; it was read up to there\n" in ended.err
     assert ended.json["feasible"] is True
 
 
@@ -331,3 +331,34 @@ def test_main_is_the_console_script() -> None:
 
 def test_quick_arm_is_a_good_description(ident: Ident, tmp_path: Path) -> None:
     assert ident("config", "check", quick_arm(tmp_path)).code == 0
+
+
+def test_correction_in_the_metric_of_the_covariance(quick: Commissioned, ident: Ident, tmp_path: Path) -> None:
+    free = tmp_path / "free"
+    run = quick.folder / "identification.mcap"
+    assert ident("identify", run, "--arm", quick.arm, "--feasible-set", "none", "--out", free).code == 0
+    content = json.loads((free / "parameters.json").read_text(encoding="utf-8"))
+    table = content["base_parameters"]
+    given = tmp_path / "given.json"
+
+    def correct(name: str) -> Ended:
+        given.write_text(json.dumps(content), encoding="utf-8")
+        words = ("correct", given, "--arm", quick.arm, "--metric", "covariance", "--out", tmp_path / name)
+        return ident(*words)
+
+    variances = [value**2 for value in table["standard_deviations"]]
+    table["covariance"] = [[v if i == j else 0.0 for j in range(len(variances))] for i, v in enumerate(variances)]
+    ended = correct("corrected.json")
+    assert ended.code == 0, ended.err
+    assert ident("verify", tmp_path / "corrected.json").code == 0
+    for covariance, reason in (
+        (None, "has no covariance"),
+        ([[0.0] * len(variances)] * len(variances), "is not positive"),
+    ):
+        table["covariance"] = covariance
+        if covariance is None:
+            del table["covariance"]
+        refused = correct("none.json")
+        assert refused.code == 1
+        assert reason in refused.err
+        assert not (tmp_path / "none.json").exists()
