@@ -351,10 +351,8 @@ def test_correction_in_the_metric_of_the_covariance(quick: Commissioned, ident: 
     ended = correct("corrected.json")
     assert ended.code == 0, ended.err
     assert ident("verify", tmp_path / "corrected.json").code == 0
-    for covariance, reason in (
-        (None, "has no covariance"),
-        ([[0.0] * len(variances)] * len(variances), "is not positive"),
-    ):
+    zero = [[0.0] * len(variances)] * len(variances)
+    for covariance, reason in ((None, "has no covariance"), (zero, "is not positive")):
         table["covariance"] = covariance
         if covariance is None:
             del table["covariance"]
