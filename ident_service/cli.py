@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ident_service import __version__
-from ident_service.errors import ArmFault, ConfigError, IdentError, MotionRefused, UsageError
+from ident_service.errors import ArmFault, ConfigError, IdentError, MotionRefused, ParameterError, UsageError
 
 DONE, FAILED, USAGE, VERDICT_NO, FAULTED = 0, 1, 2, 3, 4
 _EXIT_CODES: tuple[tuple[type[IdentError], int], ...] = (
@@ -71,9 +71,7 @@ def _own_packages_only() -> None:
 def _parser() -> argparse.ArgumentParser:
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--json", action="store_true", help="one JSON object on stdout, nothing else")
-    common.add_argument(
-        "--state", type=Path, help="state folder (default: $IDENT_STATE, or the user's XDG state folder)"
-    )
+    common.add_argument("--state", help="state folder (default: $IDENT_STATE, or the user's XDG state folder)")
     parser = argparse.ArgumentParser(
         prog="ident",
         description="Commission a robot arm: excite it, record it, identify parameters a real body could have.",
@@ -105,11 +103,18 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--prior", choices=["none", "euclidean", "entropic"], help="draw the estimate to the arm's prior")
     sub.add_argument("--prior-weight", type=_share, metavar="W", help="default: chosen on held-out data")
     sub.add_argument("--delay", type=_delay, metavar="SECONDS", help="of the torque's stamps, or 'estimate'")
-    sub.add_argument("--bootstrap", type=_seed, default=0, metavar="N", help="replicates, for the constrained estimate")
+    sub.add_argument(
+        "--bootstrap", type=_replicates, default=0, metavar="N", help="replicates of the constrained estimate"
+    )
     sub.add_argument("--essential", action="store_true", help="also the smallest model that predicts as well")
     sub.add_argument("--sdpa", action="store_true", help="also the problems in SDPA format, for other solvers")
     sub.add_argument("--feasible-set", choices=[*_SETS, "none"], help="default: the arm's; none: unconstrained")
-    sub.add_argument("--out", type=Path, metavar="DIR", help="where results go (default: below the state folder)")
+    sub.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="where results go, files of the same name being replaced (default: a new folder below the state folder)",
+    )
 
     sub = verb("base", _base, "base parameters and their expressions")
     sub.add_argument("arm", metavar="ARM")
@@ -142,6 +147,12 @@ def _seed(text: str) -> int:
     return int(text)
 
 
+def _replicates(text: str) -> int:
+    if not text.isdigit() or int(text) == 1:
+        raise argparse.ArgumentTypeError("a number of replicates is 0, or 2 and more")
+    return int(text)
+
+
 def _share(text: str) -> float:
     try:
         value = float(text)
@@ -166,6 +177,8 @@ def _delay(text: str) -> float | str:
 
 def _state_folder(arguments: argparse.Namespace) -> Path:
     if arguments.state is not None:
+        if not arguments.state:
+            raise UsageError("--state needs the name of a folder")
         return Path(arguments.state)
     if given := os.environ.get("IDENT_STATE"):
         return Path(given)
@@ -205,7 +218,7 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
         "",
     ]
     document = {"folder": str(result.folder), "score": score_document(scored), **_estimate_document(estimate)}
-    return (DONE if estimate.feasible or not estimate.constrained else VERDICT_NO), "\n".join(lines), document
+    return (DONE if estimate.feasible else VERDICT_NO), "\n".join(lines), document
 
 
 def _identify(arguments: argparse.Namespace) -> Answer:
@@ -233,7 +246,7 @@ def _identify(arguments: argparse.Namespace) -> Answer:
     estimate = result.estimate
     sys.stderr.write("".join(f"ident: {line}\n" for line in result.warnings))
     text = summary(estimate) + f"\nfiles: {folder}\n" + "".join(f"  {name}\n" for name in result.files)
-    code = DONE if estimate.feasible or not estimate.constrained else VERDICT_NO
+    code = DONE if estimate.feasible else VERDICT_NO
     document = {"folder": str(folder), "files": list(result.files), "warnings": list(result.warnings)}
     return code, text, document | _estimate_document(estimate)
 
@@ -300,6 +313,8 @@ def _verify(arguments: argparse.Namespace) -> Answer:
     from ident_service.service.verify import verify_file
 
     result = verify_file(arguments.file)
+    if result.verdict == "failed" and result.message.startswith("not a parameter file"):
+        raise ParameterError(f"{arguments.file}: {result.message}")
     text = f"{arguments.file}: {result.verdict}: {result.message}\n" + "".join(f"  {line}\n" for line in result.checked)
     document = {"file": str(arguments.file), "verdict": result.verdict, "message": result.message}
     return (DONE if result.verdict == "feasible" else VERDICT_NO), text, document | {"checked": list(result.checked)}
@@ -344,7 +359,7 @@ def _tell(arguments: argparse.Namespace, line: str) -> None:
 
 
 class _StopOnSignal:
-    """Ctrl-C asks for a controlled stop; a second one ends the process as usual."""
+    """Ctrl-C or a polite kill asks for a controlled stop; a second one ends the process as usual."""
 
     def __init__(self) -> None:
         self._asked = False
@@ -353,14 +368,15 @@ class _StopOnSignal:
         return self._asked
 
     def __enter__(self) -> None:
-        self._before = signal.signal(signal.SIGINT, self._ask)
+        self._before = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def __exit__(self, *_: object) -> None:
-        signal.signal(signal.SIGINT, self._before)
+        for number, before in self._before.items():
+            signal.signal(number, before)
 
-    def _ask(self, *_: object) -> None:
+    def _ask(self, number: int, _: object) -> None:
         self._asked = True
-        signal.signal(signal.SIGINT, self._before)
+        signal.signal(number, self._before[signal.Signals(number)])
 
 
 if __name__ == "__main__":

@@ -113,6 +113,8 @@ def base_from_expressions(expressions: tuple[str, ...], names: tuple[str, ...]) 
     if not expressions:
         raise ParameterError("no expressions: a table of base parameters has at least one")
     K = parameter_matrix(expressions, names)
+    if empty := [row + 1 for row in range(len(K)) if not K[row].any()]:
+        raise ParameterError(f"expression {empty[0]} ({expressions[empty[0] - 1]!r}) is zero whatever the parameters")
     _, R, order = scipy.linalg.qr(K.T, mode="economic", pivoting=True)
     rank = int(np.sum(np.abs(np.diag(R)) > _RANK_TOLERANCE * max(1.0, abs(R[0, 0]))))
     if rank < len(expressions):

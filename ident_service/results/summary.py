@@ -42,6 +42,7 @@ def summary(estimate: Estimate) -> str:
         "",
         ", ".join(f"{count} {word}" for word, count in counts.items())
         + f" (standard deviation below {IDENTIFIED_BELOW:.0%}, below {WEAK_BELOW:.0%}, above)",
+        "  of the larger of the parameter's size and the reference of its unit, below which it is as good as zero",
     ]
     doubtful = [i for i, verdict in enumerate(estimate.verdicts) if verdict != "identified"]
     for i in doubtful:
@@ -95,7 +96,8 @@ def parameter_table(estimate: Estimate) -> str:
 def _feasibility(estimate: Estimate) -> str:
     kind = estimate.conditions.kind
     if estimate.feasible:
-        text = f"feasible ({kind}): margin {estimate.margin:.3g}, a real body could have these parameters"
+        text = f"feasible ({kind}): margin {estimate.margin:.3g}, a real body could have these parameters\n"
+        text += "(motion shows base parameters only; the link values behind them are one body of many: see --prior)"
         if estimate.tight:
             text += "\nthe data pull against:\n" + "\n".join(f"  {name}" for name in estimate.tight)
         return text

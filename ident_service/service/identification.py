@@ -24,7 +24,7 @@ from ident_service.record.part import TrimmedRecording
 from ident_service.record.quality import Quality, quality
 from ident_service.record.recording import Recording
 from ident_service.results.files import appearing_folder, write_atomically
-from ident_service.results.run_folder import write_manifest, write_results
+from ident_service.results.run_folder import MANIFEST, write_manifest, write_results
 
 
 @dataclass(frozen=True)
@@ -91,6 +91,8 @@ def identify_files(request: Request, folder: Path, tell: Callable[[str], None] =
         RecordingError: a recording cannot be used.
         SolverError: a solver stopped without an optimum.
     """
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"{folder}: is a file, not a folder")
     model = arm_model(_config(request))
     recordings = [_open(path, model) for path in request.recordings]
     validation = [_open(path, model) for path in request.validation]
@@ -109,7 +111,7 @@ def identify_files(request: Request, folder: Path, tell: Callable[[str], None] =
         if request.sdpa:
             files += _write_sdpa(staging, estimate)
         write_manifest(staging)
-    return Identified(estimate, tuple(files), warnings)
+    return Identified(estimate, (*files, MANIFEST), warnings)
 
 
 def _config(request: Request) -> ArmConfig:

@@ -215,7 +215,8 @@ def test_the_wams_table_of_expressions_is_its_grouping(wam7: ArmModel, wam7_base
     [
         (("a", "b", "a"), "is a combination of the others"),
         (("a + b", "b + c", "a - c"), "is a combination of the others"),
-        (("a", "b - b"), "expression 2 is a combination"),
+        (("a", "b - b"), r"expression 2 ('b - b') is zero"),
+        (("0*a",), "expression 1"),
         (("a", "2*d"), "no parameter is called 'd'"),
         (("a", "2*"), "expected a name"),
         ((), "no expressions"),
