@@ -4,7 +4,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: demo test unit lint types bench campaign clean
+.PHONY: demo test unit lint types bench bench-design campaign clean
 
 demo: $(READY)
 	$(BIN)/ident simulate
@@ -24,6 +24,9 @@ types: $(READY)
 
 bench: $(READY)
 	$(BIN)/python -m benchmarks
+
+bench-design: $(READY)
+	$(BIN)/python -m benchmarks.design
 
 campaign: $(READY)
 	$(BIN)/pytest -m campaign --timeout 7200

@@ -50,7 +50,7 @@ def main() -> None:
 def _model(model: ArmModel) -> list[Row]:
     chain, layout = model.chain, model.layout
     base = base_parameters(chain, layout)
-    series = excitation(model, "identification").series
+    series = excitation(model, "identification").path.series
     q, dq, ddq, _ = series.at(np.arange(SAMPLES) * 1e-3)
 
     def batched() -> None:
@@ -119,4 +119,5 @@ def _estimation(model: ArmModel, folder: Path) -> list[Row]:
     return rows
 
 
-main()
+if __name__ == "__main__":
+    main()

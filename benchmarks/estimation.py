@@ -48,7 +48,7 @@ class Endless:
 
     def blocks(self, samples: int = 4096) -> Iterator[Block]:
         """Samples, computed when they are asked for."""
-        series = excitation(self.model, "identification").series
+        series = excitation(self.model, "identification").path.series
         prior = self.model.prior
         if prior is None:
             raise ValueError("the WAM has a prior")

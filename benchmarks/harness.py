@@ -41,10 +41,10 @@ def table(rows: list[Row]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def write(rows: list[Row], folder: Path) -> Path:
-    """Rows for programs."""
+def write(rows: list[Row], folder: Path, name: str = "benchmarks") -> Path:
+    """Rows for programs, in `<name>.json`."""
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "benchmarks.json"
+    path = folder / f"{name}.json"
     document = {
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": f"{platform.machine()}, Python {platform.python_version()}",

@@ -4,4 +4,6 @@ import sys
 
 from ident_service.cli import main
 
-sys.exit(main())
+# The processes of a search import this file again under another name.
+if __name__ == "__main__":
+    sys.exit(main())

@@ -8,8 +8,9 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
+from ident_service.config import design, recording, workspace
 from ident_service.config.quantities import Section
-from ident_service.config.recording import RecordingFormat, disagreements
+from ident_service.config.recording import RecordingFormat
 from ident_service.config.schema import ArmConfig, DHTable, FourierMotion, SimulatedDriver
 from ident_service.config.source import KeyPath, Tree, read_tree
 from ident_service.errors import ConfigError, Problem, UsageError
@@ -124,7 +125,9 @@ def _disagreements(config: ArmConfig) -> Iterator[tuple[KeyPath, str]]:
             given = getattr(config.driver, key)
             if isinstance(given, tuple) and len(given) != len(names):
                 yield ("driver", key), f"driver.{key}: {len(given)} values for {len(names)} joints"
-    yield from disagreements(config.recording, config.transmission, names)
+    yield from recording.disagreements(config.recording, config.transmission, names)
+    yield from workspace.disagreements(config.geometry, config.workspace, config.supply, names)
+    yield from design.disagreements(config.design, names)
 
 
 def _joint_names(table: DHTable | None, config: ArmConfig) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Discriminator, Field, Tag, model_validator
 
+from ident_service.config.design import Design
 from ident_service.config.quantities import (
     Angle,
     Count,
@@ -24,6 +25,7 @@ from ident_service.config.quantities import (
     Vector3,
 )
 from ident_service.config.recording import RecordingFormat, Transmission
+from ident_service.config.workspace import Geometry, Supply, Workspace
 
 JointTerm = Literal["drive_inertia", "viscous", "coulomb", "offset", "stribeck", "quadratic", "viscous_asymmetry"]
 FeasibleSetName = Literal["pseudo_inertia", "inertia"]
@@ -250,11 +252,12 @@ class FourierJoint(Section):
 
 
 class FourierMotion(Section):
-    """A finite Fourier series (eq. 78), `base_frequency` in Hz."""
+    """A finite Fourier series (eq. 78), `base_frequency` in Hz, that swells and dies down in `ramp` [s]."""
 
     kind: Literal["fourier"]
     base_frequency: Positive
     periods: Count = 3
+    ramp: NonNegative = 0.0
     joints: dict[str, FourierJoint]
 
     @model_validator(mode="after")
@@ -272,6 +275,7 @@ class SeededMotion(Section):
     base_frequency: Positive = 0.05
     harmonics: Annotated[Count, Field(le=50)] = 5
     periods: Count = 3
+    ramp: NonNegative = 0.0
     use: Annotated[float, Field(gt=0, le=1)] = 0.7
 
 
@@ -317,6 +321,20 @@ Driver = Annotated[
 ]
 
 
+_MOTION_DEPENDS_ON = (
+    "kinematics",
+    "gravity",
+    "terms",
+    "joints",
+    "prior",
+    "control",
+    "transmission",
+    "geometry",
+    "workspace",
+    "supply",
+)
+
+
 class ArmConfig(Section):
     """A whole arm as its YAML file describes it; the first thing that passes every door."""
 
@@ -335,6 +353,10 @@ class ArmConfig(Section):
     identification: Identification = Identification()
     recording: RecordingFormat = RecordingFormat()
     transmission: Transmission | None = None
+    geometry: Geometry = Field(default_factory=dict)
+    workspace: Workspace = Workspace()
+    supply: Supply | None = None
+    design: Design = Design()
     motions: Motions = Motions()
     driver: Driver | None = None
 
@@ -342,3 +364,11 @@ class ArmConfig(Section):
     def sha256(self) -> str:
         """SHA-256 of the whole resolved description, files it names included."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
+
+    @property
+    def motion_sha256(self) -> str:
+        """SHA-256 of what the safety of a motion depends on: the mechanism, its limits, its model and its surroundings.
+
+        Other estimators, recording formats, motions or drivers leave it as it is.
+        """
+        return hashlib.sha256(self.model_dump_json(include=set(_MOTION_DEPENDS_ON)).encode()).hexdigest()

@@ -7,7 +7,6 @@ Boundary: pure functions of time; whether an arm may move so is `demands.py`'s q
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,56 +51,23 @@ class FourierSeries:
         Returns:
             Four arrays in SI units, shape (samples, joints), or (joints,) for a single time.
         """
-        t = np.asarray(time, dtype=float)
-        harmonics = 2.0 * np.pi * self.base_frequency * np.arange(1, self.a.shape[1] + 1)
-        phase = t[..., None] * harmonics
+        position, velocity, acceleration, jerk = self.derivatives(np.asarray(time, dtype=float), 3)
+        return position, velocity, acceleration, jerk
+
+    def derivatives(self, time: Array, highest: int) -> list[Array]:
+        """Position and its time derivatives up to the order `highest`, each of shape (samples, joints)."""
+        rates = 2.0 * np.pi * self.base_frequency * np.arange(1, self.a.shape[1] + 1)
+        phase = time[..., None] * rates
         sine, cosine = np.sin(phase), np.cos(phase)
         a, b = self.a.T, self.b.T
-        position = (sine / harmonics) @ a - (cosine / harmonics) @ b + self.q0
-        velocity = cosine @ a + sine @ b
-        acceleration = (-sine * harmonics) @ a + (cosine * harmonics) @ b
-        jerk = (-cosine * harmonics**2) @ a - (sine * harmonics**2) @ b
-        return position, velocity, acceleration, jerk
+        position = (sine / rates) @ a - (cosine / rates) @ b + self.q0
+        values = [position, cosine @ a + sine @ b]
+        while len(values) <= highest:
+            # Every derivative turns (sine, cosine) by a quarter and multiplies by the rate.
+            sine, cosine = cosine * rates, -sine * rates
+            values.append(cosine @ a + sine @ b)
+        return values[: highest + 1]
 
     def scaled(self, factor: float) -> FourierSeries:
         """The same motion about the same middle with all amplitudes times `factor`."""
         return FourierSeries(self.base_frequency, self.a * factor, self.b * factor, self.q0.copy())
-
-
-@dataclass(frozen=True)
-class Excitation:
-    """A motion ready to run, and the arm it was made for.
-
-    Attributes:
-        name: what the motion is for.
-        series: the motion.
-        periods: how often it repeats.
-        arm_sha256: hash of the arm description.
-    """
-
-    name: str
-    series: FourierSeries
-    periods: int
-    arm_sha256: str
-
-    @property
-    def duration(self) -> float:
-        """Length of the whole motion [s]."""
-        return self.periods * self.series.period
-
-    def to_json(self) -> str:
-        """One small JSON object from which the motion can be repeated to the last bit."""
-        return json.dumps(
-            {
-                "format": "ident-excitation",
-                "version": 1,
-                "name": self.name,
-                "arm": {"sha256": self.arm_sha256},
-                "base_frequency": self.series.base_frequency,
-                "periods": self.periods,
-                "a": self.series.a.tolist(),
-                "b": self.series.b.tolist(),
-                "q0": self.series.q0.tolist(),
-            },
-            indent=1,
-        )

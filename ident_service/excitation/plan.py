@@ -10,12 +10,16 @@ from ident_service.config.limits import MotionLimits, motion_limits
 from ident_service.config.schema import FourierMotion, SeededMotion
 from ident_service.errors import MotionRefused
 from ident_service.excitation.demands import demands, require_within_limits
-from ident_service.excitation.fourier import Excitation, FourierSeries
+from ident_service.excitation.excitation import Excitation
+from ident_service.excitation.fourier import FourierSeries
+from ident_service.excitation.path import FourierPath
 from ident_service.model.arm_model import ArmModel
 
 
-def excitation(model: ArmModel, purpose: Literal["identification", "validation"]) -> Excitation:
-    """The motion configured for a purpose, proven to stay inside the arm's limits.
+def excitation(
+    model: ArmModel, purpose: Literal["identification", "validation"], *, checked: bool = True
+) -> Excitation:
+    """The motion configured for a purpose, proven to stay inside the arm's limits unless somebody else will prove it.
 
     Raises:
         MotionRefused: limits are missing, or the motion leaves them.
@@ -23,8 +27,10 @@ def excitation(model: ArmModel, purpose: Literal["identification", "validation"]
     limits = motion_limits(model.config)
     motion = getattr(model.config.motions, purpose)
     series = _published(motion) if isinstance(motion, FourierMotion) else _seeded(motion, model, limits)
-    require_within_limits(series, model, limits)
-    return Excitation(purpose, series, motion.periods, model.config.sha256)
+    path = FourierPath(series, motion.periods, motion.ramp)
+    if checked:
+        require_within_limits(path, model, limits)
+    return Excitation(purpose, path, model.config.motion_sha256)
 
 
 def _published(motion: FourierMotion) -> FourierSeries:
@@ -43,7 +49,7 @@ def _seeded(motion: SeededMotion, model: ArmModel, limits: MotionLimits) -> Four
     shape = (model.chain.joints, motion.harmonics)
     middle = 0.5 * (limits.lower + limits.upper)
     series = FourierSeries(motion.base_frequency, rng.normal(size=shape), rng.normal(size=shape), middle)
-    asked = demands(series, model)
+    asked = demands(FourierPath(series, 1, motion.ramp), model)
     room = np.minimum(limits.upper - middle, middle - limits.lower)
     used = np.max(
         [
@@ -57,7 +63,7 @@ def _seeded(motion: SeededMotion, model: ArmModel, limits: MotionLimits) -> Four
     factor = (motion.use / used)[:, None]
     series = FourierSeries(motion.base_frequency, series.a * factor, series.b * factor, middle)
     for _ in range(20):
-        torque = demands(series, model).torque
+        torque = demands(FourierPath(series, 1, motion.ramp), model).torque
         if torque is None or bool(np.all(torque <= motion.use * limits.torque)):
             return series
         series = series.scaled(0.8)

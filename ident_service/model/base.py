@@ -72,13 +72,29 @@ def base_parameters(chain: Chain, layout: Layout) -> BaseParameters:
     if "stribeck" in layout.terms:
         # Also at the speeds where this term differs from Coulomb friction.
         states[1, ::2] *= np.array(layout.stribeck_velocity) / np.pi
-    H = joint_regressor(chain, layout, *states).transpose(0, 2, 1).reshape(-1, layout.size)
+    return _grouped(joint_regressor(chain, layout, *states).transpose(0, 2, 1).reshape(-1, layout.size), layout)
+
+
+def _grouped(H: Array, layout: Layout) -> BaseParameters:
+    """The grouping that a regressor at enough states shows."""
     base, K_d = _first_independent(H)
     K = np.zeros((len(base), layout.size))
     K[np.arange(len(base)), base] = 1.0
     dependent = np.setdiff1d(np.arange(layout.size), base)
     K[:, dependent] = K_d
     return BaseParameters(layout.names, K, base, tuple(layout.units[column] for column in base))
+
+
+def static_base_parameters(chain: Chain, layout: Layout) -> BaseParameters:
+    """What standing still and slow motion can teach: gravity's base parameters and the friction terms."""
+    rng = np.random.default_rng(_SEED)
+    samples = max(8, -(-4 * layout.size // chain.joints))
+    position, velocity = rng.uniform(-np.pi, np.pi, size=(2, samples, chain.joints))
+    still = np.zeros_like(position)
+    H = joint_regressor(chain, layout, position, still, still)
+    terms = [int(column) for term in layout.terms if term != "drive_inertia" for column in layout.term_columns(term)]
+    H[:, terms] = joint_regressor(chain, layout, position, velocity, still, terms)
+    return _grouped(H.transpose(0, 2, 1).reshape(-1, layout.size), layout)
 
 
 def _first_independent(H: Array) -> tuple[NDArray[np.intp], Array]:

@@ -87,6 +87,18 @@ def joint_regressor(
 @lru_cache(maxsize=32)
 def _program(chain: Chain, layout: Layout, columns: tuple[int, ...]) -> tuple[Program, list[tuple[int, int]]]:
     """The traced formulas, and the (joint, column) that each of its outputs belongs to; the others are zero."""
+    tape, entries = traced_regressor(chain, layout)
+    kept = entries_of(entries, columns)
+    return Program(tape, list(kept.values())), list(kept)
+
+
+def traced_regressor(chain: Chain, layout: Layout) -> tuple[Tape, dict[tuple[int, int], Value]]:
+    """The formulas of H on a fresh tape, for programs of other kinds than the one here.
+
+    Returns:
+        The tape, whose inputs are position, velocity, acceleration and direction of every joint, in this order, and
+        the entries of H by (joint, column of delta); those that are not there are zero.
+    """
     tape = Tape()
     q, dq, ddq, direction = ([tape.input() for _ in range(chain.joints)] for _ in range(4))
     entries = _joint_terms(tape, chain, layout, dq, ddq, direction)
@@ -94,13 +106,31 @@ def _program(chain: Chain, layout: Layout, columns: tuple[int, ...]) -> tuple[Pr
     for link in range(chain.joints):
         for (joint, parameter), value in _link_entries(states, link).items():
             entries[joint, layout.inertial(link).start + parameter] = value
+    return tape, entries
+
+
+def traced_rigid_torque(
+    tape: Tape, chain: Chain, layout: Layout, delta: Array, q: list[Symbol], dq: Sequence[Value], ddq: Sequence[Value]
+) -> list[Value]:
+    """The links' share of the torque of every joint for known parameters; numbers in `dq` and `ddq` are folded."""
+    torque: list[Value] = [0.0] * chain.joints
+    states = _Forward(tape, chain, q, dq, ddq)
+    for link in range(chain.joints):
+        start = layout.inertial(link).start
+        for (joint, parameter), value in _link_entries(states, link).items():
+            if (factor := float(delta[start + parameter])) != 0.0:
+                torque[joint] = torque[joint] + value * factor
+    return torque
+
+
+def entries_of(entries: dict[tuple[int, int], Value], columns: Sequence[int]) -> dict[tuple[int, int], Value]:
+    """The entries that are not zero, by joint and place in `columns`."""
     chosen = {column: row for row, column in enumerate(columns)}
-    kept = {
+    return {
         (joint, chosen[column]): value
         for (joint, column), value in entries.items()
         if column in chosen and (isinstance(value, Symbol) or value != 0.0)
     }
-    return Program(tape, list(kept.values())), list(kept)
 
 
 def _joint_terms(
@@ -137,7 +167,7 @@ def _exp(tape: Tape, value: Value) -> Value:
 class _Forward:
     """Motion of every link frame, and the unit screws of its ancestors seen from it."""
 
-    def __init__(self, tape: Tape, chain: Chain, q: list[Symbol], dq: list[Symbol], ddq: list[Symbol]) -> None:
+    def __init__(self, tape: Tape, chain: Chain, q: list[Symbol], dq: Sequence[Value], ddq: Sequence[Value]) -> None:
         self.screws: list[dict[int, _Screw]] = []
         self.motion: list[tuple[_Vector, _Vector, _Vector]] = []
         base: _Vector = [-float(g) for g in chain.gravity]

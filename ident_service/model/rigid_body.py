@@ -205,6 +205,16 @@ class ForwardDynamics:
         rigid = pin.rnea(self._model, self._data, position, velocity, acceleration)
         return np.asarray(rigid + self._drive_matrix @ acceleration)
 
+    def mass_matrices(self, position: Array) -> NDArray[np.float64]:
+        """M(q) at postures [rad or m] of shape (samples, joints); (samples, joints, joints), drive inertia included."""
+        n = self._model.nv
+        M = np.empty((len(position), n, n))
+        for k, posture in enumerate(position):
+            M[k] = pin.crba(self._model, self._data, posture)
+        rows, columns = np.triu_indices(n)  # the only entries that are filled
+        M[:, columns, rows] = M[:, rows, columns]
+        return np.asarray(M + self._drive_matrix)
+
     def friction(self, velocity: Array) -> NDArray[np.float64]:
         """Torque that friction takes [N m or N], shape (joints,)."""
         rate = self._coupling @ velocity

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-_UNARY = {"sin": np.sin, "cos": np.cos, "exp": np.exp, "abs": np.abs, "neg": np.negative}
+_UNARY = {"sin": np.sin, "cos": np.cos, "exp": np.exp, "abs": np.abs, "sign": np.sign, "neg": np.negative}
 _BINARY = {"mul": np.multiply, "add": np.add, "sub": np.subtract}
 
 
@@ -71,7 +71,7 @@ class Tape:
         return self.step("input", len(self.steps), None)
 
     def apply(self, function: str, value: Symbol) -> Symbol:
-        """`sin`, `cos`, `exp` or `abs` of a value."""
+        """`sin`, `cos`, `exp`, `abs` or `sign` of a value."""
         return self.step(function, value.index, None)
 
     def step(self, operation: str, a: _Operand, b: _Operand) -> Symbol:
@@ -96,7 +96,7 @@ class Program:
         """
         self._constants = [(row, value) for row, value in enumerate(outputs) if not isinstance(value, Symbol)]
         wanted = [(row, value.index) for row, value in enumerate(outputs) if isinstance(value, Symbol)]
-        needed = _needed(tape, [index for _, index in wanted])
+        needed = needed_steps(tape, [index for _, index in wanted])
         inputs = [index for index, step in enumerate(tape.steps) if step[0] == "input"]
         # A value that is wanted lives in its output row from the start; others share slots of a workspace.
         home: dict[int, tuple[str, int]] = {index: ("input", number) for number, index in enumerate(inputs)}
@@ -106,7 +106,7 @@ class Program:
                 self._copies.append((row, home[index]))
             else:
                 home[index] = ("output", row)
-        last_use = {index: at for at in needed for index in _operands(tape, at)}
+        last_use = {index: at for at in needed for index in operands_of(tape, at)}
         free: list[int] = []
         self._slots = 0
         self._plan: list[tuple[np.ufunc, tuple[str, int] | float, tuple[str, int] | float | None, tuple[str, int]]] = []
@@ -115,7 +115,7 @@ class Program:
             if operation == "input":
                 continue
             operands = [home[value] if isinstance(value, int) else value for value in (a, b)]
-            done = {home[index] for index in _operands(tape, at) if last_use[index] == at}
+            done = {home[index] for index in operands_of(tape, at) if last_use[index] == at}
             free += [number for kind, number in done if kind == "slot"]
             if at not in home:
                 if not free:
@@ -155,12 +155,13 @@ class Program:
             output[row][...] = value
 
 
-def _operands(tape: Tape, at: int) -> list[int]:
+def operands_of(tape: Tape, at: int) -> list[int]:
+    """The earlier steps that a step is made of."""
     operation, a, b = tape.steps[at]
     return [] if operation == "input" else [value for value in (a, b) if isinstance(value, int)]
 
 
-def _needed(tape: Tape, wanted: list[int]) -> list[int]:
+def needed_steps(tape: Tape, wanted: list[int]) -> list[int]:
     """Steps that the wanted ones depend on, in order."""
     found: set[int] = set()
     waiting = list(wanted)
@@ -168,5 +169,5 @@ def _needed(tape: Tape, wanted: list[int]) -> list[int]:
         at = waiting.pop()
         if at not in found:
             found.add(at)
-            waiting += _operands(tape, at)
+            waiting += operands_of(tape, at)
     return sorted(found)

@@ -1,22 +1,19 @@
-"""Where the arm should be: the excitation, and jerk-limited ways to it, back from it, and to a stop.
+"""Where the arm should be: a state, what a way is, the excitation as one, and standing still.
 
-Every way that is not the excitation itself is a ruckig trajectory within the arm's velocity, acceleration and jerk.
-Boundary: pure functions of time; ruckig is imported nowhere else.
+The other ways are in `way.py` (from one moving state to another), `stop.py`, `pause.py` and `speed.py`.
+Boundary: pure functions of time.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
 from typing import Protocol
 
 import numpy as np
-import ruckig
 
-from ident_service.config.limits import MotionLimits, Vector
-from ident_service.errors import MotionRefused
-from ident_service.excitation.fourier import Excitation
-
-_EXTENT_STEP = 1e-3  # s; a turning point lies at most acceleration * step^2 / 8 outside: 2e-6 rad at 16 rad/s^2
+from ident_service.config.limits import Vector
+from ident_service.excitation.path import Path
 
 
 @dataclass(frozen=True)
@@ -29,7 +26,7 @@ class Setpoint:
 
 
 class Reference(Protocol):
-    """A way from now on; after `duration` it stands at its last setpoint."""
+    """A way from now on; after `duration` it stays at its last setpoint."""
 
     @property
     def duration(self) -> float:
@@ -39,87 +36,36 @@ class Reference(Protocol):
         """Setpoint at `time` [s] since the way began."""
 
 
-class FourierReference:
-    """The excitation."""
+class PathReference:
+    """A path of the excitation."""
 
-    def __init__(self, excitation: Excitation) -> None:
-        self._series = excitation.series
-        self.duration = excitation.duration
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.duration = path.duration
 
     def at(self, time: float) -> Setpoint:
         """Setpoint at `time` [s]."""
-        position, velocity, acceleration, _ = self._series.at(min(time, self.duration))
+        position, velocity, acceleration, _ = self._path.at(min(time, self.duration))
         return Setpoint(position, velocity, acceleration)
 
 
-class RuckigReference:
-    """A jerk-limited trajectory."""
+class Hold:
+    """Standing, for a time or for good."""
 
-    def __init__(self, parameters: ruckig.InputParameter) -> None:
-        self._trajectory = ruckig.Trajectory(parameters.degrees_of_freedom)
-        try:
-            result = ruckig.Ruckig(parameters.degrees_of_freedom).calculate(parameters, self._trajectory)
-        except ruckig.RuckigError as error:
-            raise MotionRefused(f"no jerk-limited way exists within the limits: {str(error).strip()}") from error
-        if result not in (ruckig.Result.Working, ruckig.Result.Finished):
-            raise MotionRefused(f"no jerk-limited way exists within the limits: {result}")
-        self.duration = float(self._trajectory.duration)
+    def __init__(self, position: Vector, duration: float) -> None:
+        self._setpoint = rest(position.copy())
+        self.duration = duration
 
     def at(self, time: float) -> Setpoint:
         """Setpoint at `time` [s]."""
-        position, velocity, acceleration = self._trajectory.at_time(min(time, self.duration))[:3]
-        return Setpoint(np.array(position), np.array(velocity), np.array(acceleration))
-
-    def extent(self) -> tuple[Vector, Vector]:
-        """Lowest and highest position on the way, each of shape (joints,), but for what happens between two points."""
-        # The position_extrema of ruckig itself miss turning points (pantor/ruckig#215), here by more than 0.1 rad.
-        times = np.linspace(0.0, self.duration, 2 + int(self.duration / _EXTENT_STEP))
-        positions = np.array([self._trajectory.at_time(time)[0] for time in times])
-        return positions.min(axis=0), positions.max(axis=0)
-
-
-def way(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference:
-    """From one moving state to another, all joints arriving together.
-
-    Raises:
-        MotionRefused: no such way exists within the limits, or it would leave the position limits.
-    """
-    parameters = _parameters(start, limits)
-    parameters.target_position = end.position.tolist()
-    parameters.target_velocity = end.velocity.tolist()
-    parameters.target_acceleration = end.acceleration.tolist()
-    reference = RuckigReference(parameters)
-    lowest, highest = reference.extent()
-    if bool(np.any(lowest < limits.lower) or np.any(highest > limits.upper)):
-        joint = int(np.argmax(np.maximum(limits.lower - lowest, highest - limits.upper)))
-        raise MotionRefused(
-            f"the way to or from the motion swings joint {joint + 1} to {lowest[joint]:.3f}..{highest[joint]:.3f}, "
-            f"outside {limits.lower[joint]:g}..{limits.upper[joint]:g}; begin nearer to it or slower"
-        )
-    return reference
-
-
-def stop(start: Setpoint, limits: MotionLimits) -> RuckigReference:
-    """From a moving state to rest, each joint as soon as it can."""
-    parameters = _parameters(start, limits)
-    parameters.control_interface = ruckig.ControlInterface.Velocity
-    parameters.synchronization = ruckig.Synchronization.No
-    parameters.target_velocity = [0.0] * len(start.velocity)
-    parameters.target_acceleration = [0.0] * len(start.velocity)
-    return RuckigReference(parameters)
+        return self._setpoint
 
 
 def rest(position: Vector) -> Setpoint:
-    """Standing still."""
+    """Standing still at `position` [rad or m], shape (joints,)."""
     return Setpoint(position, np.zeros_like(position), np.zeros_like(position))
 
 
-def _parameters(start: Setpoint, limits: MotionLimits) -> ruckig.InputParameter:
-    parameters = ruckig.InputParameter(len(start.position))
-    parameters.current_position = start.position.tolist()
-    parameters.current_velocity = start.velocity.tolist()
-    parameters.current_acceleration = start.acceleration.tolist()
-    parameters.max_velocity = limits.velocity.tolist()
-    parameters.max_acceleration = limits.acceleration.tolist()
-    parameters.max_jerk = limits.jerk.tolist()
-    return parameters
+def hold(position: Vector, duration: float = inf) -> Hold:
+    """Stand at `position` [rad or m], shape (joints,), for `duration` [s]."""
+    return Hold(position, duration)

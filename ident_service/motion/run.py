@@ -19,13 +19,17 @@ from drivers.arm import Arm, Sample, StopKind, Vector
 from ident_service.config.limits import MotionLimits, motion_limits
 from ident_service.errors import ArmFault, DriverError, MotionRefused
 from ident_service.excitation.demands import require_within_limits
-from ident_service.excitation.fourier import Excitation
+from ident_service.excitation.excitation import Excitation
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.rigid_body import InverseDynamics
 from ident_service.motion.control import ComputedTorque
 from ident_service.motion.guard import REACTIONS, Fault, Guard, Reaction
-from ident_service.motion.reference import FourierReference, Reference, Setpoint, rest, stop, way
+from ident_service.motion.reference import PathReference, Reference, Setpoint, rest
+from ident_service.motion.speed import Slowed, require_factor
 from ident_service.motion.states import LAWFUL, MOVING, State, next_state
+from ident_service.motion.stop import require_stops_within_limits, stop
+from ident_service.motion.surroundings import require_clear
+from ident_service.motion.way import way
 
 _KEPT_SAMPLES = 100
 _REST_CYCLES = 20
@@ -82,6 +86,8 @@ def run(
     excitation: Excitation,
     sink: Sink,
     stop_requested: Callable[[], bool] = lambda: False,
+    *,
+    speed: float = 1.0,
 ) -> RunReport:
     """Move an open arm along an excitation and back to where it stood.
 
@@ -91,16 +97,19 @@ def run(
         excitation: checked against the limits beforehand.
         sink: takes every sample.
         stop_requested: asked every cycle; True brings the arm to a controlled stop.
+        speed: share of the motion's own speed at which all of it is played, approach and return too; a rehearsal
+            takes 0.2. Stops are never slowed.
 
     Returns:
         The report of a run that ended in DONE or, after a request, in STOPPED.
 
     Raises:
+        UsageError: the speed is not above 0 and at most 1; nothing has moved.
         MotionRefused: nothing has moved; the message says why.
         ArmFault: a fault stopped the motion; the arm is stopped or without torque.
         DriverError: the arm refused to be enabled.
     """
-    return _Run(arm, model, excitation, sink, stop_requested).run()
+    return _Run(arm, model, excitation, sink, stop_requested, require_factor(speed)).run()
 
 
 @dataclass
@@ -116,6 +125,7 @@ class _Run:
     excitation: Excitation
     sink: Sink
     stop_requested: Callable[[], bool]
+    speed: float
     state: State = State.IDLE
     last: deque[Sample] = field(default_factory=lambda: deque(maxlen=_KEPT_SAMPLES))
 
@@ -129,14 +139,16 @@ class _Run:
                 f"the arm on the bus has the joints {', '.join(described.joint_names)}, "
                 f"the description {', '.join(self.model.chain.names)}"
             )
-        if self.excitation.arm_sha256 != self.model.config.sha256:
+        if self.excitation.arm_sha256 != self.model.config.motion_sha256:
             raise MotionRefused(f"the {self.excitation.name} motion was made for another description of the arm")
-        require_within_limits(self.excitation.series, self.model, limits)
+        require_within_limits(self.excitation.path, self.model, limits)
+        require_stops_within_limits(self.excitation.path, limits, self.model.chain.names)
         dynamics = InverseDynamics(self.model.chain, self.model.layout, self.model.prior)
         period = 1.0 / described.rate
         sample = self._look(limits, period)
         home = sample.position.copy()
         ways = self._ways(home, limits)
+        require_clear(self.model, self.excitation.path, [ways[0], ways[-1]], limits)
         self._guard = Guard(self.model.chain.names, limits, period, home)
         self._control = ComputedTorque(dynamics, limits, period, self.model.config.control.velocity_cutoff, home)
         self._peaks = _Peaks(np.zeros_like(home), np.zeros_like(home))
@@ -182,9 +194,10 @@ class _Run:
         return last
 
     def _ways(self, home: Vector, limits: MotionLimits) -> list[Reference]:
-        exciting = FourierReference(self.excitation)
+        exciting = PathReference(self.excitation.path)
         start, end = exciting.at(0.0), exciting.at(exciting.duration)
-        return [way(rest(home), start, limits), exciting, way(end, rest(home), limits)]
+        ways: list[Reference] = [way(rest(home), start, limits), exciting, way(end, rest(home), limits)]
+        return [Slowed(reference, self.speed) for reference in ways]
 
     def _loop(self, torque: Vector, ways: list[Reference], limits: MotionLimits, period: float) -> Fault | None:
         """Cycle until done, stopped or faulted; the fault that ended the motion, if one did."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from ident_service.errors import ArmError, UsageError
 from ident_service.estimation.equations import equations
 from ident_service.estimation.feasible.feasible_set import SetName
 from ident_service.estimation.identify import Estimate, identify
-from ident_service.excitation.fourier import Excitation
+from ident_service.excitation.excitation import Excitation
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.urdf import urdf_text
@@ -85,6 +85,7 @@ def simulate(
     config: ArmConfig,
     folder: Path,
     *,
+    motion: Excitation | None = None,
     set_name: SetName | None = None,
     clock: Clock | None = None,
     tell: Tell = lambda _: None,
@@ -95,6 +96,7 @@ def simulate(
     Args:
         config: with a simulated driver.
         folder: the run folder; it appears when everything is in it, and must not exist.
+        motion: to identify from, a designed one for example; the description's when None.
         set_name: feasible set, the configuration's when None.
         clock: the loop's, what the driver section asks for when None.
         tell: called with a line at each step.
@@ -111,22 +113,23 @@ def simulate(
     truth = true_parameters(config, model)
     if truth is None:
         raise UsageError(f"{config.name} has no simulated driver; use a description that has one")
-    motions = [excitation(model, "identification"), excitation(model, "validation")]
+    first = excitation(model, "identification") if motion is None else replace(motion, name="identification")
+    motions = [first, excitation(model, "validation")]
     reports, observed = [], list[Truth]()
     with appearing_folder(folder) as staging:
-        paths = [staging / f"{motion.name}.mcap" for motion in motions]
-        for motion, path in zip(motions, paths, strict=True):
-            tell(f"{motion.name} motion: {motion.duration:g} s at {config.control.rate:g} Hz")
+        paths = [staging / f"{planned.name}.mcap" for planned in motions]
+        for planned, path in zip(motions, paths, strict=True):
+            tell(f"{planned.name} motion: {planned.duration:g} s at {config.control.rate:g} Hz")
             observed = []
             arm = make_arm(config, clock)
             if isinstance(arm, SimulatedArm):
                 arm.observer = observed.append
-            report = record_motion(arm, model, motion, path, stop_requested)
+            report = record_motion(arm, model, planned, path, stop_requested)
             if report.state is not State.DONE:
                 # Who asked for a stop does not want to see the arm move again.
-                raise ArmError(f"{motion.name} motion: stopped on request; nothing was kept")
+                raise ArmError(f"{planned.name} motion: stopped on request; nothing was kept")
             reports.append(report)
-            write_atomically(staging / f"{motion.name}.excitation.json", motion.to_json() + "\n")
+            write_atomically(staging / f"{planned.name}.excitation.json", planned.to_json() + "\n")
         tell("identifying")
         recordings = [open_recording(path, model.chain.names) for path in paths]
         estimate = identify(model, recordings[:1], recordings[1:], set_name=set_name)
@@ -149,11 +152,11 @@ def score_document(scored: Score) -> dict[str, object]:
     }
 
 
-def new_run_folder(state: Path, arm: str) -> Path:
-    """A folder name under the state folder that no earlier run has."""
+def new_run_folder(state: Path, arm: str, kind: str = "runs") -> Path:
+    """A folder name under the state folder that no earlier run, or other thing of the `kind`, has."""
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-    folder, count = state / "runs" / f"{stamp}-{arm}", 1
+    folder, count = state / kind / f"{stamp}-{arm}", 1
     while folder.exists():
         count += 1
-        folder = state / "runs" / f"{stamp}-{arm}-{count}"
+        folder = state / kind / f"{stamp}-{arm}-{count}"
     return folder

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from ident_service.config.schema import ArmConfig
 from ident_service.errors import MotionRefused
 from ident_service.excitation.demands import demands, require_within_limits
 from ident_service.excitation.fourier import FourierSeries
+from ident_service.excitation.path import FourierPath
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import ArmModel, arm_model
 
@@ -27,6 +29,18 @@ MOVABLE = ["planar2", "threelink", "wam7", "wam7_sim"]
 def bare_model(joints: int) -> ArmModel:
     """A mechanism of which no parameters are known."""
     return model_around(random_chain(np.random.default_rng(0), joints))
+
+
+def once(series: FourierSeries) -> FourierPath:
+    """One period of a series, without ramps."""
+    return FourierPath(series, 1)
+
+
+def series_of(model: ArmModel, purpose: Any) -> FourierSeries:
+    """Of the motion that an arm's description asks for."""
+    path = excitation(model, purpose).path
+    assert isinstance(path, FourierPath)
+    return path.series
 
 
 def fine_extremes(series: FourierSeries, points: int) -> list[tuple[Array, Array]]:
@@ -43,7 +57,7 @@ def fine_extremes(series: FourierSeries, points: int) -> list[tuple[Array, Array
 
 
 def assert_bounds(series: FourierSeries, points: int) -> None:
-    asked = demands(series, bare_model(series.a.shape[0]))
+    asked = demands(once(series), bare_model(series.a.shape[0]))
     position, *derivatives = fine_extremes(series, points)
     swing = np.maximum(np.abs(position[0] - series.q0), np.abs(position[1] - series.q0))
     rounding = 1e-12 * (1.0 + np.abs(series.q0) + swing)
@@ -88,14 +102,14 @@ def test_torque_is_that_of_the_prior() -> None:
     rng = np.random.default_rng(5)
     bare = bare_model(3)
     series = FourierSeries(0.1, *rng.normal(size=(2, 3, 4)), rng.normal(size=3))
-    assert demands(series, bare).torque is None
+    assert demands(once(series), bare).torque is None
     delta = random_delta(rng, bare.layout)
-    once = demands(series, dataclasses.replace(bare, prior=delta)).torque
-    twice = demands(series, dataclasses.replace(bare, prior=2.0 * delta)).torque
-    assert once is not None
-    assert twice is not None
-    assert (once > 0.0).all()
-    np.testing.assert_allclose(twice, 2.0 * once)
+    single = demands(once(series), dataclasses.replace(bare, prior=delta)).torque
+    double = demands(once(series), dataclasses.replace(bare, prior=2.0 * delta)).torque
+    assert single is not None
+    assert double is not None
+    assert (single > 0.0).all()
+    np.testing.assert_allclose(double, 2.0 * single)
 
 
 def limits_of(model: ArmModel, **changes: Array) -> MotionLimits:
@@ -111,7 +125,7 @@ def test_each_violation_names_joint_and_limit_and_nothing_else(what: str) -> Non
     model = arm_model(load_arm("planar2"))
     series = FourierSeries(0.1, np.full((2, 3), 0.2), np.full((2, 3), 0.1), np.zeros(2))
     tight = {"lower": np.array([-100.0, 0.0]), "upper": np.array([100.0, 0.0])}.get(what, np.array([1e6, 1e-3]))
-    found = demands(series, model).violations(model.chain.names, limits_of(model, **{what: tight}))
+    found = demands(once(series), model).violations(model.chain.names, limits_of(model, **{what: tight}))
     assert len(found) == 1
     assert found[0].startswith(f"elbow: {'position' if what in ('lower', 'upper') else what} ")
 
@@ -120,7 +134,7 @@ def test_all_violations_are_named_in_the_refusal() -> None:
     model = arm_model(load_arm("planar2"))
     series = FourierSeries(0.1, np.full((2, 3), 50.0), np.full((2, 3), 50.0), np.zeros(2))
     with pytest.raises(MotionRefused) as caught:
-        require_within_limits(series, model, motion_limits(model.config))
+        require_within_limits(once(series), model, motion_limits(model.config))
     for joint in ("shoulder", "elbow"):
         for what in ("position", "velocity", "acceleration", "jerk", "torque"):
             assert f"{joint}: {what} " in str(caught.value)
@@ -128,34 +142,34 @@ def test_all_violations_are_named_in_the_refusal() -> None:
 
 @pytest.mark.parametrize("arm", MOVABLE)
 @pytest.mark.parametrize("purpose", ["identification", "validation"])
-def test_shipped_motions_stay_inside_the_limits(arm: str, purpose: str) -> None:
+def test_shipped_motions_stay_inside_the_limits(arm: str, purpose: Any) -> None:
     model = arm_model(load_arm(arm))
-    motion = excitation(model, purpose)  # type: ignore[arg-type]
+    motion = excitation(model, purpose)
     limits = motion_limits(model.config)
-    assert demands(motion.series, model).violations(model.chain.names, limits) == []
-    position, velocity, *_ = motion.series.at(np.linspace(0.0, motion.series.period, 2000))
+    assert demands(motion.path, model).violations(model.chain.names, limits, model.config.supply) == []
+    position, velocity, *_ = motion.path.at(np.linspace(0.0, motion.duration, 2000))
     assert (position >= limits.lower).all()
     assert (position <= limits.upper).all()
     assert (np.abs(velocity) <= limits.velocity).all()
-    assert (motion.name, motion.arm_sha256) == (purpose, model.config.sha256)
+    assert (motion.name, motion.arm_sha256) == (purpose, model.config.motion_sha256)
 
 
 def test_the_two_motions_of_an_arm_differ() -> None:
     for arm in MOVABLE:
         model = arm_model(load_arm(arm))
-        first, second = (excitation(model, purpose).series for purpose in ("identification", "validation"))  # type: ignore[arg-type]
+        first, second = (series_of(model, purpose) for purpose in ("identification", "validation"))
         assert not np.allclose(first.at(1.0)[0], second.at(1.0)[0])
 
 
 def seeded(seed: int, **changes: object) -> ArmConfig:
     """planar2 with another seeded motion."""
-    config = load_arm("planar2").model_dump()
+    config = load_arm("planar2").model_dump(by_alias=True)
     config["motions"]["identification"] |= {"seed": seed} | changes
     return ArmConfig.model_validate(config)
 
 
 def test_seeded_motions_are_the_same_for_the_same_seed() -> None:
-    first, again, other = (excitation(arm_model(seeded(seed)), "identification").series for seed in (11, 11, 12))
+    first, again, other = (series_of(arm_model(seeded(seed)), "identification") for seed in (11, 11, 12))
     for name in ("a", "b", "q0"):
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
     assert not np.allclose(first.a, other.a)
@@ -175,13 +189,13 @@ def test_seeded_motions_use_their_share_of_the_limits(seed: int, harmonics: int,
     middle = 0.5 * (limits.lower + limits.upper)
     roomy = dataclasses.replace(limits, torque=limits.torque * 100)
     try:
-        series = excitation(model, "identification").series
+        series = series_of(model, "identification")
     except MotionRefused as refusal:
         # Little use of the torque is not enough to carry the arm's own weight, and nothing else is refused.
         assert use < 0.32
         assert "gravity alone" in str(refusal)  # noqa: PT017
         return
-    asked = demands(series, model)
+    asked = demands(once(series), model)
     shares = np.array(
         [
             np.maximum(asked.highest - middle, middle - asked.lowest) / (limits.upper - middle),
@@ -197,14 +211,14 @@ def test_seeded_motions_use_their_share_of_the_limits(seed: int, harmonics: int,
 
 
 def test_an_arm_too_weak_for_its_own_weight_is_told_so() -> None:
-    config = load_arm("planar2").model_dump()
+    config = load_arm("planar2").model_dump(by_alias=True)
     config["joints"]["shoulder"]["torque"] = 1.0
     with pytest.raises(MotionRefused, match="gravity alone asks for more than 70%"):
         excitation(arm_model(ArmConfig.model_validate(config)), "identification")
 
 
 def test_a_published_motion_beyond_the_limits_is_refused() -> None:
-    config = load_arm("wam7").model_dump()
+    config = load_arm("wam7").model_dump(by_alias=True)
     config["joints"]["j2"]["velocity"] = 0.5
     with pytest.raises(MotionRefused, match="j2: velocity"):
         excitation(arm_model(ArmConfig.model_validate(config)), "identification")
@@ -227,6 +241,6 @@ def test_missing_limits_are_refused_and_every_gap_is_named(tmp_path: Path) -> No
 
 
 def test_an_arm_without_joint_limits_is_refused() -> None:
-    config = load_arm("planar2").model_dump() | {"joints": {}}
+    config = load_arm("planar2").model_dump(by_alias=True) | {"joints": {}}
     with pytest.raises(MotionRefused, match="limits for every joint"):
         excitation(arm_model(ArmConfig.model_validate(config)), "identification")

@@ -1,4 +1,4 @@
-"""Fourier motions: derivatives, periods, shapes, and the file they are kept in."""
+"""Fourier series: derivatives, periods, shapes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ident_service.errors import ModelError
-from ident_service.excitation.fourier import Excitation, FourierSeries
+from ident_service.excitation.fourier import FourierSeries
 
 Array = np.ndarray
 
@@ -96,18 +96,3 @@ def test_arrays_that_do_not_belong_together_are_refused(
 def test_a_series_cannot_be_changed() -> None:
     with pytest.raises(ValueError, match="read-only"):
         random_series(4).a[0, 0] = 1.0
-
-
-@given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 7), harmonics=st.integers(1, 8))
-def test_the_file_repeats_the_motion_to_the_last_bit(seed: int, joints: int, harmonics: int) -> None:
-    series = random_series(seed, joints, harmonics, frequency=0.1 + 1e-9 * (seed % 1000))
-    content = json.loads(Excitation("identification", series, 4, "ab" * 32).to_json())
-    again = FourierSeries(content["base_frequency"], *(np.array(content[key]) for key in ("a", "b", "q0")))
-    for one, other in zip(series.at(np.linspace(0, 9, 5)), again.at(np.linspace(0, 9, 5)), strict=True):
-        np.testing.assert_array_equal(one, other)
-    assert (content["format"], content["version"], content["periods"]) == ("ident-excitation", 1, 4)
-    assert content["arm"] == {"sha256": "ab" * 32}
-
-
-def test_the_duration_counts_all_periods() -> None:
-    assert Excitation("x", random_series(5, frequency=0.25), 3, "").duration == 12.0

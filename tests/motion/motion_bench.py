@@ -11,7 +11,7 @@ import numpy as np
 from drivers.arm import Arm, ArmDescription, Sample, StopKind
 from ident_service.config.limits import MotionLimits, motion_limits
 from ident_service.config.schema import ArmConfig
-from ident_service.excitation.fourier import Excitation
+from ident_service.excitation.excitation import Excitation
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import ArmModel, arm_model
 from sim_backend.arm import SimulatedArm, Truth, from_config

@@ -1,0 +1,187 @@
+"""Excitation design: what a minute of search reaches, against the published motion, and what the result is worth.
+
+Ten seeds of a minute each and a few shorter searches: about a quarter of an hour. `python -m benchmarks.design`.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.harness import Row, median_seconds, table, write
+from ident_service.config.design import Criterion
+from ident_service.config.limits import motion_limits
+from ident_service.config.load import load_arm
+from ident_service.estimation.identify import identify
+from ident_service.excitation.design import Designed, design_motion, family, settled
+from ident_service.excitation.excitation import Excitation
+from ident_service.excitation.expectation import described_noise, expected_deviations, information
+from ident_service.excitation.path import FourierPath
+from ident_service.excitation.plan import excitation
+from ident_service.excitation.problem import Problem
+from ident_service.excitation.proof import objections
+from ident_service.excitation.search import Budget
+from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.model.base import base_parameters
+from ident_service.model.threads import one_blas_thread
+from ident_service.motion.factory import make_arm
+from ident_service.record.open import open_recording
+from ident_service.record.part import TrimmedRecording
+from ident_service.service.commission import record_motion
+
+_SEEDS = int(os.environ.get("IDENT_BENCH_SEEDS", "10"))
+_SECONDS = float(os.environ.get("IDENT_BENCH_SECONDS", "60"))
+
+
+def measure() -> list[Row]:
+    """All figures."""
+    plain, noisy = arm_model(load_arm("wam7")), arm_model(load_arm("wam7_sim"))
+    return [*_evaluation(plain), *_condition_numbers(plain), *_gain(noisy), *_small_arms()]
+
+
+def _designed(model: ArmModel, criterion: Criterion, seed: int, seconds: float, **changes: object) -> Designed:
+    design = model.config.design.model_copy(update={"criterion": criterion, **changes})
+    return design_motion(model, design, seed=seed, budget=Budget(seconds, None, 2))
+
+
+def _evaluation(model: ArmModel) -> list[Row]:
+    rows = []
+    for criterion in ("condition_number", "d_optimal"):
+        design = model.config.design.model_copy(update={"criterion": criterion, "position_margin": 0.15, "ramp": 0.0})
+        basis, base = family(design, model)
+        problem = Problem(settled(model, design, basis, base), 500)
+        x = 0.3 * np.random.default_rng(0).normal(size=problem.size)
+        multipliers = problem.no_multipliers(1.0)
+        with one_blas_thread():
+            seconds = median_seconds(lambda p=problem, x=x, m=multipliers: p.value_and_gradient(x, 8.0, m), 51, 5)
+        limits = ", ".join(problem.names)
+        rows.append(
+            Row(
+                f"one evaluation at 500 points, WAM, {criterion}, with gradient ({limits})",
+                1e3 * seconds,
+                "ms",
+                "<= 20",
+            )
+        )
+    return rows
+
+
+def _condition_numbers(model: ArmModel) -> list[Row]:
+    base = base_parameters(model.chain, model.layout)
+    published = excitation(model, "identification").path
+    ones = np.ones(model.chain.joints)
+    rows = [Row("condition number, WAM, published motion", _root(information(published, model, base, ones)), "", None)]
+    reached = []
+    for seed in range(_SEEDS):
+        begun = time.monotonic()
+        found = _designed(model, "condition_number", seed, _SECONDS, position_margin=0.15)
+        _require_proven(model, found, 0.15)
+        reached.append(found.condition_number)
+        rows.append(Row(f"condition number, WAM, seed {seed}, all limits proven", found.condition_number, "", None))
+        print(f"seed {seed}: {found.condition_number:.2f} after {time.monotonic() - begun:.1f} s", flush=True)
+    return [
+        *rows,
+        Row("condition number, WAM, median of the seeds", statistics.median(reached), "", None),
+        Row(
+            f"seeds of {_SEEDS} whose condition number is at most 40", sum(k <= 40.0 for k in reached), "", ">= 9 of 10"
+        ),
+    ]
+
+
+def _gain(model: ArmModel) -> list[Row]:
+    base, noise = base_parameters(model.chain, model.layout), described_noise(model, motion_limits(model.config))
+    published = excitation(model, "identification")
+    found = _designed(model, "d_optimal", 0, _SECONDS, position_margin=0.15)
+    _require_proven(model, found, 0.15)
+    ours, theirs = (
+        float(np.linalg.slogdet(information(path, model, base, noise.deviation))[1])
+        for path in (found.excitation.path, published.path)
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        measured = _deviations(model, found.excitation, Path(folder) / "designed.mcap")
+        before = _deviations(model, published, Path(folder) / "published.mcap")
+    expected = [expected_deviations(motion.path, model, base, noise) for motion in (found.excitation, published)]
+    print(f"{'base parameter':<70} {'traj1':>10} {'designed':>10} {'ratio':>7}")
+    for expression, new, old in zip(base.expressions, measured, before, strict=True):
+        print(f"{expression:<70} {old:>10.3g} {new:>10.3g} {new / old:>7.3f}")
+    return [
+        Row(
+            "D-optimality, WAM: exp(gain in log-det / 69) against traj1",
+            float(np.exp((ours - theirs) / base.size)),
+            "",
+            ">= 3",
+        ),
+        Row(
+            "sigma(designed) / sigma(traj1), simulated WAM, 60 s each, geometric mean",
+            _mean_ratio(measured, before),
+            "",
+            "< 0.7",
+        ),
+        Row("the same, as the preview expects it", _mean_ratio(*expected), "", None),
+    ]
+
+
+def _small_arms() -> list[Row]:
+    rows = []
+    for name in ("planar2", "sixaxis"):
+        model = arm_model(load_arm(name))
+        base, noise = base_parameters(model.chain, model.layout), described_noise(model, motion_limits(model.config))
+        given = excitation(model, "identification").path
+        begun = time.monotonic()
+        found = _designed(model, "d_optimal", 0, 15.0)
+        seconds = time.monotonic() - begun
+        gain = [
+            float(np.linalg.slogdet(information(path, model, base, noise.deviation))[1])
+            for path in (found.excitation.path, given)
+        ]
+        rows += [
+            Row(f"design for {name}, whole", seconds, "s", "< 20"),
+            Row(
+                "its exp(gain in log-det / n) against the seeded motion",
+                float(np.exp((gain[0] - gain[1]) / base.size)),
+                "",
+                None,
+            ),
+        ]
+    return rows
+
+
+def _require_proven(model: ArmModel, found: Designed, margin: float) -> None:
+    limits = motion_limits(model.config)
+    if wrong := objections(found.proof, model, limits):
+        raise AssertionError(wrong)
+    asked = found.proof.demands
+    if not ((asked.lowest >= limits.lower + margin).all() and (asked.highest <= limits.upper - margin).all()):
+        raise AssertionError("the margin is not kept")
+
+
+def _deviations(model: ArmModel, motion: Excitation, path: Path) -> np.ndarray:
+    """Standard deviations found from the minute that a motion runs at full size."""
+    report = record_motion(make_arm(model.config), model, motion, path)
+    recording = open_recording(path, model.chain.names)
+    fourier = motion.path
+    if not isinstance(fourier, FourierPath):
+        raise TypeError("a Fourier motion")
+    rate = model.config.control.rate
+    around = report.cycles / rate - fourier.periods * fourier.series.period
+    part = TrimmedRecording(recording, 0.5 * around, 0.5 * around)
+    return identify(model, [part]).standard_deviations
+
+
+def _mean_ratio(ours: np.ndarray, theirs: np.ndarray) -> float:
+    return float(np.exp(np.mean(np.log(ours / theirs))))
+
+
+def _root(G: np.ndarray) -> float:
+    return float(np.sqrt(np.linalg.cond(G)))
+
+
+if __name__ == "__main__":
+    found = measure()
+    print(table(found))
+    print(f"written to {write(found, Path(__file__).parent / 'results', 'design')}")

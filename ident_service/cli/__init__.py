@@ -1,0 +1,94 @@
+"""The command `ident`: parses words, calls the same functions as the Python API, prints, and picks an exit code.
+
+One file per group of verbs: `GROUPS` lists them, each registers its verbs with `add(verbs)` and answers them. Boundary:
+nothing is computed here, and large libraries load only when a verb needs them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from ident_service import __version__
+from ident_service.cli import commission, configs, motions, parameters
+from ident_service.cli.answer import DONE, FAILED, FAULTED, USAGE, VERDICT_NO, Answer, print_answer, print_error
+from ident_service.cli.words import Parser, Verbs, WrongWords, asks_for_json
+from ident_service.errors import ArmFault, ConfigError, IdentError, MotionRefused, UsageError
+
+__all__ = ["DONE", "FAILED", "FAULTED", "USAGE", "VERDICT_NO", "main"]
+
+GROUPS = (commission, motions, parameters, configs)
+_EXIT_CODES: tuple[tuple[type[IdentError], int], ...] = (
+    (ConfigError, USAGE),
+    (UsageError, USAGE),
+    (MotionRefused, VERDICT_NO),
+    (ArmFault, FAULTED),
+    (IdentError, FAILED),
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one verb.
+
+    Args:
+        argv: the words after `ident`; those of the process if None.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        SystemExit: with 0 after help or version, with 2 after words that no verb understands.
+    """
+    words = sys.argv[1:] if argv is None else argv
+    try:
+        arguments = parser().parse_args(words)
+    except WrongWords as wrong:
+        if asks_for_json(words):
+            print_error(UsageError.__name__, wrong.message, USAGE)
+        raise
+    try:
+        _own_packages_only()
+        verb: Callable[[argparse.Namespace], Answer] = arguments.verb
+        code, text, document = verb(arguments)
+    except KeyboardInterrupt:
+        # Asked twice, or by somebody who does not want to wait for what could be saved.
+        sys.stderr.write("ident: interrupted\n")
+        if arguments.json:
+            print_error("Interrupted", "interrupted", FAILED)
+        return FAILED
+    except IdentError as error:
+        code = next(number for kind, number in _EXIT_CODES if isinstance(error, kind))
+        sys.stderr.write(f"ident: {error}\n")
+        if arguments.json:
+            print_error(type(error).__name__, str(error), code)
+        return code
+    print_answer(arguments, code, text, document)
+    return code
+
+
+def parser() -> Parser:
+    """All verbs and their words."""
+    top = Parser(
+        prog="ident",
+        description="Commission a robot arm: excite it, record it, identify parameters a real body could have.",
+    )
+    top.add_argument("--version", action="version", version=f"ident-service {__version__}")
+    verbs = Verbs.of(top)
+    for group in GROUPS:
+        group.add(verbs)
+    return top
+
+
+def _own_packages_only() -> None:
+    """`drivers` and `sim_backend` are common words: refuse to run somebody else's from the working directory."""
+    home = Path(__file__).resolve().parents[2]
+    for name in ("drivers", "sim_backend"):
+        spec = importlib.util.find_spec(name)
+        origin = Path(spec.origin).resolve() if spec and spec.origin else None
+        if origin is None or origin.parent.parent != home:
+            raise UsageError(
+                f"the package {name!r} was found at {origin}, not beside ident_service in {home}; run elsewhere"
+            )

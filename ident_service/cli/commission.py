@@ -1,0 +1,144 @@
+"""Verbs that make parameters: `simulate` the whole job, `identify` recordings.
+
+Boundary: words to requests, results to words; the work is `service/commission.py` and `service/identification.py`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
+from ident_service.cli.words import FEASIBLE_SETS, Verbs, delay, replicates, seed, weight
+
+if TYPE_CHECKING:
+    from ident_service.estimation.identify import Estimate
+
+
+def add(verbs: Verbs) -> None:
+    """Register `simulate` and `identify`."""
+    sub = verbs.add("simulate", _simulate, "the whole job on a simulated arm, scored against the known truth")
+    sub.add_argument("arm", nargs="?", default="wam7_sim", metavar="ARM", help="description with a simulated driver")
+    sub.add_argument("--out", type=Path, help="run folder; must not exist (default: below the state folder)")
+    sub.add_argument("--motion", type=Path, metavar="MOTION", help="motion.json to identify from (default: the arm's)")
+    sub.add_argument("--seed", type=seed, help="seed of the simulated arm's noise (default: the description's)")
+    sub.add_argument("--feasible-set", choices=[*FEASIBLE_SETS, "none"])
+
+    sub = verbs.add("identify", _identify, "recordings to parameters.json, URDF and report")
+    sub.add_argument(
+        "recordings", nargs="+", type=Path, metavar="RECORDING", help="MCAP or CSV; FILE@2:1.5 leaves out 2 s and 1.5 s"
+    )
+    sub.add_argument("--arm", required=True, metavar="ARM", help="description file, or the name of a shipped one")
+    sub.add_argument(
+        "--validate", action="append", default=[], type=Path, metavar="RECORDING", help="judge on this one too"
+    )
+    sub.add_argument("--columns", type=Path, metavar="FILE", help="YAML that says how the recordings are laid out")
+    sub.add_argument("--method", choices=["ols", "wls", "huber", "iv"], help="default: the arm's")
+    sub.add_argument("--prior", choices=["none", "euclidean", "entropic"], help="draw the estimate to the arm's prior")
+    sub.add_argument("--prior-weight", type=weight, metavar="W", help="default: chosen on held-out data")
+    sub.add_argument("--delay", type=delay, metavar="SECONDS", help="of the torque's stamps, or 'estimate'")
+    sub.add_argument(
+        "--bootstrap", type=replicates, default=0, metavar="N", help="replicates of the constrained estimate"
+    )
+    sub.add_argument("--essential", action="store_true", help="also the smallest model that predicts as well")
+    sub.add_argument("--sdpa", action="store_true", help="also the problems in SDPA format, for other solvers")
+    sub.add_argument("--feasible-set", choices=[*FEASIBLE_SETS, "none"], help="default: the arm's; none: unconstrained")
+    sub.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="where results go, files of the same name being replaced (default: a new folder below the state folder)",
+    )
+
+
+def _simulate(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.load import load_arm
+    from ident_service.excitation.excitation import read_excitation
+    from ident_service.results.summary import summary
+    from ident_service.service.commission import new_run_folder, score_document, simulate
+
+    config = load_arm(arguments.arm)
+    if arguments.seed is not None and config.driver is not None:
+        config = config.model_copy(update={"driver": config.driver.model_copy(update={"seed": arguments.seed})})
+    folder = arguments.out or new_run_folder(state_folder(arguments), config.name)
+    stopping = StopOnSignal()
+    with stopping:
+        result = simulate(
+            config,
+            folder,
+            motion=None if arguments.motion is None else read_excitation(arguments.motion),
+            set_name=arguments.feasible_set,
+            tell=lambda line: tell(arguments, line),
+            stop_requested=stopping.requested,
+        )
+    scored, estimate = result.score, result.estimate
+    lines = [
+        "",
+        summary(estimate),
+        "score against the truth, which the estimate never saw",
+        f"  predicted torque against noise-free torque (validation): {scored.noise_free_percent:.3f} %",
+        f"  validation residual over what the true parameters leave: {scored.residual_ratio:.4f}",
+        f"  worst identified parameter: {scored.worst_identified:.2f} deviations off, {scored.worst_expression}",
+        "",
+        f"files: {result.folder}",
+        *(f"  {path.name}" for path in sorted(result.folder.iterdir())),
+        "",
+    ]
+    document = {"folder": str(result.folder), "score": score_document(scored), **_estimate_document(estimate)}
+    return (DONE if estimate.feasible else VERDICT_NO), "\n".join(lines), document
+
+
+def _identify(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.load import load_arm
+    from ident_service.results.summary import summary
+    from ident_service.service.commission import new_run_folder
+    from ident_service.service.identification import Request, identify_files
+
+    request = Request(
+        arm=arguments.arm,
+        recordings=tuple(arguments.recordings),
+        validation=tuple(arguments.validate),
+        columns=arguments.columns,
+        method=arguments.method,
+        set_name=arguments.feasible_set,
+        prior=arguments.prior,
+        prior_weight=arguments.prior_weight,
+        delay=arguments.delay,
+        replicates=arguments.bootstrap,
+        essential=arguments.essential,
+        sdpa=arguments.sdpa,
+    )
+    folder = arguments.out or new_run_folder(state_folder(arguments), load_arm(arguments.arm).name)
+    result = identify_files(request, folder, lambda line: tell(arguments, line))
+    estimate = result.estimate
+    sys.stderr.write("".join(f"ident: {line}\n" for line in result.warnings))
+    text = summary(estimate) + f"\nfiles: {folder}\n" + "".join(f"  {name}\n" for name in result.files)
+    code = DONE if estimate.feasible else VERDICT_NO
+    document = {"folder": str(folder), "files": list(result.files), "warnings": list(result.warnings)}
+    return code, text, document | _estimate_document(estimate)
+
+
+def _estimate_document(estimate: Estimate) -> dict[str, Any]:
+    own = estimate.candidates[estimate.chosen]
+    return {
+        "arm": estimate.model.config.name,
+        "feasible": estimate.feasible,
+        "margin": estimate.margin,
+        "relative_error_percent": own.identification.relative_percent,
+        "validation": [
+            {"recording": score.recording, "relative_error_percent": score.error.relative_percent}
+            for score in own.validation
+        ],
+        "candidates": [
+            {
+                "name": candidate.name,
+                "feasible": candidate.margin > 0.0,
+                "margin": candidate.margin,
+                "relative_error_percent": candidate.identification.relative_percent,
+            }
+            for candidate in estimate.candidates
+        ],
+        "verdicts": {word: estimate.verdicts.count(word) for word in ("identified", "weak", "unidentified")},
+    }

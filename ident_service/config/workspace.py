@@ -1,0 +1,150 @@
+"""What a motion must not touch, and what the supply can give: bodies of the links, obstacles, power.
+
+SI units. Shapes of links are in the link frame, obstacles and the allowed box in the base frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Annotated
+
+from pydantic import ConfigDict, Field, model_validator
+
+from ident_service.config.quantities import Angle, Interval, NonNegative, Positive, Section, Vector3
+
+BASE = "base"  # the name, among the links, of what does not move
+
+
+class Capsule(Section):
+    """All points within `radius` of the line from `from` to `to` [m]; a ball where the two are one point."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, populate_by_name=True)
+
+    start: Vector3 = Field(alias="from")
+    end: Vector3 = Field(alias="to")
+    radius: Positive
+
+
+class SolidBox(Section):
+    """A box by its centre and its edge lengths [m], turned by roll, pitch and yaw about the base's axes [rad]."""
+
+    center: Vector3
+    size: tuple[Positive, Positive, Positive]
+    rpy: tuple[Angle, Angle, Angle] = (0.0, 0.0, 0.0)
+
+
+class HalfSpace(Section):
+    """Everything behind a plane: points x with `normal . x < offset` [m] are solid; the normal points to free space."""
+
+    normal: Vector3
+    offset: float
+
+    @model_validator(mode="after")
+    def _direction(self) -> HalfSpace:
+        if sum(component**2 for component in self.normal) < 1e-12:
+            raise ValueError("a normal of length zero has no direction")
+        return self
+
+
+class Obstacle(Section):
+    """Exactly one solid in the base frame: a table, a wall, a floor."""
+
+    box: SolidBox | None = None
+    half_space: HalfSpace | None = None
+    capsule: Capsule | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Obstacle:
+        if sum(shape is not None for shape in (self.box, self.half_space, self.capsule)) != 1:
+            raise ValueError("give exactly one of box, half_space, capsule")
+        return self
+
+
+class Inside(Section):
+    """The box in the base frame that no part of a moving link may leave [m]."""
+
+    x: Interval | None = None
+    y: Interval | None = None
+    z: Interval | None = None
+
+
+class Workspace(Section):
+    """Where the arm may be.
+
+    Attributes:
+        clearance: smallest distance that must remain between any two things that may not touch [m].
+        obstacles: solids that do not move.
+        inside: the box that the moving links must stay in.
+        may_touch: pairs of links (joint names, or `base`) that are not checked against each other. Links that a joint
+            connects never are.
+    """
+
+    clearance: NonNegative = 0.02
+    obstacles: dict[str, Obstacle] = Field(default_factory=dict)
+    inside: Inside | None = None
+    may_touch: tuple[tuple[str, str], ...] = ()
+
+
+Geometry = dict[str, Annotated[tuple[Capsule, ...], Field(min_length=1)]]
+
+
+class Supply(Section):
+    """What feeds the drives.
+
+    Drive k draws `torque velocity + loss torque^2`, never less than nothing: what a braking drive feeds back is not
+    counted on.
+
+    Attributes:
+        power: the most that all drives together may draw [W].
+        voltage: of the supply [V].
+        current: the most that it can give [A].
+        loss: heat in the windings per torque squared [W/(N m)^2], per joint or one number for all.
+        standby: what is drawn without any torque [W].
+    """
+
+    power: Positive | None = None
+    voltage: Positive | None = None
+    current: Positive | None = None
+    loss: NonNegative | tuple[NonNegative, ...] = 0.0
+    standby: NonNegative = 0.0
+
+    @model_validator(mode="after")
+    def _complete(self) -> Supply:
+        if self.current is not None and self.voltage is None:
+            raise ValueError("a limit of the current needs the voltage")
+        if self.power is None and self.current is None:
+            raise ValueError("give power, or voltage and current")
+        return self
+
+    @property
+    def budget(self) -> float:
+        """The smaller of both limits [W]."""
+        from_current = float("inf") if self.current is None or self.voltage is None else self.current * self.voltage
+        return min(self.power or float("inf"), from_current)
+
+
+def disagreements(
+    geometry: Geometry, workspace: Workspace, supply: Supply | None, joints: Sequence[str]
+) -> Iterator[tuple[tuple[str | int, ...], str]]:
+    """What does not fit an arm of these joints: the place in the arm's file, and what is wrong.
+
+    Args:
+        geometry: the section `geometry`.
+        workspace: the section `workspace`.
+        supply: the section `supply`.
+        joints: names of the arm's joints; none where the file does not name them.
+    """
+    if not joints:
+        return
+    for name in geometry:
+        if name not in (*joints, BASE):
+            yield ("geometry", name), f"geometry: no joint {name!r}, and not {BASE!r}"
+    for number, pair in enumerate(workspace.may_touch):
+        for side, name in enumerate(pair):
+            if name not in (*joints, BASE):
+                yield (
+                    ("workspace", "may_touch", number, side),
+                    f"workspace.may_touch: no joint {name!r}, and not {BASE!r}",
+                )
+    if supply is not None and isinstance(supply.loss, tuple) and len(supply.loss) != len(joints):
+        yield ("supply", "loss"), f"supply.loss: {len(supply.loss)} values for {len(joints)} joints"

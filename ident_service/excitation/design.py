@@ -1,0 +1,270 @@
+"""From an arm to the most informative motion that it can safely make, with the proof that it can.
+
+Everything a search needs is settled here, contradictions refused with their reason before it begins; what it finds is
+then proven for all time, made smaller where the proof needs it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ident_service.config.design import Criterion, Design
+from ident_service.config.limits import MotionLimits, motion_limits
+from ident_service.errors import MotionRefused, UsageError
+from ident_service.excitation.basis import Basis, FourierBasis, PostureBasis
+from ident_service.excitation.criteria import condition_number, criterion
+from ident_service.excitation.excitation import Excitation
+from ident_service.excitation.expectation import described_noise, information, seconds_of_information
+from ident_service.excitation.following import expected_friction
+from ident_service.excitation.path import FourierPath, PosturePath
+from ident_service.excitation.postures import safe_posture
+from ident_service.excitation.proof import Proof, largest_proven, objections, proof_of
+from ident_service.excitation.search import Budget, Found, Progress, search
+from ident_service.excitation.task import Task, usable_limits
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.base import BaseParameters, base_parameters, static_base_parameters
+from ident_service.model.chain import Array
+from ident_service.model.collision import CollisionModel
+
+_PER_HARMONIC = 50  # samples of a search per period of its highest harmonic
+_PER_WAY = 24  # samples of a search per way between postures
+_MOST_SAMPLES = 2000
+
+
+@dataclass(frozen=True)
+class Designed:
+    """A motion, what is proven of it, and the search that it came from.
+
+    Attributes:
+        excitation: the motion, ready to be written.
+        proof: bounds that hold at every instant.
+        condition_number: of the stacked regressor over one pass, as in the paper.
+        found: of the search, to go on from.
+    """
+
+    excitation: Excitation
+    proof: Proof
+    condition_number: float
+    found: Found
+
+
+def family(design: Design, model: ArmModel) -> tuple[Basis, BaseParameters]:
+    """The family of motions that a design asks for, and the parameters that it can teach."""
+    if design.motion == "fourier":
+        basis = FourierBasis(design.base_frequency, design.harmonics, design.periods, design.ramp)
+        return basis, base_parameters(model.chain, model.layout)
+    ways = design.postures - 1
+    times = (design.way,) * ways + (2.0 * design.way,) * ways
+    return PostureBasis(design.postures, times, design.dwell), static_base_parameters(model.chain, model.layout)
+
+
+def settled(
+    model: ArmModel,
+    design: Design,
+    basis: Basis,
+    base: BaseParameters,
+    noise: Array | None = None,
+    added: Array | None = None,
+) -> Task:
+    """The task of a search.
+
+    Args:
+        model: of the arm.
+        design: criterion and margins.
+        basis: family of motions.
+        base: the parameters that the motion shall teach.
+        noise: standard deviation of each joint's torque, shape (joints,); the description's when None.
+        added: information from earlier recordings, plain rows for the condition number and else whitened by `noise`.
+
+    Raises:
+        MotionRefused: limits are missing or contradict each other.
+        UsageError: `design.parameters` names what is no base parameter.
+    """
+    full = motion_limits(model.config)
+    limits = usable_limits(model.chain.names, full, design)
+    _require_torque(model, limits)
+    if unknown := [name for name in design.parameters if name not in base.expressions]:
+        raise UsageError(
+            f"{', '.join(unknown)}: not among the base parameters of {model.config.name}; `ident base` prints them"
+        )
+    chosen = np.array([base.expressions.index(name) for name in design.parameters], dtype=np.intp)
+    plain = design.criterion == "condition_number"
+    own_noise = described_noise(model, full).deviation if noise is None else noise
+    return Task(
+        model=model,
+        columns=base.base,
+        basis=basis,
+        limits=limits,
+        criterion=design.criterion,
+        chosen=chosen if len(chosen) else None,
+        scale=_scale(model, base, design.criterion),
+        noise=np.ones_like(own_noise) if plain else own_noise,
+        friction=expected_friction(model, full, design.friction_guess),
+        rate=model.config.control.rate,
+        added=added,
+    )
+
+
+def _require_torque(model: ArmModel, limits: MotionLimits) -> None:
+    if model.prior is None:
+        raise MotionRefused(
+            f"{model.config.name}: torque cannot be predicted without prior (CAD) parameters; give them under prior"
+        )
+    dry = np.abs(model.layout.term_values("coulomb", model.prior)) + np.abs(
+        model.layout.term_values("stribeck", model.prior)
+    )
+    needed = dry @ np.abs(model.chain.coupling)
+    if weak := [
+        f"{name}: friction {f:g} against {limit:g}"
+        for name, f, limit in zip(model.chain.names, needed, limits.torque, strict=True)
+        if f >= limit
+    ]:
+        raise MotionRefused("dry friction alone takes all the torque that the margin leaves: " + "; ".join(weak))
+    supply = model.config.supply
+    if supply is not None and supply.standby >= supply.budget:
+        raise MotionRefused(
+            f"{model.config.name}: the supply's standby {supply.standby:g} W leaves nothing of {supply.budget:g} W"
+        )
+
+
+def _scale(model: ArmModel, base: BaseParameters, kind: Criterion) -> Array | None:
+    """What deviations are measured in: the prior's values, at least a hundredth of the largest of the unit."""
+    if kind != "a_optimal" or model.prior is None:
+        return None
+    values = np.abs(base.K @ model.prior)
+    units = np.array(base.units)
+    least = np.array([values[units == unit].max() for unit in units])
+    overall = np.where(least > 0.0, 0.01 * least, 0.1)
+    return np.asarray(np.maximum(values, overall))
+
+
+def design_motion(
+    model: ArmModel,
+    design: Design,
+    *,
+    seed: int = 0,
+    budget: Budget | None = None,
+    basis: Basis | None = None,
+    base: BaseParameters | None = None,
+    noise: Array | None = None,
+    added: Array | None = None,
+    earlier: Found | None = None,
+    tell: Callable[[Progress], None] = lambda _: None,
+    cancelled: Callable[[], bool] = lambda: False,
+) -> Designed:
+    """The most informative motion that a search within a budget finds, proven to keep every limit.
+
+    Args:
+        model: of the arm, with prior parameters.
+        design: criterion, margins and, unless `basis` is given, the family of motions.
+        seed: of the random starts.
+        budget: of the search; a minute on two cores when None.
+        basis: another family of motions.
+        base: the parameters that the motion shall teach; all that the family can when None.
+        noise: standard deviation of each joint's torque, shape (joints,); from the description when None.
+        added: information from earlier recordings (`settled`).
+        earlier: of a search for the same task, to go on from.
+        tell: called from time to time.
+        cancelled: asked from time to time; True ends the search with what it has.
+
+    Raises:
+        MotionRefused: limits are missing or contradict each other, home is in collision, or no posture keeps them.
+        UsageError: parameters that are none.
+    """
+    asked = family(design, model)
+    basis, base = asked[0] if basis is None else basis, asked[1] if base is None else base
+    task = settled(model, design, basis, base, noise, added)
+    collision = CollisionModel(model)
+    _require_free_home(model, task.limits, collision)
+    safe = safe_posture(model, task.limits, seed)
+    found = search(task, safe, seed, budget or Budget(), per_period(basis), tell, cancelled, earlier)
+
+    def proven(coefficients: Array) -> Proof | None:
+        proof = proof_of(basis.path(coefficients), model, task.limits, collision)
+        return None if objections(proof, model, task.limits) else proof
+
+    best: tuple[float, Array, Proof] | None = None
+    for candidate in found.candidates:
+        if best is not None and candidate.value >= best[0]:
+            break  # even without the loss that a proof may cost it is no better
+        result = largest_proven(basis, candidate.coefficients, basis.standing(safe), proven)
+        if result is not None:
+            value = criterion_of(task, basis.path(result[0]), base)
+            if best is None or value < best[0]:
+                best = (value, *result)
+    if best is None:
+        still = basis.standing(safe)
+        proof = proof_of(basis.path(still), model, task.limits, collision)
+        raise MotionRefused(
+            "not even standing still keeps the limits: " + "; ".join(objections(proof, model, task.limits))
+        )
+    value, coefficients, proof = best
+    path = basis.path(coefficients)
+    kappa = condition_number(information(path, model, base, np.ones(model.chain.joints)))
+    excitation = Excitation(
+        "designed", path, model.config.motion_sha256, _made(model, design, seed, found, kappa, value, proof)
+    )
+    return Designed(excitation, proof, kappa, found)
+
+
+def per_period(basis: Basis) -> int:
+    """How many samples a search looks at."""
+    if isinstance(basis, FourierBasis):
+        return min(_MOST_SAMPLES, max(120, _PER_HARMONIC * basis.harmonics))
+    return min(_MOST_SAMPLES, max(120, _PER_WAY * 2 * basis.size))
+
+
+def criterion_of(task: Task, path: FourierPath | PosturePath, base: BaseParameters) -> float:
+    """The criterion of a motion over its whole length, with the information that was there before."""
+    G = information(path, task.model, base, task.noise) * seconds_of_information(path) * task.rate
+    if task.added is not None:
+        G = G + task.added
+    return criterion(task.criterion, G, 64.0, task.chosen, task.scale).value
+
+
+def _require_free_home(model: ArmModel, limits: MotionLimits, collision: CollisionModel) -> None:
+    if not collision.pairs:
+        return
+    distances = collision.distances(limits.home[None])[0]
+    nearest = int(distances.argmin())
+    least = model.config.workspace.clearance
+    if distances[nearest] < least:
+        what = "in collision" if distances[nearest] < 0.0 else f"nearer than the clearance of {least:g} m"
+        raise MotionRefused(
+            f"{model.config.name}: home, where motions begin, is {what}: {distances[nearest]:.3f} m at "
+            f"{collision.pairs[nearest]}; give another home, or mend geometry and workspace"
+        )
+
+
+def _made(
+    model: ArmModel, design: Design, seed: int, found: Found, kappa: float, value: float, proof: Proof
+) -> dict[str, object]:
+    """How the motion was found and what was proven of it, as JSON values."""
+    asked = proof.demands
+    bounds: dict[str, object] = {
+        "position": np.column_stack([asked.lowest, asked.highest]).tolist(),
+        **{kind: getattr(asked, kind).tolist() for kind in ("velocity", "acceleration", "jerk")},
+    }
+    if asked.torque is not None:
+        bounds["torque"] = asked.torque.tolist()
+    if asked.power is not None:
+        bounds["power"] = asked.power
+    for name, clearance in (("clearance", proof.clearance), ("approach_clearance", proof.approach)):
+        if clearance is not None and clearance.pair is not None:
+            bounds[name] = clearance.lower_bound
+    return {
+        "arm": model.config.name,
+        "criterion": design.criterion,
+        "criterion_value": value,
+        "condition_number": kappa if np.isfinite(kappa) else None,
+        "seed": seed,
+        "starts": found.finished,
+        "position_margin": np.asarray(design.position_margin).tolist(),
+        "torque_margin": design.torque_margin,
+        "bounds": bounds,
+        "bounds_hold": "at every instant: enclosures of the motion and of the model's torque between samples",
+        "slack": {name: np.max(values).item() for name, values in asked.slack.items()},
+    }

@@ -1,0 +1,156 @@
+"""A motion ready to run, the arm it was made for, and the one small JSON file that it is kept in."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+
+from ident_service.errors import ModelError, UsageError
+from ident_service.excitation.fourier import FourierSeries
+from ident_service.excitation.path import FourierPath, PosturePath
+from ident_service.model.chain import Array
+
+FORMAT, VERSION = "ident-excitation", 1
+_MOST_BYTES = 4 * 2**20
+_MOST_DURATION = 24 * 3600.0
+_MOST_PERIODS = 10**9
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """A motion ready to run, and the arm it was made for.
+
+    Attributes:
+        name: what the motion is for.
+        path: the motion.
+        arm_sha256: `motion_sha256` of the arm description.
+        made: how it was found and what was proven of it, for people and for the record; JSON values.
+    """
+
+    name: str
+    path: FourierPath | PosturePath
+    arm_sha256: str
+    made: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def duration(self) -> float:
+        """Length of the whole motion [s]."""
+        return self.path.duration
+
+    def to_json(self) -> str:
+        """One small JSON object from which the motion can be repeated to the last bit."""
+        head = {"format": FORMAT, "version": VERSION, "name": self.name, "arm": {"sha256": self.arm_sha256}}
+        path = self.path
+        if isinstance(path, FourierPath):
+            body: dict[str, Any] = {
+                "kind": "fourier",
+                "base_frequency": path.series.base_frequency,
+                "periods": path.periods,
+                "ramp": path.ramp,
+                "a": path.series.a.tolist(),
+                "b": path.series.b.tolist(),
+                "q0": path.series.q0.tolist(),
+            }
+        else:
+            body = {
+                "kind": "postures",
+                "points": path.points.tolist(),
+                "times": path.times.tolist(),
+                "dwell": path.dwell,
+            }
+        made = {"made": dict(self.made)} if self.made else {}
+        return json.dumps(head | body | made, indent=1, allow_nan=False)
+
+
+def read_excitation(file: FilePath) -> Excitation:
+    """Read a motion's JSON file.
+
+    Raises:
+        UsageError: no such file, or not a motion; the message says what is wrong with it.
+    """
+    try:
+        if file.stat().st_size > _MOST_BYTES:
+            raise UsageError(f"{file}: larger than {_MOST_BYTES} bytes; a motion is one small JSON file")
+        text = file.read_text(encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"{file}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise UsageError(f"{file}: not UTF-8 text, so not a motion") from None
+    try:
+        return excitation_from_json(text)
+    except UsageError as error:
+        raise UsageError(f"{file}: {error}") from None
+
+
+def excitation_from_json(text: str) -> Excitation:
+    """The inverse of `Excitation.to_json`.
+
+    Raises:
+        UsageError: not a motion; the message says what is wrong with it.
+    """
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise UsageError(f"not JSON: {error}") from None
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise UsageError(f"not a motion; expected a JSON object whose format is {FORMAT!r}")
+    if content.get("version") != VERSION:
+        raise UsageError(f"version {content.get('version')!r} of the format; this software reads version {VERSION}")
+    try:
+        path: FourierPath | PosturePath
+        if content["kind"] == "fourier":
+            series = FourierSeries(
+                _number(content, "base_frequency"),
+                _array(content, "a", 2),
+                _array(content, "b", 2),
+                _array(content, "q0", 1),
+            )
+            if not series.base_frequency > 0.0:
+                raise UsageError("base_frequency must be above zero")
+            periods = content["periods"]
+            if not isinstance(periods, int) or isinstance(periods, bool) or periods > _MOST_PERIODS:
+                raise UsageError(f"periods must be a whole number, and no more than {_MOST_PERIODS}")
+            path = FourierPath(series, periods, _number(content, "ramp"))
+        elif content["kind"] == "postures":
+            path = PosturePath(_array(content, "points", 2), _array(content, "times", 1), _number(content, "dwell"))
+        else:
+            raise UsageError(f"kind {content['kind']!r} is none of fourier, postures")
+        name, sha256, made = content["name"], content["arm"]["sha256"], content.get("made", {})
+    except KeyError as error:
+        raise UsageError(f"{error.args[0]!r} is missing") from None
+    except ModelError as error:
+        raise UsageError(str(error)) from None
+    except TypeError:
+        raise UsageError("'arm' must be an object with the arm's sha256") from None
+    if not (isinstance(name, str) and isinstance(sha256, str) and isinstance(made, dict)):
+        raise UsageError("name and arm.sha256 must be text, made an object")
+    if not path.duration <= _MOST_DURATION:
+        raise UsageError(f"a motion of {path.duration:g} s; the longest is {_MOST_DURATION:g} s")
+    return Excitation(name, path, sha256, made)
+
+
+def _number(content: dict[str, Any], key: str) -> float:
+    value = content[key]
+    most = sys.float_info.max
+    if isinstance(value, bool) or not isinstance(value, int | float) or not -most <= value <= most:
+        raise UsageError(f"{key} must be a finite number")
+    return float(value)
+
+
+def _array(content: dict[str, Any], key: str, dimensions: int) -> Array:
+    try:
+        given = np.array(content[key])
+        if given.dtype.kind in "US":
+            raise ValueError("text that numpy would read as numbers")
+        array = given.astype(float)
+    except (TypeError, ValueError, OverflowError):
+        raise UsageError(f"{key} must be {'rows of numbers' if dimensions == 2 else 'numbers'}") from None
+    if array.ndim != dimensions or not array.size or not np.isfinite(array).all():
+        raise UsageError(f"{key} must be {'rows' if dimensions == 2 else 'a list'} of finite numbers, none left out")
+    return array

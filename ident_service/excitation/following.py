@@ -1,0 +1,93 @@
+"""How far the arm will fall behind: friction that the control law does not know against how stiffly it holds.
+
+Computed torque (eq. 76) answers an unknown torque d with the error `e = K_p^-1 M(q)^-1 d`, once it has settled. Where
+little inertia stands behind a joint, as behind the upper arm's rotation when the elbow is straight, little friction
+moves it far. Static, so a forecast and no bound; the guard keeps the limit itself.
+
+Boundary: forecasts; friction is the prior's where it has some, else a guess from the torque limits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ident_service.config.limits import MotionLimits
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.chain import Array
+from ident_service.model.inertia_response import InertiaResponse
+
+USABLE = 0.8  # of the limit: settling overshoots a little, and the forecast is static
+
+
+@dataclass(frozen=True)
+class ExpectedFriction:
+    """Friction of the drives.
+
+    Attributes:
+        coulomb: [N m or N], shape (joints,).
+        viscous: [N m s/rad or N s/m], shape (joints,).
+    """
+
+    coulomb: Array
+    viscous: Array
+
+
+def expected_friction(model: ArmModel, limits: MotionLimits, guess: tuple[float, float]) -> ExpectedFriction:
+    """The prior's friction, or, of drives of which it has none, the guess.
+
+    Args:
+        model: of the arm.
+        limits: its full limits.
+        guess: Coulomb friction, and viscous friction at the velocity limit, in shares of the torque limit.
+    """
+    coulomb, viscous = guess[0] * limits.torque, guess[1] * limits.torque / limits.velocity
+    if model.prior is None:
+        return ExpectedFriction(coulomb, viscous)
+    known = [model.layout.term_values(term, model.prior) for term in ("coulomb", "viscous")]
+    some = (known[0] > 0.0) | (known[1] > 0.0)
+    return ExpectedFriction(np.where(some, known[0], coulomb), np.where(some, known[1], viscous))
+
+
+class FollowingError:
+    """The forecast at many states, with derivatives of whatever is computed from it."""
+
+    def __init__(self, model: ArmModel, limits: MotionLimits, friction: ExpectedFriction, creep: Array) -> None:
+        """Take the prior model.
+
+        Args:
+            model: with prior parameters.
+            limits: for the gains.
+            friction: of the drives.
+            creep: velocity over which a joint's Coulomb friction turns round [rad/s or m/s], shape (joints,).
+
+        Raises:
+            ModelError: no prior, or one that no real body has.
+        """
+        prior = np.zeros(model.layout.size) if model.prior is None else model.prior
+        self._response = InertiaResponse(model.chain, model.layout, prior)
+        self._coupling, self._kp = model.chain.coupling, limits.kp
+        self._friction, self._creep = friction, creep
+        self._slope = np.zeros((0, len(creep)))
+
+    def run(self, position: Array, velocity: Array) -> Array:
+        """Forecast error [rad or m], shape (samples, joints), at states of shape (samples, joints)."""
+        rate = velocity @ self._coupling.T
+        turned = np.tanh(rate / self._creep)
+        self._slope = self._friction.viscous + self._friction.coulomb * (1.0 - turned**2) / self._creep
+        torque = (self._friction.coulomb * turned + self._friction.viscous * rate) @ self._coupling
+        return self._response.run(position, torque) / self._kp
+
+    def pull(self, seeds: Array) -> tuple[Array, Array]:
+        """The gradient of `sum(seeds * run(...))` over position and velocity, each of shape (samples, joints)."""
+        by_position, by_torque = self._response.pull(seeds / self._kp)
+        return by_position, ((by_torque @ self._coupling.T) * self._slope) @ self._coupling
+
+
+def forecast(
+    model: ArmModel, limits: MotionLimits, friction: ExpectedFriction, position: Array, velocity: Array
+) -> Array:
+    """The largest forecast error of every joint over samples of a motion [rad or m], shape (joints,)."""
+    sharp = np.full(len(limits.kp), 1e-6)
+    return np.asarray(np.abs(FollowingError(model, limits, friction, sharp).run(position, velocity)).max(axis=0))

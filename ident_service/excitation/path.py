@@ -1,0 +1,241 @@
+"""Motions of all joints as functions of time: a Fourier series in a smooth window, or ways between postures.
+
+Every path bounds its fifth derivative, so that what holds at single times can be extended to all times
+(`enclosure.py`). Boundary: pure functions of time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import comb
+from typing import Protocol
+
+import numpy as np
+
+from ident_service.errors import ModelError
+from ident_service.excitation.fourier import FourierSeries
+from ident_service.model.chain import Array
+
+# The smooth step 35 s^4 - 84 s^5 + 70 s^6 - 20 s^7: three derivatives vanish at both ends. The peaks are those of the
+# step and of its first five derivatives on [0, 1].
+_STEP = np.polynomial.Polynomial([0.0, 0.0, 0.0, 0.0, 35.0, -84.0, 70.0, -20.0])
+_STEP_DERIVATIVES = (_STEP, *(_STEP.deriv(order) for order in (1, 2, 3, 4)))
+STEP_PEAKS = (1.0, 35.0 / 16.0, 84.0 / 5.0**0.5 / 5.0, 52.5, 840.0, 10080.0)
+
+
+class Path(Protocol):
+    """A motion of all joints."""
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+
+    @property
+    def duration(self) -> float:
+        """Length [s]."""
+
+    @property
+    def distinct(self) -> tuple[tuple[float, float], ...]:
+        """Stretches of time [s] in which everything happens that ever happens; the others repeat them."""
+
+    @property
+    def crackle(self) -> Array:
+        """Bound of the fifth derivative, but where the fourth may jump [rad/s^5 or m/s^5], shape (joints,)."""
+
+    @property
+    def seams(self) -> Array:
+        """Times between which all derivatives are smooth [s], from 0 to the duration, increasing."""
+
+    @property
+    def fastest(self) -> float:
+        """The highest frequency that matters in the motion [Hz]."""
+
+    def derivatives(self, time: Array, highest: int) -> list[Array]:
+        """Position and its time derivatives up to the order `highest` <= 4, each of shape (samples, joints)."""
+
+    def at(self, time: Array | float) -> tuple[Array, Array, Array, Array]:
+        """Position, velocity, acceleration and jerk at `time` [s], shape (samples, joints) or (joints,)."""
+
+
+@dataclass(frozen=True)
+class FourierPath:
+    """A Fourier series that swells from rest about its middle, repeats, and dies down to rest.
+
+        q(t) = q0 + w(t) s(t - ramp)
+
+    with w the smooth step over `ramp` at both ends and 1 between, where whole periods of the series s are played.
+
+    Attributes:
+        series: the periodic motion.
+        periods: how often it repeats at full size.
+        ramp: length of the swelling and of the dying down [s]; 0 for a motion that begins and ends moving.
+    """
+
+    series: FourierSeries
+    periods: int
+    ramp: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.periods < 1 or not 0.0 <= self.ramp < float("inf"):
+            raise ModelError(f"{self.periods=} and {self.ramp=} are no motion")
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        return len(self.series.q0)
+
+    @property
+    def duration(self) -> float:
+        """Length of the whole motion [s]."""
+        return self.periods * self.series.period + 2.0 * self.ramp
+
+    @property
+    def distinct(self) -> tuple[tuple[float, float], ...]:
+        """Both ramps and one period."""
+        full = (self.ramp, self.ramp + self.series.period)
+        if self.ramp == 0.0:
+            return (full,)
+        return ((0.0, self.ramp), full, (self.duration - self.ramp, self.duration))
+
+    @property
+    def crackle(self) -> Array:
+        """Leibniz' rule on the window and the sum of the harmonics' sizes, shape (joints,)."""
+        rates = 2.0 * np.pi * self.series.base_frequency * np.arange(1, self.series.a.shape[1] + 1)
+        sizes = np.hypot(self.series.a, self.series.b) / rates
+        swing = [(sizes * rates**order).sum(axis=1) for order in range(6)]
+        if self.ramp == 0.0:
+            return np.asarray(swing[5])
+        window = [peak / self.ramp**order for order, peak in enumerate(STEP_PEAKS)]
+        return np.asarray(sum(comb(5, k) * window[k] * swing[5 - k] for k in range(6)))
+
+    @property
+    def seams(self) -> Array:
+        """The ends of the ramps [s]."""
+        ends = [0.0, self.ramp, self.duration - self.ramp, self.duration]
+        return np.array(sorted(set(ends)))
+
+    @property
+    def fastest(self) -> float:
+        """Of the highest harmonic, or of the ramp [Hz]."""
+        highest = self.series.base_frequency * self.series.a.shape[1]
+        return float(max(highest, 1.0 / self.ramp) if self.ramp else highest)
+
+    def at(self, time: Array | float) -> tuple[Array, Array, Array, Array]:
+        """Position, velocity, acceleration and jerk.
+
+        Args:
+            time: [s] since the beginning of the first ramp, shape (samples,) or a single number; before and after the
+                motion it stands where it begins and ends.
+
+        Returns:
+            Four arrays in SI units, shape (samples, joints), or (joints,) for a single time.
+        """
+        position, velocity, acceleration, jerk = self.derivatives(np.asarray(time, dtype=float), 3)
+        return position, velocity, acceleration, jerk
+
+    def derivatives(self, time: Array, highest: int) -> list[Array]:
+        """Position and its time derivatives up to the order `highest`."""
+        swing = self.series.derivatives(time - self.ramp, highest)
+        if self.ramp == 0.0:
+            return swing
+        swing[0] = swing[0] - self.series.q0
+        window = self._window(time, highest)
+        values = [
+            np.asarray(sum(comb(order, k) * window[k][..., None] * swing[order - k] for k in range(order + 1)))
+            for order in range(highest + 1)
+        ]
+        values[0] = values[0] + self.series.q0
+        return values
+
+    def _window(self, t: Array, highest: int) -> list[Array]:
+        """The window and its derivatives."""
+        rising, falling = t / self.ramp, (self.duration - t) / self.ramp
+        nearer = np.minimum(rising, falling)
+        inside = (nearer > 0.0) & (nearer < 1.0)
+        nearer = np.clip(nearer, 0.0, 1.0)
+        rate = np.where(rising <= falling, 1.0, -1.0) / self.ramp
+        # Only the fourth derivative does not vanish at the ends; outside the ramps it is zero all the same.
+        return [
+            np.asarray(_STEP_DERIVATIVES[order](nearer) * (rate**order * (inside if order else 1.0)))
+            for order in range(highest + 1)
+        ]
+
+
+@dataclass(frozen=True)
+class PosturePath:
+    """Straight ways in joint space from posture to posture, at rest at each.
+
+    Attributes:
+        points: postures in the order they are visited [rad or m], shape (postures, joints).
+        times: how long each way takes [s], shape (postures - 1,).
+        dwell: how long the arm stands at each posture [s].
+    """
+
+    points: Array
+    times: Array
+    dwell: float
+    _begins: Array = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        ways = max(len(self.points) - 1, 0)
+        if self.points.ndim != 2 or not ways or self.times.shape != (ways,) or not (self.times > 0.0).all():
+            raise ModelError(f"{self.points.shape=} and {self.times.shape=} do not belong to one motion")
+        if not 0.0 <= self.dwell < float("inf"):
+            raise ModelError(f"{self.dwell=} is no time")
+        begins = self.dwell + np.concatenate([[0.0], np.cumsum(self.times + self.dwell)])
+        object.__setattr__(self, "_begins", begins)
+        for array in (self.points, self.times, begins):
+            array.setflags(write=False)
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        return int(self.points.shape[1])
+
+    @property
+    def duration(self) -> float:
+        """Length of the whole motion [s]."""
+        return float(self._begins[-1])
+
+    @property
+    def distinct(self) -> tuple[tuple[float, float], ...]:
+        """All of it."""
+        return ((0.0, self.duration),)
+
+    @property
+    def crackle(self) -> Array:
+        """Of the steepest way, shape (joints,)."""
+        ways = np.abs(np.diff(self.points, axis=0))
+        return np.asarray((ways * STEP_PEAKS[5] / self.times[:, None] ** 5).max(axis=0))
+
+    @property
+    def seams(self) -> Array:
+        """Where ways begin and end [s]."""
+        return np.unique(np.concatenate([[0.0], self._begins[:-1], self._begins[:-1] + self.times, [self.duration]]))
+
+    @property
+    def fastest(self) -> float:
+        """Of the shortest way [Hz]."""
+        return float(1.0 / self.times.min())
+
+    def at(self, time: Array | float) -> tuple[Array, Array, Array, Array]:
+        """As `FourierPath.at`."""
+        position, velocity, acceleration, jerk = self.derivatives(np.asarray(time, dtype=float), 3)
+        return position, velocity, acceleration, jerk
+
+    def derivatives(self, time: Array, highest: int) -> list[Array]:
+        """Position and its time derivatives up to the order `highest`."""
+        way = np.clip(np.searchsorted(self._begins, time, side="right") - 1, 0, len(self.times) - 1)
+        length = self.times[way]
+        share = (time - self._begins[way]) / length
+        inside = (share > 0.0) & (share < 1.0)
+        share = np.clip(share, 0.0, 1.0)
+        whole = self.points[way + 1] - self.points[way]
+        values = [
+            np.asarray(
+                (_STEP_DERIVATIVES[order](share) / length**order * (inside if order else 1.0))[..., None] * whole
+            )
+            for order in range(highest + 1)
+        ]
+        values[0] = values[0] + self.points[way]
+        return values

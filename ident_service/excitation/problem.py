@@ -1,0 +1,250 @@
+"""A search's objective and limits at the samples of a time grid, with their derivatives.
+
+Variables are the coefficients of the basis, scaled to about one. Every limit is a number that must not be positive, in
+shares of the limit. They enter the objective as an augmented Lagrangian (Hestenes 1969, Powell 1969),
+
+    f(x) + 1/2 sum (max(0, rho c(x) + lambda)^2 - lambda^2) / rho
+
+so that one sweep forwards and one backwards through the regressor give value and gradient, whatever the number of
+limits. What holds between the samples is proven afterwards (`demands.py`, `clearance.py`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ident_service.excitation.basis import maps
+from ident_service.excitation.criteria import Value, criterion
+from ident_service.excitation.following import USABLE, FollowingError
+from ident_service.excitation.task import Task
+from ident_service.model.base import base_parameters
+from ident_service.model.capsules import CapsuleModel
+from ident_service.model.chain import Array
+from ident_service.model.regressor_gradient import RegressorGradient
+
+_RESERVE = 0.004  # of every limit, for what happens between two samples
+_CREEP = 0.05  # of the velocity limit: friction's direction turns round over so much, which gives it a gradient
+_DEPTH = 0.05  # m; a clearance missed by so much counts like another limit missed altogether
+_BETWEEN = 0.02  # m, the most that is kept free for what happens between two samples; the proof mends the rest
+_LINE = 25  # points on the way from home to where the motion begins
+Limits = dict[str, Array]
+
+
+@dataclass
+class Multipliers:
+    """State of the augmented Lagrangian: one multiplier per limit and sample, and the weight of what is violated."""
+
+    values: Limits
+    weight: float
+
+    def tightened(self, found: Limits, factor: float) -> Multipliers:
+        """The next state after a minimisation that ended with `found`."""
+        values = {name: np.maximum(0.0, self.values[name] + self.weight * c) for name, c in found.items()}
+        return Multipliers(values, self.weight * factor)
+
+
+@dataclass(frozen=True)
+class State:
+    """Everything at one point.
+
+    Attributes:
+        coefficients: of the basis, shape (joints, size).
+        criterion: its value and gradient with respect to the information.
+        limits: by name, shares beyond the limit, not positive where it is kept.
+    """
+
+    coefficients: Array
+    criterion: Value
+    limits: Limits
+
+    @property
+    def worst(self) -> float:
+        """The largest share by which a limit is exceeded; not positive where all are kept."""
+        return max(float(values.max()) for values in self.limits.values() if values.size)
+
+
+class Problem:
+    """One search on one time grid."""
+
+    def __init__(self, task: Task, per_period: int) -> None:
+        """Lay the grid.
+
+        Args:
+            task: what to search.
+            per_period: samples per period.
+        """
+        self.task = task
+        model, limits = task.model, task.limits
+        self._n = model.chain.joints
+        self._regressor = RegressorGradient(model.chain, model.layout, task.columns)
+        times, weights = task.basis.samples(per_period)
+        self._maps = maps(task.basis, times)
+        self._weights = weights * task.rate
+        self._middle, self._half = 0.5 * (limits.lower + limits.upper), 0.5 * (limits.upper - limits.lower)
+        sizes = [np.maximum(np.abs(values).max(axis=0), 1e-12) for values in self._maps[:2]]
+        reach = np.minimum(self._half[:, None] / sizes[0], limits.velocity[:, None] / sizes[1])
+        self._scale = np.where(task.basis.moving, reach, self._half[:, None])
+        self._offset = task.basis.standing(self._middle)
+        self._creep = _CREEP * limits.velocity
+        self._torque_parameters()
+        self._following: FollowingError | None = None
+        if task.friction is not None and model.prior is not None:
+            self._following = FollowingError(model, limits, task.friction, self._creep)
+            self._allowed = USABLE * limits.following_error
+        self._capsules = CapsuleModel(model)
+        step = float(np.median(np.diff(times)))
+        # What a point a metre away from an axis may do between two samples, beyond the straight line between them.
+        between = min(0.125 * float(limits.acceleration.max()) * step**2, _BETWEEN)
+        self._clearance = model.config.workspace.clearance + between
+        # The straight way from home to where the motion begins, for which only clearance matters.
+        self._line = np.linspace(0.0, 1.0, _LINE)[:, None]
+        self._begin = maps(task.basis, np.zeros(1))[0]
+        self.names = ["position", "velocity", "acceleration", "jerk"]
+        self.names += ["torque"] * (model.prior is not None) + ["power"] * (self._supply is not None)
+        self.names += ["following error"] * (self._following is not None)
+        self.names += ["clearance"] * bool(self._capsules.pairs)
+
+    def _torque_parameters(self) -> None:
+        """The model's base parameters without dry friction, which is taken off the limits instead: it has no slope."""
+        model = self.task.model
+        self._beta = np.zeros(len(self.task.columns))
+        self._torque_limit = self.task.limits.torque.copy()
+        self._supply = model.config.supply if model.prior is not None else None
+        self._torque_regressor = self._regressor
+        if model.prior is None:
+            return
+        base = base_parameters(model.chain, model.layout)
+        delta = model.prior.copy()
+        dry = model.layout.term_values("coulomb", delta) + model.layout.term_values("stribeck", delta)
+        self._torque_limit = self._torque_limit - np.abs(model.chain.coupling.T) @ np.abs(dry)
+        delta[model.layout.term_columns("coulomb")] = 0.0
+        delta[model.layout.term_columns("stribeck")] = 0.0
+        self._beta = base.K @ delta
+        if not np.array_equal(base.base, self.task.columns):
+            self._torque_regressor = RegressorGradient(model.chain, model.layout, base.base)
+        self._dry = np.abs(dry)
+        self._to_drives = np.linalg.inv(model.chain.coupling)  # drive torques are C^-T tau, rows times C^-1
+
+    @property
+    def size(self) -> int:
+        """Number of variables."""
+        return self._scale.size
+
+    def coefficients(self, x: Array) -> Array:
+        """Coefficients of the basis, shape (joints, size), of variables of shape (size,)."""
+        return np.asarray(self._offset + x.reshape(self._scale.shape) * self._scale)
+
+    def variables(self, coefficients: Array) -> Array:
+        """The inverse of `coefficients`."""
+        return np.asarray(((coefficients - self._offset) / self._scale).ravel())
+
+    def no_multipliers(self, weight: float) -> Multipliers:
+        """Where an augmented Lagrangian begins."""
+        samples = len(self._weights)
+        shapes = {"power": (samples, 1), "clearance": (samples + _LINE, len(self._capsules.pairs))}
+        return Multipliers({name: np.zeros(shapes.get(name, (samples, self._n))) for name in self.names}, weight)
+
+    def state(self, x: Array, sharpness: float) -> State:
+        """Criterion and limits at x."""
+        return self._evaluate(x, sharpness, None)[0]
+
+    def value_and_gradient(self, x: Array, sharpness: float, multipliers: Multipliers) -> tuple[float, Array]:
+        """The augmented Lagrangian and its gradient, shape (size,)."""
+        _, value, gradient = self._evaluate(x, sharpness, multipliers)
+        return value, gradient
+
+    def _evaluate(self, x: Array, sharpness: float, multipliers: Multipliers | None) -> tuple[State, float, Array]:
+        task, X = self.task, self.coefficients(x)
+        q, dq, ddq, jerk = (values @ X.T for values in self._maps)
+        direction = np.tanh(dq @ task.model.chain.coupling.T / self._creep)
+        H = self._regressor.run(q, dq, ddq, direction)
+        G = np.zeros((H.shape[1], H.shape[1]))
+        counted = self._weights > 0.0
+        for rows, noise in zip(H, task.noise, strict=True):
+            seen = rows[:, counted] * np.sqrt(self._weights[counted])
+            G += seen @ seen.T / noise**2
+        if task.added is not None:
+            G += task.added
+        value = criterion(task.criterion, G, sharpness, task.chosen, task.scale)
+        T = H
+        if self._torque_regressor is not self._regressor:
+            T = self._torque_regressor.run(q, dq, ddq, direction)
+        torque = np.stack([self._beta @ rows for rows in T], axis=1) if task.model.prior is not None else None
+        limits = task.limits
+        signed = {
+            "position": (q - self._middle) / self._half,
+            "velocity": dq / limits.velocity,
+            "acceleration": ddq / limits.acceleration,
+            "jerk": jerk / limits.jerk,
+        }
+        if torque is not None:
+            signed["torque"] = torque / self._torque_limit
+        if self._following is not None:
+            signed["following error"] = self._following.run(q, dq) / self._allowed
+        found = {name: np.abs(share) - (1.0 - _RESERVE) for name, share in signed.items()}
+        if torque is not None and self._supply is not None:
+            found["power"], power_slopes = self._power(torque, dq)
+        if self._capsules.pairs:
+            way = limits.home + self._line * (self._begin @ X.T - limits.home)
+            found["clearance"] = (self._clearance - self._capsules.distances(np.concatenate([q, way])).T) / _DEPTH
+        state = State(X, value, found)
+        if multipliers is None:
+            return state, value.value, np.zeros(0)
+        rho = multipliers.weight
+        forces = {name: np.maximum(0.0, rho * c + multipliers.values[name]) for name, c in found.items()}
+        penalty = sum(
+            float((forces[name] ** 2).sum() - (multipliers.values[name] ** 2).sum()) / (2.0 * rho) for name in found
+        )
+        pushes = {name: forces[name] * np.sign(share) for name, share in signed.items()}
+        on_q = pushes["position"] / self._half
+        on_dq = pushes["velocity"] / limits.velocity
+        on_ddq = pushes["acceleration"] / limits.acceleration
+        on_jerk = pushes["jerk"] / limits.jerk
+        on_begin = np.zeros(self._n)
+        if "clearance" in found:
+            by_posture = self._capsules.pull(-forces["clearance"].T / _DEPTH)
+            on_q = on_q + by_posture[: len(q)]
+            on_begin = (self._line * by_posture[len(q) :]).sum(axis=0)
+        if self._following is not None:
+            by_q, by_dq = self._following.pull(pushes["following error"] / self._allowed)
+            on_q, on_dq = on_q + by_q, on_dq + by_dq
+        seeds = np.empty_like(H)
+        for k, (rows, noise) in enumerate(zip(H, task.noise, strict=True)):
+            seeds[k] = (2.0 / noise**2) * (value.gradient @ rows) * self._weights
+        if torque is not None:
+            on_torque = pushes["torque"] / self._torque_limit
+            if self._supply is not None:
+                on_torque = on_torque + forces["power"] * power_slopes[0]
+                on_dq = on_dq + forces["power"] * power_slopes[1]
+            along = on_torque.T[:, None, :] * self._beta[None, :, None]
+            if T is H:
+                seeds += along
+            else:
+                by_q, by_dq, by_ddq, _ = self._torque_regressor.pull(along)
+                on_q, on_dq, on_ddq = on_q + by_q, on_dq + by_dq, on_ddq + by_ddq
+        by_q, by_dq, by_ddq, by_direction = self._regressor.pull(seeds)
+        turning = (by_direction * (1.0 - direction**2) / self._creep) @ task.model.chain.coupling
+        sources = (on_q + by_q, on_dq + by_dq + turning, on_ddq + by_ddq, on_jerk)
+        gradient = np.outer(on_begin, self._begin[0])
+        gradient += sum(source.T @ values for source, values in zip(sources, self._maps, strict=True))
+        return state, value.value + penalty, (gradient * self._scale).ravel()
+
+    def _power(self, torque: Array, velocity: Array) -> tuple[Array, tuple[Array, Array]]:
+        """Share of the supply's budget beyond it, shape (samples, 1), and its slopes over torque and velocity."""
+        supply = self._supply
+        if supply is None:
+            raise AssertionError("no supply")
+        coupling = self.task.model.chain.coupling
+        loss = np.broadcast_to(np.asarray(supply.loss, dtype=float), (self._n,))
+        rate = velocity @ coupling.T
+        rigid = torque @ self._to_drives
+        effort = rigid + self._dry * np.tanh(rate / self._creep)
+        drawn = effort * rate + loss * effort**2
+        on = drawn > 0.0
+        share = (supply.standby + np.where(on, drawn, 0.0).sum(axis=1)) / supply.budget
+        by_effort = on * (rate + 2.0 * loss * effort) / supply.budget
+        by_rate = on * effort / supply.budget
+        by_rate = by_rate + by_effort * self._dry * (1.0 - np.tanh(rate / self._creep) ** 2) / self._creep
+        return share[:, None] - (1.0 - _RESERVE), (by_effort @ self._to_drives.T, by_rate @ coupling)

@@ -1,0 +1,97 @@
+"""What is proven of a motion for all time, and the largest motion of a family that it can be proven of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ident_service.config.limits import MotionLimits
+from ident_service.excitation.basis import Basis
+from ident_service.excitation.clearance import Clearance, certified_clearance
+from ident_service.excitation.demands import Demands, demands
+from ident_service.excitation.path import FourierPath, PosturePath
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.chain import Array
+from ident_service.model.collision import CollisionModel
+
+_SHRINKS = tuple(1.0 - 0.002 * 1.35**k for k in range(20))  # 0.998 ... 0.4
+
+
+@dataclass(frozen=True)
+class Proof:
+    """Bounds that hold at every instant of a motion.
+
+    Attributes:
+        demands: on the joints and the supply.
+        clearance: the smallest distance, None where the arm has no geometry.
+        approach: the smallest distance on the straight way from home to where the motion begins and back, likewise.
+    """
+
+    demands: Demands
+    clearance: Clearance | None
+    approach: Clearance | None
+
+
+def proof_of(
+    path: FourierPath | PosturePath, model: ArmModel, limits: MotionLimits, collision: CollisionModel
+) -> Proof:
+    """Bound everything a motion asks.
+
+    Args:
+        path: the motion.
+        model: of the arm.
+        limits: for home and for how fast the ways to and from it are.
+        collision: geometry of the arm.
+    """
+    least = model.config.workspace.clearance
+    if not collision.pairs:
+        return Proof(demands(path, model), None, None)
+    ends = [path.at(0.0)[0], path.at(path.duration)[0]]
+    points = np.array([limits.home, ends[0], limits.home, ends[1]])
+    return Proof(
+        demands(path, model),
+        certified_clearance(collision, path, least),
+        certified_clearance(collision, PosturePath(points, np.full(3, 2.0), 0.0), least),
+    )
+
+
+def objections(proof: Proof, model: ArmModel, limits: MotionLimits) -> list[str]:
+    """Every limit that is not proven to be kept, in words; empty when all are."""
+    found = proof.demands.violations(model.chain.names, limits, model.config.supply)
+    least = model.config.workspace.clearance
+    for what, clearance in (("the motion", proof.clearance), ("the way from home or back", proof.approach)):
+        if clearance is not None and clearance.lower_bound < least:
+            found.append(
+                f"{what} comes within {clearance.lower_bound:.4f} m at {clearance.pair}, {clearance.time:.2f} s; "
+                f"{least:g} m must remain"
+            )
+    return found
+
+
+def largest_proven(
+    basis: Basis,
+    coefficients: Array,
+    safe: Array,
+    proven: Callable[[Array], Proof | None],
+) -> tuple[Array, Proof] | None:
+    """The largest motion between standing still and the given one of which everything can be proven.
+
+    Args:
+        basis: the family.
+        coefficients: of the motion, shape (joints, size).
+        safe: coefficients of standing still in a posture that keeps all limits.
+        proven: the proof of a motion that keeps all limits, None for one that does not.
+
+    Returns:
+        Coefficients and proof, or None where even a hundredth of the motion cannot be proven.
+    """
+    if (proof := proven(coefficients)) is not None:
+        return coefficients, proof
+    for anchor in (basis.still(coefficients), safe):
+        for share in (*_SHRINKS, 0.2, 0.1, 0.05, 0.01):
+            smaller = anchor + share * (coefficients - anchor)
+            if (proof := proven(smaller)) is not None:
+                return smaller, proof
+    return None

@@ -1,0 +1,95 @@
+"""Pause and resume: a controlled stop out of a motion, and a jerk-limited way back onto it.
+
+The way back leads from standstill to the motion's own moving state, so that position, velocity and acceleration have
+no step anywhere. Boundary: pure functions of time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from ident_service.config.limits import MotionLimits
+from ident_service.errors import MotionRefused
+from ident_service.motion.reference import Reference, Setpoint, rest
+from ident_service.motion.stop import stop
+from ident_service.motion.way import RuckigReference, way
+
+_SEARCH_STEP = 0.1  # s
+_SEARCH = 20  # steps to either side
+
+
+class Paused:
+    """A motion that is stopped, and then stands.
+
+    Attributes:
+        duration: until the arm stands [s].
+        time: of the motion at which it was left [s].
+    """
+
+    def __init__(self, motion: Reference, time: float, limits: MotionLimits) -> None:
+        """Leave a motion.
+
+        Args:
+            motion: within the limits.
+            time: of the motion [s]; the pause begins there.
+            limits: of the arm.
+        """
+        self._motion = motion
+        self._limits = limits
+        self._stop = stop(motion.at(time), limits)
+        self.time = min(time, motion.duration)
+        self.duration = self._stop.duration
+
+    def at(self, time: float) -> Setpoint:
+        """Setpoint at `time` [s] since the pause began."""
+        return self._stop.at(time)
+
+    def resume(self, limits: MotionLimits | None = None) -> Resumed:
+        """The way back onto the motion and the rest of it, to be followed once the arm stands.
+
+        It joins the motion where it was left. Where no way leads there within the limits, it joins a little earlier and
+        repeats that little; else a little later; else it begins the motion again. This takes a millisecond or few where
+        the motion was left, but up to some tenths of a second when it must search: not to be called inside a cycle.
+
+        Args:
+            limits: of the way, by default the arm's; `slowed_limits` for one as slow as a rehearsal.
+
+        Raises:
+            MotionRefused: not even the motion's beginning can be reached from here.
+        """
+        here = rest(self._stop.end)
+        for time in _joining_times(self.time, self._motion.duration):
+            try:
+                return Resumed(way(here, self._motion.at(time), limits or self._limits), self._motion, time)
+            except MotionRefused as error:
+                refusal = error
+        raise MotionRefused(f"no way leads from here back onto the motion: {refusal}") from refusal
+
+
+class Resumed:
+    """A way back onto a motion, and the motion from there on.
+
+    Attributes:
+        duration: of both [s].
+        back: length of the way back [s].
+        joined: time of the motion at which the way back ends [s].
+    """
+
+    def __init__(self, back: RuckigReference, motion: Reference, joined: float) -> None:
+        self._way = back
+        self._motion = motion
+        self.back = back.duration
+        self.joined = joined
+        self.duration = back.duration + motion.duration - joined
+
+    def at(self, time: float) -> Setpoint:
+        """Setpoint at `time` [s] since the way back began."""
+        return self._way.at(time) if time < self.back else self._motion.at(self.joined + time - self.back)
+
+
+def _joining_times(left: float, duration: float) -> Iterator[float]:
+    yield left
+    steps = [_SEARCH_STEP * count for count in range(1, _SEARCH + 1)]
+    yield from (left - step for step in steps if step < left)
+    yield from (left + step for step in steps if left + step < duration)
+    yield 0.0

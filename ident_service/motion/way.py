@@ -1,0 +1,70 @@
+"""Jerk-limited ways from one moving state to another: the approach, the return, the way back onto a motion.
+
+Every way is a ruckig trajectory within the arm's velocity, acceleration and jerk; ruckig is imported nowhere else.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import ruckig
+
+from ident_service.config.limits import MotionLimits, Vector
+from ident_service.errors import MotionRefused
+from ident_service.motion.reference import Setpoint
+
+_EXTENT_STEP = 1e-3  # s; a turning point lies at most acceleration * step^2 / 8 outside: 2e-6 rad at 16 rad/s^2
+
+
+class RuckigReference:
+    """A jerk-limited trajectory."""
+
+    def __init__(self, parameters: ruckig.InputParameter) -> None:
+        self._trajectory = ruckig.Trajectory(parameters.degrees_of_freedom)
+        try:
+            result = ruckig.Ruckig(parameters.degrees_of_freedom).calculate(parameters, self._trajectory)
+        except ruckig.RuckigError as error:
+            raise MotionRefused(f"no jerk-limited way exists within the limits: {str(error).strip()}") from error
+        if result not in (ruckig.Result.Working, ruckig.Result.Finished):
+            raise MotionRefused(f"no jerk-limited way exists within the limits: {result}")
+        self.duration = float(self._trajectory.duration)
+
+    def at(self, time: float) -> Setpoint:
+        """Setpoint at `time` [s]."""
+        position, velocity, acceleration = self._trajectory.at_time(min(time, self.duration))[:3]
+        return Setpoint(np.array(position), np.array(velocity), np.array(acceleration))
+
+    def extent(self) -> tuple[Vector, Vector]:
+        """Lowest and highest position on the way, each of shape (joints,), but for what happens between two points."""
+        # The position_extrema of ruckig itself miss turning points (pantor/ruckig#215), here by more than 0.1 rad.
+        times = np.linspace(0.0, self.duration, 2 + int(self.duration / _EXTENT_STEP))
+        positions = np.array([self._trajectory.at_time(time)[0] for time in times])
+        return positions.min(axis=0), positions.max(axis=0)
+
+
+def way(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference:
+    """From one moving or resting state to another, all joints arriving together.
+
+    Raises:
+        MotionRefused: no such way exists within the limits, or it would leave the position limits.
+    """
+    parameters = ruckig.InputParameter(len(start.position))
+    parameters.current_position = start.position.tolist()
+    parameters.current_velocity = start.velocity.tolist()
+    parameters.current_acceleration = start.acceleration.tolist()
+    parameters.target_position = end.position.tolist()
+    parameters.target_velocity = end.velocity.tolist()
+    parameters.target_acceleration = end.acceleration.tolist()
+    parameters.max_velocity = limits.velocity.tolist()
+    parameters.max_acceleration = limits.acceleration.tolist()
+    parameters.max_jerk = limits.jerk.tolist()
+    # From rest to rest all joints share one profile, so that the way is straight in joint space; else it cannot be.
+    parameters.synchronization = ruckig.Synchronization.Phase
+    reference = RuckigReference(parameters)
+    lowest, highest = reference.extent()
+    if bool(np.any(lowest < limits.lower) or np.any(highest > limits.upper)):
+        joint = int(np.argmax(np.maximum(limits.lower - lowest, highest - limits.upper)))
+        raise MotionRefused(
+            f"the way to or from the motion swings joint {joint + 1} to {lowest[joint]:.3f}..{highest[joint]:.3f}, "
+            f"outside {limits.lower[joint]:g}..{limits.upper[joint]:g}; begin nearer to it or slower"
+        )
+    return reference

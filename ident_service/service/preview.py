@@ -1,0 +1,214 @@
+"""What a motion asks of an arm and what it will teach, told before anything moves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ident_service.config.limits import MotionLimits, motion_limits
+from ident_service.errors import MotionRefused, UsageError
+from ident_service.excitation.criteria import condition_number
+from ident_service.excitation.excitation import Excitation
+from ident_service.excitation.expectation import (
+    NoiseModel,
+    described_noise,
+    expected_deviations,
+    information,
+)
+from ident_service.excitation.following import expected_friction, forecast
+from ident_service.excitation.proof import Proof, objections, proof_of
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.base import BaseParameters, base_parameters
+from ident_service.model.chain import Array
+from ident_service.model.collision import CollisionModel
+from ident_service.motion.reference import Setpoint, rest
+from ident_service.motion.stop import stop_extent
+from ident_service.motion.surroundings import Nearest, stop_clearance
+from ident_service.motion.way import way
+from ident_service.results.parameter_file import read_parameters
+
+_LOOKED_AT = 2000  # samples of every part of a motion that the following error is forecast at
+KINDS = ("velocity", "acceleration", "jerk", "torque")
+
+
+@dataclass(frozen=True)
+class Preview:
+    """Everything that can be said of a motion beforehand.
+
+    Attributes:
+        model: of the arm.
+        excitation: the motion.
+        limits: of the arm.
+        proof: what it asks, at every instant.
+        objections: every limit that is not kept, in words; empty for a motion that may run.
+        stops: lowest and highest positions that a stop from anywhere on the motion reaches, each of shape (joints,).
+        stop_clearance: the smallest distance on stops out of the motion.
+        following: forecast of the following error [rad or m], shape (joints,).
+        approach: how long the way from home to its beginning takes [s], and back from its end.
+        base: the parameters.
+        noise: of the torques, as far as known.
+        deviations: to be expected, shape (base,).
+        condition_number: of the stacked regressor.
+    """
+
+    model: ArmModel
+    excitation: Excitation
+    limits: MotionLimits
+    proof: Proof
+    objections: tuple[str, ...]
+    stops: tuple[Array, Array]
+    stop_clearance: Nearest
+    following: Array
+    approach: tuple[float, float]
+    base: BaseParameters
+    noise: NoiseModel
+    deviations: Array
+    condition_number: float
+
+
+def preview(
+    model: ArmModel, excitation: Excitation, noise: NoiseModel | None = None, added: Array | None = None
+) -> Preview:
+    """Look at a motion.
+
+    Args:
+        model: of the arm, with prior parameters.
+        excitation: made for it.
+        noise: of the torques; the description's when None.
+        added: information from earlier recordings, whitened by `noise`, shape (base, base).
+
+    Raises:
+        MotionRefused: the motion was made for another arm, or the arm's description lacks limits.
+    """
+    if excitation.arm_sha256 != model.config.motion_sha256:
+        raise MotionRefused(
+            f"the {excitation.name} motion was made for another description of the arm than {model.config.name} as it "
+            "is now; design it again"
+        )
+    if excitation.path.joints != model.chain.joints:
+        raise MotionRefused(f"a motion of {excitation.path.joints} joints for an arm of {model.chain.joints}")
+    limits = motion_limits(model.config)
+    path = excitation.path
+    proof = proof_of(path, model, limits, CollisionModel(model))
+    lowest, highest = stop_extent(path, limits)
+    found = objections(proof, model, limits)
+    for k, name in enumerate(model.chain.names):
+        if lowest[k] < limits.lower[k] or highest[k] > limits.upper[k]:
+            found.append(
+                f"{name}: a stop out of the motion reaches {lowest[k]:.3f}..{highest[k]:.3f}, "
+                f"outside {limits.lower[k]:g}..{limits.upper[k]:g}"
+            )
+    nearest = stop_clearance(path, limits, model)
+    if nearest.distance <= 0.0:
+        found.append(f"a stop out of the motion at {nearest.time:.2f} s would touch: {nearest.pair}")
+    home = rest(limits.home)
+    begin, end = (Setpoint(*path.at(time)[:3]) for time in (0.0, path.duration))
+    durations = []
+    for leg in ((home, begin), (end, home)):
+        try:
+            durations.append(way(leg[0], leg[1], limits).duration)
+        except MotionRefused as error:
+            durations.append(float("nan"))
+            found.append(str(error))
+    base = base_parameters(model.chain, model.layout)
+    noise = described_noise(model, limits) if noise is None else noise
+    return Preview(
+        model=model,
+        excitation=excitation,
+        limits=limits,
+        proof=proof,
+        objections=tuple(found),
+        stops=(lowest, highest),
+        stop_clearance=nearest,
+        following=_following(model, excitation, limits),
+        approach=(durations[0], durations[1]),
+        base=base,
+        noise=noise,
+        deviations=expected_deviations(path, model, base, noise, added),
+        condition_number=condition_number(information(path, model, base, np.ones(model.chain.joints))),
+    )
+
+
+def _following(model: ArmModel, excitation: Excitation, limits: MotionLimits) -> Array:
+    path = excitation.path
+    time = np.concatenate([np.linspace(begin, end, _LOOKED_AT) for begin, end in path.distinct])
+    position, velocity, *_ = path.at(time)
+    friction = expected_friction(model, limits, model.config.design.friction_guess)
+    return forecast(model, limits, friction, position, velocity)
+
+
+def recorded_noise(file: Path, model: ArmModel) -> NoiseModel:
+    """Noise as an earlier identification of the arm found it.
+
+    Per joint the residual's root mean square; and by how much the deviations found in blocks exceed those that white
+    noise would give, in the geometric mean.
+
+    Raises:
+        UsageError, ParameterError: no such file, not a parameter file, or one of another arm or without a fit.
+    """
+    content = read_parameters(file, model.layout.names).content
+    try:
+        rows = {row["joint"]: float(row["rms"]) for row in content["fit"]["per_joint"]}
+        deviation = np.array([rows[name] for name in model.chain.names])
+        table = content["base_parameters"]
+        pairs = zip(table["standard_deviations"], table["white_standard_deviations"], strict=True)
+        ratios = [blocks / white for blocks, white in pairs if blocks is not None and white]
+    except (KeyError, TypeError):
+        raise UsageError(
+            f"{file}: no residual per joint and no standard deviations of the joints {', '.join(model.chain.names)}; "
+            "give the parameters.json of an identification of this arm"
+        ) from None
+    if not ratios or not (deviation > 0.0).all():
+        raise UsageError(f"{file}: its residuals or standard deviations are zero, so nothing can be foretold from it")
+    return NoiseModel(deviation, float(np.exp(np.mean(np.log(ratios)))), f"the residuals in {file.name}")
+
+
+def preview_document(seen: Preview) -> dict[str, Any]:
+    """The preview as JSON values."""
+    asked = seen.proof.demands
+    clearances = {"clearance": seen.proof.clearance, "approach_clearance": seen.proof.approach}
+    return {
+        "arm": seen.model.config.name,
+        "motion": seen.excitation.name,
+        "duration": seen.excitation.duration,
+        "approach": [value if np.isfinite(value) else None for value in seen.approach],
+        "joints": [
+            {
+                "joint": name,
+                "position": [float(asked.lowest[k]), float(asked.highest[k])],
+                "following_error": float(seen.following[k]),
+                "stops": [float(seen.stops[0][k]), float(seen.stops[1][k])],
+                **{kind: None if (peak := getattr(asked, kind)) is None else float(peak[k]) for kind in KINDS},
+                "limits": {
+                    "position": [float(seen.limits.lower[k]), float(seen.limits.upper[k])],
+                    **{kind: float(getattr(seen.limits, kind)[k]) for kind in KINDS},
+                },
+            }
+            for k, name in enumerate(seen.model.chain.names)
+        ],
+        "power": asked.power,
+        **{
+            key: None
+            if one is None or one.pair is None
+            else {"lower_bound": one.lower_bound, "sampled": one.sampled, "pair": one.pair, "time": one.time}
+            for key, one in clearances.items()
+        },
+        "stop_clearance": None
+        if seen.stop_clearance.pair is None
+        else {
+            "sampled": seen.stop_clearance.distance,
+            "pair": seen.stop_clearance.pair,
+            "time": seen.stop_clearance.time,
+        },
+        "condition_number": seen.condition_number if np.isfinite(seen.condition_number) else None,
+        "noise": {"deviation": seen.noise.deviation.tolist(), "inflation": seen.noise.inflation},
+        "base_parameters": {
+            "expressions": list(seen.base.expressions),
+            "units": list(seen.base.units),
+            "expected_standard_deviations": [float(value) if np.isfinite(value) else None for value in seen.deviations],
+        },
+        "objections": list(seen.objections),
+    }

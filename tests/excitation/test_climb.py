@@ -1,0 +1,111 @@
+"""One start of the search: whatever it begins with, what comes out keeps every limit, and is no worse."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from design_bench import quick, small
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ident_service.excitation.climb import Interrupted, Stopped, climbed, keeps, kept, random_variables
+from ident_service.excitation.design import family, settled
+from ident_service.excitation.postures import safe_posture
+from ident_service.excitation.problem import Problem
+
+Array = np.ndarray
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def bench() -> tuple[Problem, Array]:
+    """A small problem, and standing still in its safe posture."""
+    model, design = small(), quick()
+    task = settled(model, design, *family(design, model))
+    return Problem(task, 60), task.basis.standing(safe_posture(model, task.limits))
+
+
+PROBLEM, SAFE = bench()
+
+
+def after(calls: int) -> Callable[[], None]:
+    """Somebody who interrupts at that call."""
+    left = [calls]
+
+    def check() -> None:
+        left[0] -= 1
+        if left[0] < 0:
+            raise Interrupted
+
+    return check
+
+
+@settings(max_examples=40)
+@given(seed=SEEDS, size=st.sampled_from([0.0, 1e-3, 1.0, 10.0, 1e3, 1e6]))
+def test_what_is_kept_keeps_all_limits_even_from_absurd_motions(seed: int, size: float) -> None:
+    x = size * np.random.default_rng(seed).normal(size=PROBLEM.size)
+    candidate = kept(PROBLEM, x, SAFE, 7)
+    assert candidate.start == 7
+    assert keeps(PROBLEM, candidate.coefficients)
+    assert np.isfinite(candidate.value)
+
+
+@settings(max_examples=40)
+@given(seed=SEEDS, size=st.sampled_from([0.3, 1.0, 3.0]))
+def test_what_is_kept_is_the_largest_motion_that_keeps_the_limits(seed: int, size: float) -> None:
+    X = PROBLEM.coefficients(size * np.random.default_rng(seed).normal(size=PROBLEM.size))
+    candidate = kept(PROBLEM, PROBLEM.variables(X), SAFE, 0)
+    if keeps(PROBLEM, X):
+        np.testing.assert_allclose(candidate.coefficients, X, atol=1e-12)
+        return
+    middle = PROBLEM.task.basis.still(X)
+    anchor = middle if keeps(PROBLEM, middle) else SAFE
+    larger = anchor + 1.01 * (candidate.coefficients - anchor)
+    assert not keeps(PROBLEM, larger)
+
+
+@settings(max_examples=40)
+@given(seed=SEEDS)
+def test_a_random_start_is_a_motion_about_a_posture_within_the_limits(seed: int) -> None:
+    task = PROBLEM.task
+    x = random_variables(PROBLEM, np.random.default_rng(seed), SAFE)
+    middle = task.basis.still(PROBLEM.coefficients(x))[:, -1]
+    assert ((task.limits.lower <= middle) & (middle <= task.limits.upper)).all()
+    again = random_variables(PROBLEM, np.random.default_rng(seed), SAFE)
+    np.testing.assert_array_equal(x, again)
+
+
+@pytest.mark.parametrize("size", [0.1, 1.0])
+def test_a_climb_ends_in_a_moving_motion_that_keeps_all_limits(size: float) -> None:
+    x = size * np.random.default_rng(1).normal(size=PROBLEM.size)
+    candidate = climbed(PROBLEM, x, SAFE, 3, lambda: None)
+    assert keeps(PROBLEM, candidate.coefficients)
+    assert np.ptp(PROBLEM.task.basis.path(candidate.coefficients).at(np.linspace(0.0, 7.0, 200))[0], axis=0).min() > 0.1
+    assert candidate.value < kept(PROBLEM, x, SAFE, 3).value
+
+
+@pytest.mark.parametrize("calls", [0, 1, 5, 40, 100])
+def test_an_interrupted_climb_hands_over_what_it_has(calls: int) -> None:
+    x = random_variables(PROBLEM, np.random.default_rng(2), SAFE)
+    with pytest.raises(Stopped) as caught:
+        climbed(PROBLEM, x, SAFE, 3, after(calls))
+    assert keeps(PROBLEM, caught.value.candidate.coefficients)
+
+
+@pytest.mark.parametrize("calls", [0, 1, 30, 65, 80, 120])
+def test_a_polish_makes_nothing_worse_however_early_it_ends(calls: int) -> None:
+    good = climbed(PROBLEM, random_variables(PROBLEM, np.random.default_rng(2), SAFE), SAFE, 3, lambda: None)
+    try:
+        polished = climbed(PROBLEM, PROBLEM.variables(good.coefficients), SAFE, 3, after(calls), polish=True)
+    except Stopped as stopped:
+        polished = stopped.candidate
+    assert keeps(PROBLEM, polished.coefficients)
+    assert polished.value <= good.value + 1e-9
+
+
+def test_the_same_start_climbs_the_same_way_twice() -> None:
+    x = random_variables(PROBLEM, np.random.default_rng(4), SAFE)
+    one, other = (climbed(PROBLEM, x.copy(), SAFE, 4, lambda: None) for _ in range(2))
+    assert one.value == other.value
+    np.testing.assert_array_equal(one.coefficients, other.coefficients)

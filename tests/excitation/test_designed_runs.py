@@ -1,0 +1,53 @@
+"""A motion designed on the CAD model and run on the arm as it really is: torque stays inside its limits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from design_bench import ONE_START, quick
+
+from ident_service.config.limits import motion_limits
+from ident_service.config.load import load_arm
+from ident_service.config.schema import ArmConfig
+from ident_service.excitation.design import design_motion
+from ident_service.excitation.excitation import Excitation
+from ident_service.excitation.search import Budget
+from ident_service.model.arm_model import arm_model
+from ident_service.motion.factory import make_arm
+from ident_service.motion.states import State
+from ident_service.service.commission import record_motion
+
+
+def assert_runs(arm: ArmConfig, motion: Excitation, folder: Path) -> None:
+    """The prior knows neither the arm's friction nor its true inertia; the margins are for that."""
+    report = record_motion(make_arm(arm), arm_model(arm), motion, folder / "run.mcap")
+    assert report.state is State.DONE
+    assert report.warnings == {}
+    limits = motion_limits(arm)
+    assert (np.asarray(report.peak_torque) <= limits.torque).all()
+    # Most of what the margins leave is used by some joint, or the test would show nothing.
+    assert (np.asarray(report.peak_torque) / limits.torque).max() > 0.3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["planar2", "threelink"])
+def test_a_small_arm_runs_its_designed_motion(name: str, tmp_path: Path) -> None:
+    arm = load_arm(name)
+    motion = design_motion(arm_model(arm), quick(harmonics=3), budget=ONE_START).excitation
+    assert_runs(arm, motion, tmp_path)
+
+
+@pytest.mark.slow
+def test_the_wam_runs_its_designed_motion(tmp_path: Path) -> None:
+    arm = load_arm("wam7_sim")
+    design = arm.design.model_copy(update={"harmonics": 3, "base_frequency": 0.1, "periods": 1})
+    motion = design_motion(arm_model(arm), design, budget=Budget(seconds=20.0, starts=None, workers=1)).excitation
+    # Home is put where the motion begins: this is about the motion, not about the way there.
+    described = arm.model_dump(by_alias=True)
+    for joint, begin in zip(described["joints"].values(), motion.path.at(0.0)[0], strict=True):
+        joint["home"] = float(begin)
+    begun = ArmConfig.model_validate(described)
+    assert_runs(begun, replace(motion, arm_sha256=begun.motion_sha256), tmp_path)

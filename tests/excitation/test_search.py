@@ -1,0 +1,155 @@
+"""The search: the same result for the same seed, resumable, to be cancelled, within its budget."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from design_bench import quick, small
+
+from ident_service.excitation.climb import keeps
+from ident_service.excitation.design import family, settled
+from ident_service.excitation.postures import safe_posture
+from ident_service.excitation.problem import Problem
+from ident_service.excitation.search import Budget, Found, Progress, search
+
+GRID = 60
+
+
+def bench() -> tuple[Any, np.ndarray]:
+    model, design = small(), quick()
+    task = settled(model, design, *family(design, model))
+    return task, safe_posture(model, task.limits)
+
+
+TASK, SAFE = bench()
+COARSE, FINE = Problem(TASK, GRID), Problem(TASK, 2 * GRID)
+
+
+def starts(number: int | None, workers: int = 1, seconds: float | None = None, **options: Any) -> Found:
+    return search(TASK, SAFE, options.pop("seed", 5), Budget(seconds, number, workers), GRID, **options)
+
+
+def assert_same(one: Found, other: Found) -> None:
+    assert (one.seed, one.finished, len(one.candidates)) == (other.seed, other.finished, len(other.candidates))
+    for first, second in zip(one.candidates, other.candidates, strict=True):
+        assert (first.start, first.value) == (second.start, second.value)
+        np.testing.assert_array_equal(first.coefficients, second.coefficients)
+
+
+def test_the_same_seed_and_starts_give_the_same_result_to_the_last_bit() -> None:
+    found = starts(3)
+    assert found.finished == 3
+    assert {candidate.start for candidate in found.candidates} == {0, 1, 2}
+    assert_same(found, starts(3))
+
+
+@pytest.mark.slow
+def test_however_many_processes_there_are() -> None:
+    assert_same(starts(3), starts(3, workers=2))
+
+
+def test_another_seed_is_another_search() -> None:
+    one, other = starts(1), starts(1, seed=6)
+    assert one.candidates[0].value != other.candidates[0].value
+
+
+def test_candidates_keep_all_limits_and_the_best_comes_first() -> None:
+    found = starts(3)
+    values = [candidate.value for candidate in found.candidates]
+    assert values == sorted(values)
+    for candidate in found.candidates:
+        assert keeps(FINE, candidate.coefficients)
+
+
+@pytest.mark.slow
+def test_a_search_goes_on_where_it_ended() -> None:
+    first = starts(2)
+    both = starts(2, earlier=first)
+    assert both.finished == 4
+    assert {candidate.start for candidate in both.candidates} == {0, 1, 2, 3}
+    assert both.candidates[0].value <= first.candidates[0].value
+    assert both.seconds > first.seconds
+    # The motions that the later starts began with are those of a search for all four.
+    together = {candidate.start: candidate for candidate in starts(4).candidates}
+    for candidate in both.candidates:
+        if candidate.start >= 2:
+            assert candidate.value == pytest.approx(together[candidate.start].value)
+
+
+def test_going_on_without_another_start_never_makes_the_best_worse() -> None:
+    found = starts(1)
+    for _ in range(3):
+        again = starts(0, earlier=found)
+        assert again.candidates[0].value <= found.candidates[0].value
+        found = again
+
+
+def test_without_a_single_start_the_arm_stands_still() -> None:
+    found = starts(0)
+    assert found.finished == 0
+    (candidate,) = found.candidates
+    np.testing.assert_array_equal(candidate.coefficients, TASK.basis.standing(SAFE))
+    assert keeps(COARSE, candidate.coefficients)
+
+
+def test_a_search_that_is_cancelled_at_once_has_a_candidate() -> None:
+    found = starts(100, cancelled=lambda: True)
+    assert found.finished == 0
+    assert keeps(COARSE, found.candidates[0].coefficients)
+
+
+def test_cancelling_ends_a_search_soon_with_what_it_has() -> None:
+    asked = [0]
+
+    def cancelled() -> bool:
+        asked[0] += 1
+        return asked[0] > 400
+
+    begun = time.monotonic()
+    found = starts(10_000, cancelled=cancelled)
+    assert time.monotonic() - begun < 30.0
+    assert 0 < found.finished < 10_000
+    assert keeps(COARSE, found.candidates[0].coefficients)
+    assert found.candidates[0].start >= 0
+
+
+@pytest.mark.slow
+def test_cancelling_ends_the_work_of_other_processes_too() -> None:
+    begun = time.monotonic()
+    found = starts(10_000, workers=2, cancelled=lambda: time.monotonic() - begun > 6.0)
+    assert time.monotonic() - begun < 30.0
+    assert 0 < found.finished < 10_000
+
+
+def test_a_budget_of_time_is_kept() -> None:
+    begun = time.monotonic()
+    found = starts(None, seconds=1.0)
+    assert 0.6 < time.monotonic() - begun < 5.0
+    assert found.finished > 0
+    assert keeps(COARSE, found.candidates[0].coefficients)
+
+
+def test_a_budget_too_short_for_a_single_climb_still_has_a_candidate() -> None:
+    found = starts(None, seconds=0.01)
+    assert keeps(COARSE, found.candidates[0].coefficients)
+
+
+def test_time_spent_is_added_up() -> None:
+    found = starts(0, earlier=Found(5, 3, 100.0, ()))
+    assert found.finished == 3
+    assert 100.0 < found.seconds < 120.0
+
+
+def test_progress_is_told() -> None:
+    told: list[Progress] = []
+    found = starts(3, tell=told.append)
+    assert [progress.phase for progress in told] == ["starts"] * 3 + ["polish"] * 3
+    assert [progress.finished for progress in told][-1] == found.finished == 3
+    elapsed = [progress.elapsed for progress in told]
+    assert elapsed == sorted(elapsed)
+    assert told[0].best is None
+    assert told[-1].best is not None
+    assert all(progress.remaining >= 0.0 or np.isnan(progress.remaining) for progress in told)

@@ -1,0 +1,63 @@
+"""A guard that is shown one position after another, and how its faults are read."""
+
+from __future__ import annotations
+
+import numpy as np
+from motion_bench import bench_limits
+
+from drivers.arm import Sample
+from ident_service.motion.guard import (
+    JUMP,
+    REACTIONS,
+    Fault,
+    Guard,
+    Reaction,
+)
+from ident_service.motion.reference import rest
+
+Array = np.ndarray
+NAMES = ("shoulder", "elbow")
+LIMITS = bench_limits()
+PERIOD = 1e-3
+HOME = np.array([0.1, -0.1])
+STILL = np.zeros(2)
+WINDOW = JUMP * LIMITS.velocity * PERIOD
+OFF, STOP, WARN = Reaction.TORQUE_OFF, Reaction.CONTROLLED_STOP, Reaction.WARN
+
+
+def unit(joint: int) -> Array:
+    return np.eye(2)[joint]
+
+
+class Bench:
+    """A guard that is shown one position after another."""
+
+    def __init__(self, position: Array = HOME) -> None:
+        self.guard = Guard(NAMES, LIMITS, PERIOD, position)
+        self.cycle = 0
+
+    def see(
+        self,
+        position: Array,
+        reference: Array | None = None,
+        velocity: Array = STILL,
+        valid: tuple[bool, bool] = (True, True),
+        correction: Array = STILL,
+    ) -> tuple[list[bool], Fault | None]:
+        flags = np.array(valid)
+        age = np.where(flags, 0, 1)
+        sample = Sample(self.cycle, self.cycle * 1_000_000, np.array(position), None, np.zeros(2), flags, age)
+        self.cycle += 1
+        setpoint = rest(position if reference is None else reference)
+        usable, fault = self.guard.feedback(sample, setpoint, velocity, correction)
+        return usable.tolist(), fault
+
+
+def is_fault(fault: Fault | None, code: str, joint: int | None = None) -> str:
+    """Check a fault's code, reaction and joint; its code."""
+    assert fault is not None
+    assert fault.code == code
+    assert fault.reaction is REACTIONS[code]
+    if joint is not None:
+        assert fault.message.startswith(f"{NAMES[joint]}: ")
+    return code

@@ -1,0 +1,202 @@
+"""A run in which the recorder, the operator, the drives or the program get in the way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from motion_bench import LOOKED
+from run_bench import HOME, LIMITS, MIDWAY, Bench
+
+from drivers.arm import StopKind
+from ident_service.errors import DriverError
+from ident_service.motion.control import ComputedTorque
+from ident_service.motion.states import State
+from sim_backend.faults import Fault, FaultKind
+
+Array = np.ndarray
+
+
+def test_a_recorder_that_is_behind_stops_the_arm(make: Callable[..., Bench]) -> None:
+    bench = make()
+    bench.story.misbehave = lambda count: count < 850
+    error = bench.fault()
+    assert error.code == "recorder_behind"
+    bench.stopped_under_control()
+
+
+def test_a_warning_does_not_hide_that_the_recorder_is_behind(make: Callable[..., Bench]) -> None:
+    bench = make(Fault(LOOKED + 849, FaultKind.LOST_FEEDBACK, 0))
+    bench.story.misbehave = lambda count: count != 850
+    assert bench.fault().code == "recorder_behind"
+    bench.stopped_under_control()
+
+
+@pytest.mark.parametrize("error", [OSError("disk full"), ValueError("no"), RuntimeError()])
+def test_a_recorder_that_fails_stops_the_arm_under_control(make: Callable[..., Bench], error: Exception) -> None:
+    bench = make()
+
+    def fail(count: int) -> bool:
+        if count >= 850:
+            raise error
+        return True
+
+    bench.story.misbehave = fail
+    fault = bench.fault()
+    assert fault.code == "recorder_behind"
+    assert str(error) in str(fault)
+    bench.stopped_under_control()
+
+
+def test_events_that_cannot_be_kept_end_nothing(make: Callable[..., Bench]) -> None:
+    bench = make()
+
+    def fail(message: str) -> None:
+        raise OSError(message)
+
+    bench.story.at_event = fail
+    assert bench.run().state is State.DONE
+    assert bench.story.events == []
+
+
+@pytest.mark.parametrize("cycle", [250, MIDWAY, 1500])
+def test_a_stop_that_is_asked_for_is_controlled(make: Callable[..., Bench], cycle: int) -> None:
+    bench = make()
+    report = bench.run(lambda: len(bench.story.samples) >= cycle - LOOKED)
+    assert report.state is State.STOPPED
+    assert bench.story.errors == []
+    bench.stopped_under_control()
+
+
+def test_a_stop_before_the_first_cycle_moves_nothing(make: Callable[..., Bench]) -> None:
+    bench = make()
+    assert bench.run(lambda: True).state is State.STOPPED
+    assert bench.story.states == ["approaching", "stopping", "stopped"]
+    assert (np.abs(bench.truth[-1].position - HOME) < 1e-3).all()
+
+
+def test_a_fault_during_a_stop_that_was_asked_for_is_not_swallowed(make: Callable[..., Bench]) -> None:
+    bench = make(Fault(MIDWAY + 20, FaultKind.ENCODER_JUMP, 0, 2, 1.0))
+    error = bench.fault(stop_requested=lambda: len(bench.story.samples) >= MIDWAY - LOOKED)
+    assert error.code == "encoder_jumps"
+    assert bench.story.states[-2:] == ["stopping", "stopped"]
+    assert bench.story.errors == [str(error)]
+
+
+def test_an_arm_that_cannot_be_enabled_is_left_without_torque(make: Callable[..., Bench]) -> None:
+    bench = make()
+    bench.arm.enable_error = DriverError("drive 3 does not answer")
+    with pytest.raises(DriverError, match="drive 3"):
+        bench.run()
+    assert bench.arm.stops == [StopKind.TORQUE_OFF]
+    assert bench.arm.torques == []
+    assert bench.story.states == ["faulted"]
+
+
+class _Broken(Exception):
+    pass
+
+
+def test_a_mistake_in_the_control_law_takes_the_torque(
+    make: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench, law = make(), ComputedTorque.torque
+
+    def broken(self: ComputedTorque, *arguments: Any) -> Array:
+        if len(bench.arm.torques) > 500:
+            raise _Broken
+        return law(self, *arguments)
+
+    monkeypatch.setattr(ComputedTorque, "torque", broken)
+    with pytest.raises(_Broken):
+        bench.run()
+    assert bench.arm.stops == [StopKind.TORQUE_OFF]
+    assert bench.story.states[-1] == "faulted"
+    assert bench.story.errors == ["_Broken"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "code"), [(np.nan, "torque_not_finite"), (np.inf, "torque_not_finite"), (1e3, "torque_absurd")]
+)
+def test_an_impossible_torque_never_leaves(
+    make: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch, wrong: float, code: str
+) -> None:
+    bench, law = make(), ComputedTorque.torque
+
+    def broken(self: ComputedTorque, *arguments: Any) -> Array:
+        torque = law(self, *arguments)
+        return np.array([torque[0], wrong]) if len(bench.arm.torques) == 500 else torque
+
+    monkeypatch.setattr(ComputedTorque, "torque", broken)
+    error = bench.fault()
+    assert error.code == code
+    assert "elbow" in str(error)
+    assert len(bench.arm.torques) == 500
+
+
+def test_a_torque_beyond_the_limit_is_clipped_and_counted(
+    make: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench, law = make(), ComputedTorque.torque
+
+    def strong(self: ComputedTorque, *arguments: Any) -> Array:
+        torque = law(self, *arguments)
+        return 2.0 * LIMITS.torque if len(bench.arm.torques) in (500, 501) else torque
+
+    monkeypatch.setattr(ComputedTorque, "torque", strong)
+    report = bench.run()
+    assert report.state is State.DONE
+    assert report.warnings == {"torque_saturated": 2}
+    np.testing.assert_array_equal(report.peak_torque, LIMITS.torque)
+
+
+@pytest.mark.parametrize("where", ["sample", "event", "exchange", "enable"])
+def test_an_interrupt_takes_the_torque(make: Callable[..., Bench], where: str) -> None:
+    bench = make()
+
+    def interrupt(*_: Any) -> bool:
+        raise KeyboardInterrupt
+
+    def later(count: int) -> bool:
+        return interrupt() if count == 850 else True
+
+    if where == "sample":
+        bench.story.misbehave = later
+    elif where == "event":
+        bench.story.at_event = lambda message: interrupt() and None if message == "exciting" else None
+    elif where == "exchange":
+        bench.arm.before_exchange = lambda cycle: later(cycle) and None
+    else:
+        bench.arm.after_enable = lambda: interrupt() and None
+    with pytest.raises(KeyboardInterrupt):
+        bench.run()
+    assert bench.arm.stops == [StopKind.TORQUE_OFF]
+    assert bench.story.states[-1] == "faulted"
+
+
+def test_torque_is_taken_before_anything_is_told(make: Callable[..., Bench]) -> None:
+    bench = make(Fault(MIDWAY, FaultKind.NAN_POSITION, 0))
+    stops: dict[str, int] = {}
+    bench.story.at_event = lambda message: stops.setdefault(message, len(bench.arm.stops)) and None
+    bench.fault()
+    assert stops["exciting"] == 0
+    assert stops["faulted"] == 1
+
+
+@pytest.mark.parametrize("stop_error", [DriverError("bus is gone"), ZeroDivisionError("driver")])
+def test_a_stop_that_raises_hides_nothing(make: Callable[..., Bench], stop_error: Exception) -> None:
+    bench = make(Fault(MIDWAY, FaultKind.NAN_POSITION, 0))
+    bench.arm.stop_error = stop_error
+    error = bench.fault()
+    assert error.code == "feedback_not_finite"
+    assert any(str(stop_error) in note for note in error.__notes__)
+    assert bench.story.states[-1] == "faulted"
+
+
+def test_a_run_whose_torque_cannot_be_taken_is_not_done(make: Callable[..., Bench]) -> None:
+    bench = make()
+    bench.arm.stop_error = DriverError("bus is gone")
+    with pytest.raises(DriverError, match="bus is gone"):
+        bench.run()
