@@ -18,7 +18,7 @@ from ident_service.excitation.basis import Basis, FourierBasis, PostureBasis
 from ident_service.excitation.criteria import condition_number, criterion
 from ident_service.excitation.excitation import Excitation
 from ident_service.excitation.expectation import described_noise, information, seconds_of_information
-from ident_service.excitation.following import expected_friction
+from ident_service.excitation.following import dry_friction, expected_friction
 from ident_service.excitation.path import FourierPath, PosturePath
 from ident_service.excitation.postures import safe_posture
 from ident_service.excitation.proof import Proof, largest_proven, objections, proof_of
@@ -113,10 +113,7 @@ def _require_torque(model: ArmModel, limits: MotionLimits) -> None:
         raise MotionRefused(
             f"{model.config.name}: torque cannot be predicted without prior (CAD) parameters; give them under prior"
         )
-    dry = np.abs(model.layout.term_values("coulomb", model.prior)) + np.abs(
-        model.layout.term_values("stribeck", model.prior)
-    )
-    needed = dry @ np.abs(model.chain.coupling)
+    _, needed = dry_friction(model, model.prior)
     if weak := [
         f"{name}: friction {f:g} against {limit:g}"
         for name, f, limit in zip(model.chain.names, needed, limits.torque, strict=True)
@@ -198,9 +195,9 @@ def design_motion(
     if best is None:
         still = basis.standing(safe)
         proof = proof_of(basis.path(still), model, task.limits, collision)
-        raise MotionRefused(
-            "not even standing still keeps the limits: " + "; ".join(objections(proof, model, task.limits))
-        )
+        if wrong := objections(proof, model, task.limits):
+            raise MotionRefused(f"not even standing still keeps the limits: {'; '.join(wrong)}")
+        best = (criterion_of(task, basis.path(still), base), still, proof)
     value, coefficients, proof = best
     path = basis.path(coefficients)
     kappa = condition_number(information(path, model, base, np.ones(model.chain.joints)))

@@ -55,9 +55,9 @@ def stretches(path: Path, longest: float | None = None) -> Stretches:
         path: the motion.
         longest: their greatest length [s]; by default a small part of the fastest oscillation.
     """
-    length = 1.0 / (_PER_CYCLE * path.fastest) if longest is None else longest
     edges = []
     for begin, end in path.distinct:
+        length = 1.0 / (_PER_CYCLE * path.fastest(begin, end)) if longest is None else longest
         inner = path.seams[(path.seams > begin) & (path.seams < end)]
         corners = np.concatenate([[begin], inner, [end]])
         for first, last in pairwise(corners.tolist()):

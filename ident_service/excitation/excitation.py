@@ -95,7 +95,7 @@ def excitation_from_json(text: str) -> Excitation:
         UsageError: not a motion; the message says what is wrong with it.
     """
     try:
-        content = json.loads(text)
+        content = json.loads(text, parse_constant=_no_number)
     except (ValueError, RecursionError) as error:
         raise UsageError(f"not JSON: {error}") from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:
@@ -133,6 +133,10 @@ def excitation_from_json(text: str) -> Excitation:
     if not path.duration <= _MOST_DURATION:
         raise UsageError(f"a motion of {path.duration:g} s; the longest is {_MOST_DURATION:g} s")
     return Excitation(name, path, sha256, made)
+
+
+def _no_number(word: str) -> float:
+    raise UsageError(f"{word} is not a number")
 
 
 def _number(content: dict[str, Any], key: str) -> float:

@@ -50,6 +50,12 @@ def expected_friction(model: ArmModel, limits: MotionLimits, guess: tuple[float,
     return ExpectedFriction(np.where(some, known[0], coulomb), np.where(some, known[1], viscous))
 
 
+def dry_friction(model: ArmModel, delta: Array) -> tuple[Array, Array]:
+    """The most that dry friction can take, of every drive and of every joint [N m or N], each of shape (joints,)."""
+    drives = np.abs(model.layout.term_values("coulomb", delta)) + np.abs(model.layout.term_values("stribeck", delta))
+    return drives, drives @ np.abs(model.chain.coupling)
+
+
 class FollowingError:
     """The forecast at many states, with derivatives of whatever is computed from it."""
 

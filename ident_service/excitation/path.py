@@ -46,9 +46,8 @@ class Path(Protocol):
     def seams(self) -> Array:
         """Times between which all derivatives are smooth [s], from 0 to the duration, increasing."""
 
-    @property
-    def fastest(self) -> float:
-        """The highest frequency that matters in the motion [Hz]."""
+    def fastest(self, begin: float, end: float) -> float:
+        """The highest frequency that matters between two times [Hz]."""
 
     def derivatives(self, time: Array, highest: int) -> list[Array]:
         """Position and its time derivatives up to the order `highest` <= 4, each of shape (samples, joints)."""
@@ -114,18 +113,18 @@ class FourierPath:
         ends = [0.0, self.ramp, self.duration - self.ramp, self.duration]
         return np.array(sorted(set(ends)))
 
-    @property
-    def fastest(self) -> float:
-        """Of the highest harmonic, or of the ramp [Hz]."""
+    def fastest(self, begin: float, end: float) -> float:
+        """Of the highest harmonic, or of a ramp [Hz]."""
         highest = self.series.base_frequency * self.series.a.shape[1]
-        return float(max(highest, 1.0 / self.ramp) if self.ramp else highest)
+        in_ramp = self.ramp > 0.0 and (begin < self.ramp or end > self.duration - self.ramp)
+        return float(max(highest, 1.0 / self.ramp) if in_ramp else highest)
 
     def at(self, time: Array | float) -> tuple[Array, Array, Array, Array]:
         """Position, velocity, acceleration and jerk.
 
         Args:
-            time: [s] since the beginning of the first ramp, shape (samples,) or a single number; before and after the
-                motion it stands where it begins and ends.
+            time: [s] since the beginning of the first ramp, shape (samples,) or a single number; before and after a
+                motion with ramps it stands where it begins and ends, one without them goes on.
 
         Returns:
             Four arrays in SI units, shape (samples, joints), or (joints,) for a single time.
@@ -213,8 +212,7 @@ class PosturePath:
         """Where ways begin and end [s]."""
         return np.unique(np.concatenate([[0.0], self._begins[:-1], self._begins[:-1] + self.times, [self.duration]]))
 
-    @property
-    def fastest(self) -> float:
+    def fastest(self, begin: float, end: float) -> float:
         """Of the shortest way [Hz]."""
         return float(1.0 / self.times.min())
 

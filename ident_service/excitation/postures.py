@@ -9,6 +9,7 @@ import numpy as np
 
 from ident_service.config.limits import MotionLimits
 from ident_service.errors import MotionRefused
+from ident_service.excitation.following import dry_friction
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.capsules import CapsuleModel
 from ident_service.model.chain import Array
@@ -61,8 +62,8 @@ def _torque_used(model: ArmModel, limits: MotionLimits, postures: Array) -> Arra
         return np.zeros_like(postures)
     still = np.zeros_like(postures)
     rows = joint_regressor(model.chain, model.layout, postures, still, still)
-    dry = model.layout.term_values("coulomb", model.prior) + model.layout.term_values("stribeck", model.prior)
-    torque = np.abs(np.einsum("jps,p->sj", rows, model.prior)) + np.abs(dry) @ np.abs(model.chain.coupling)
+    _, dry = dry_friction(model, model.prior)
+    torque = np.abs(np.einsum("jps,p->sj", rows, model.prior)) + dry
     return np.asarray(torque / limits.torque)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from ident_service.excitation.basis import maps
 from ident_service.excitation.criteria import Value, criterion
-from ident_service.excitation.following import USABLE, FollowingError
+from ident_service.excitation.following import USABLE, FollowingError, dry_friction
 from ident_service.excitation.task import Task
 from ident_service.model.base import base_parameters
 from ident_service.model.capsules import CapsuleModel
@@ -117,14 +117,13 @@ class Problem:
             return
         base = base_parameters(model.chain, model.layout)
         delta = model.prior.copy()
-        dry = model.layout.term_values("coulomb", delta) + model.layout.term_values("stribeck", delta)
-        self._torque_limit = self._torque_limit - np.abs(model.chain.coupling.T) @ np.abs(dry)
+        self._dry, at_joints = dry_friction(model, delta)
+        self._torque_limit = self._torque_limit - at_joints
         delta[model.layout.term_columns("coulomb")] = 0.0
         delta[model.layout.term_columns("stribeck")] = 0.0
         self._beta = base.K @ delta
         if not np.array_equal(base.base, self.task.columns):
             self._torque_regressor = RegressorGradient(model.chain, model.layout, base.base)
-        self._dry = np.abs(dry)
         self._to_drives = np.linalg.inv(model.chain.coupling)  # drive torques are C^-T tau, rows times C^-1
 
     @property

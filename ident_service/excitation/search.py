@@ -17,6 +17,7 @@ from multiprocessing.synchronize import Event
 
 import numpy as np
 
+from ident_service.errors import UsageError
 from ident_service.excitation.climb import Candidate, Interrupted, Stopped, climbed, random_variables
 from ident_service.excitation.problem import Problem
 from ident_service.excitation.task import Task
@@ -43,6 +44,14 @@ class Budget:
     seconds: float | None = 60.0
     starts: int | None = None
     workers: int = 2
+
+    def __post_init__(self) -> None:
+        if self.seconds is None and self.starts is None:
+            raise UsageError("a search without a bound never ends; give seconds, starts or both")
+        if self.workers < 1 or (self.starts is not None and self.starts < 0):
+            raise UsageError(
+                f"{self.workers=} and {self.starts=}: a search needs one worker or more, and no fewer than 0 starts"
+            )
 
 
 @dataclass(frozen=True)

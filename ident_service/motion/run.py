@@ -29,7 +29,7 @@ from ident_service.motion.speed import Slowed, require_factor
 from ident_service.motion.states import LAWFUL, MOVING, State, next_state
 from ident_service.motion.stop import require_stops_within_limits, stop
 from ident_service.motion.surroundings import require_clear
-from ident_service.motion.way import way
+from ident_service.motion.way import calm_way
 
 _KEPT_SAMPLES = 100
 _REST_CYCLES = 20
@@ -196,7 +196,7 @@ class _Run:
     def _ways(self, home: Vector, limits: MotionLimits) -> list[Reference]:
         exciting = PathReference(self.excitation.path)
         start, end = exciting.at(0.0), exciting.at(exciting.duration)
-        ways: list[Reference] = [way(rest(home), start, limits), exciting, way(end, rest(home), limits)]
+        ways: list[Reference] = [calm_way(rest(home), start, limits), exciting, calm_way(end, rest(home), limits)]
         return [Slowed(reference, self.speed) for reference in ways]
 
     def _loop(self, torque: Vector, ways: list[Reference], limits: MotionLimits, period: float) -> Fault | None:

@@ -5,6 +5,8 @@ Every way is a ruckig trajectory within the arm's velocity, acceleration and jer
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import ruckig
 
@@ -39,6 +41,27 @@ class RuckigReference:
         times = np.linspace(0.0, self.duration, 2 + int(self.duration / _EXTENT_STEP))
         positions = np.array([self._trajectory.at_time(time)[0] for time in times])
         return positions.min(axis=0), positions.max(axis=0)
+
+
+_CALM = 0.5  # of the limits, on the way to a motion and back
+
+
+def calm_way(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference:
+    """The way to a motion or back from it: within half of the velocity and acceleration limits where its ends allow.
+
+    A way at the full limits leaves nothing for what the model does not know, and nobody waits for its last second.
+
+    Raises:
+        MotionRefused: as `way`.
+    """
+    velocity = np.maximum(np.abs(start.velocity), np.abs(end.velocity))
+    acceleration = np.maximum(np.abs(start.acceleration), np.abs(end.acceleration))
+    calm = replace(
+        limits,
+        velocity=np.minimum(limits.velocity, np.maximum(_CALM * limits.velocity, 1.1 * velocity)),
+        acceleration=np.minimum(limits.acceleration, np.maximum(_CALM * limits.acceleration, 1.1 * acceleration)),
+    )
+    return way(start, end, calm)
 
 
 def way(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference:

@@ -27,7 +27,7 @@ from ident_service.model.collision import CollisionModel
 from ident_service.motion.reference import Setpoint, rest
 from ident_service.motion.stop import stop_extent
 from ident_service.motion.surroundings import Nearest, stop_clearance
-from ident_service.motion.way import way
+from ident_service.motion.way import calm_way
 from ident_service.results.parameter_file import read_parameters
 
 _LOOKED_AT = 2000  # samples of every part of a motion that the following error is forecast at
@@ -109,7 +109,7 @@ def preview(
     durations = []
     for leg in ((home, begin), (end, home)):
         try:
-            durations.append(way(leg[0], leg[1], limits).duration)
+            durations.append(calm_way(leg[0], leg[1], limits).duration)
         except MotionRefused as error:
             durations.append(float("nan"))
             found.append(str(error))
