@@ -20,7 +20,7 @@ from ident_service.model.chain import Array
 
 _ROUNDS = ((2.0, 1.0, 60), (4.0, 3.0, 60), (8.0, 9.0, 60), (16.0, 27.0, 80), (24.0, 81.0, 80))
 _POLISH = ((16.0, 30.0, 60), (24.0, 90.0, 80), (32.0, 270.0, 80))
-_HOPELESS = 0.3  # share of a limit that a second round leaves exceeded where no further one will mend it
+_HOPELESS = 0.3  # share of a limit that a third round leaves exceeded where no further one will mend it
 _SPREAD = 0.25  # of the scaled coefficients of a random start
 _HALVINGS = 24
 
@@ -99,7 +99,7 @@ def climbed(
             ).x
             here = problem.state(x, sharpness)
             state = state.tightened(here.limits, 1.0)
-            if sharpness > _ROUNDS[0][0] and here.worst > _HOPELESS:
+            if sharpness >= _ROUNDS[2][0] and here.worst > _HOPELESS:
                 break  # caught on the wrong side of an obstacle; another start will do better
     except Interrupted:
         raise Stopped(_best_of([*before, kept(problem, x, safe, start)])) from None

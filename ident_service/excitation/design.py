@@ -149,6 +149,7 @@ def design_motion(
     noise: Array | None = None,
     added: Array | None = None,
     earlier: Found | None = None,
+    veto: Callable[[FourierPath | PosturePath], str | None] = lambda _: None,
     tell: Callable[[Progress], None] = lambda _: None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> Designed:
@@ -164,6 +165,7 @@ def design_motion(
         noise: standard deviation of each joint's torque, shape (joints,); from the description when None.
         added: information from earlier recordings (`settled`).
         earlier: of a search for the same task, to go on from.
+        veto: what else speaks against a motion of which everything is proven, in words; such a motion is made smaller.
         tell: called from time to time.
         cancelled: asked from time to time; True ends the search with what it has.
 
@@ -181,7 +183,8 @@ def design_motion(
 
     def proven(coefficients: Array) -> Proof | None:
         proof = proof_of(basis.path(coefficients), model, task.limits, collision)
-        return None if objections(proof, model, task.limits) else proof
+        unsound = objections(proof, model, task.limits) or veto(basis.path(coefficients))
+        return None if unsound else proof
 
     best: tuple[float, Array, Proof] | None = None
     for candidate in found.candidates:

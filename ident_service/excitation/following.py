@@ -12,12 +12,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse
 
 from ident_service.config.limits import MotionLimits
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array
 from ident_service.model.inertia_response import InertiaResponse
 
+# Where the inertia behind a joint changes, so does how far it falls behind, and its speed is another than asked for.
+TOLERATED = 1.05  # of the velocity limit; the guard stops at 1.2
 USABLE = 0.8  # of the limit: settling overshoots a little, and the forecast is static
 
 
@@ -89,6 +92,27 @@ class FollowingError:
         """The gradient of `sum(seeds * run(...))` over position and velocity, each of shape (samples, joints)."""
         by_position, by_torque = self._response.pull(seeds / self._kp)
         return by_position, ((by_torque @ self._coupling.T) * self._slope) @ self._coupling
+
+
+def rate_of_change(times: Array) -> scipy.sparse.csr_array:
+    """The matrix that takes values at `times` [s] to their time derivatives, by differences of neighbours.
+
+    Neighbours are samples of one stretch; where times jump or turn back, another stretch begins.
+    """
+    steps = np.diff(times)
+    usual = np.median(np.abs(steps))
+    jumps = np.abs(steps) > 1.6 * usual
+    turns = (np.sign(steps[1:]) != np.sign(steps[:-1])) & ~jumps[:-1]
+    apart = jumps | np.concatenate([[False], turns])
+    stretch = np.concatenate([[0], np.cumsum(apart)])
+    n = len(times)
+    index = np.arange(n)
+    before = np.where((index > 0) & (stretch == np.roll(stretch, 1)), index - 1, index)
+    after = np.where((index < n - 1) & (stretch == np.roll(stretch, -1)), index + 1, index)
+    gap = times[after] - times[before]
+    weight = np.where(gap != 0.0, 1.0 / np.where(gap != 0.0, gap, 1.0), 0.0)
+    rows = np.concatenate([index, index])
+    return scipy.sparse.csr_array((np.concatenate([weight, -weight]), (rows, np.concatenate([after, before]))), (n, n))
 
 
 def forecast(

@@ -17,7 +17,7 @@ import numpy as np
 
 from ident_service.excitation.basis import maps
 from ident_service.excitation.criteria import Value, criterion
-from ident_service.excitation.following import USABLE, FollowingError, dry_friction
+from ident_service.excitation.following import TOLERATED, USABLE, FollowingError, dry_friction, rate_of_change
 from ident_service.excitation.task import Task
 from ident_service.model.base import base_parameters
 from ident_service.model.capsules import CapsuleModel
@@ -25,6 +25,8 @@ from ident_service.model.chain import Array
 from ident_service.model.regressor_gradient import RegressorGradient
 
 _RESERVE = 0.004  # of every limit, for what happens between two samples
+# Likewise for the forecast of the following error, which is static: the arm itself takes its time to settle.
+_TURNING = 0.5
 _CREEP = 0.05  # of the velocity limit: friction's direction turns round over so much, which gives it a gradient
 _DEPTH = 0.05  # m; a clearance missed by so much counts like another limit missed altogether
 _BETWEEN = 0.02  # m, the most that is kept free for what happens between two samples; the proof mends the rest
@@ -91,8 +93,9 @@ class Problem:
         self._torque_parameters()
         self._following: FollowingError | None = None
         if task.friction is not None and model.prior is not None:
-            self._following = FollowingError(model, limits, task.friction, self._creep)
+            self._following = FollowingError(model, limits, task.friction, _TURNING * limits.velocity)
             self._allowed = USABLE * limits.following_error
+            self._rate_of = rate_of_change(times)
         self._capsules = CapsuleModel(model)
         step = float(np.median(np.diff(times)))
         # What a point a metre away from an axis may do between two samples, beyond the straight line between them.
@@ -103,7 +106,7 @@ class Problem:
         self._begin = maps(task.basis, np.zeros(1))[0]
         self.names = ["position", "velocity", "acceleration", "jerk"]
         self.names += ["torque"] * (model.prior is not None) + ["power"] * (self._supply is not None)
-        self.names += ["following error"] * (self._following is not None)
+        self.names += ["following error", "forecast speed"] * (self._following is not None)
         self.names += ["clearance"] * bool(self._capsules.pairs)
 
     def _torque_parameters(self) -> None:
@@ -181,7 +184,9 @@ class Problem:
         if torque is not None:
             signed["torque"] = torque / self._torque_limit
         if self._following is not None:
-            signed["following error"] = self._following.run(q, dq) / self._allowed
+            behind = self._following.run(q, dq)
+            signed["following error"] = behind / self._allowed
+            signed["forecast speed"] = (dq - self._rate_of @ behind) / (TOLERATED * limits.velocity)
         found = {name: np.abs(share) - (1.0 - _RESERVE) for name, share in signed.items()}
         if torque is not None and self._supply is not None:
             found["power"], power_slopes = self._power(torque, dq)
@@ -207,8 +212,9 @@ class Problem:
             on_q = on_q + by_posture[: len(q)]
             on_begin = (self._line * by_posture[len(q) :]).sum(axis=0)
         if self._following is not None:
-            by_q, by_dq = self._following.pull(pushes["following error"] / self._allowed)
-            on_q, on_dq = on_q + by_q, on_dq + by_dq
+            on_speed = pushes["forecast speed"] / (TOLERATED * limits.velocity)
+            by_q, by_dq = self._following.pull(pushes["following error"] / self._allowed - self._rate_of.T @ on_speed)
+            on_q, on_dq = on_q + by_q, on_dq + by_dq + on_speed
         seeds = np.empty_like(H)
         for k, (rows, noise) in enumerate(zip(H, task.noise, strict=True)):
             seeds[k] = (2.0 / noise**2) * (value.gradient @ rows) * self._weights

@@ -66,6 +66,14 @@ def stop_clearance(path: Path, limits: MotionLimits, model: ArmModel) -> Nearest
     return nearest
 
 
+def touching_stop(path: Path, limits: MotionLimits, model: ArmModel) -> str | None:
+    """The stop out of a motion that would touch something, in words; None where none does."""
+    nearest = stop_clearance(path, limits, model)
+    if nearest.distance > 0.0:
+        return None
+    return f"a stop out of the motion at {nearest.time:.2f} s would touch: {nearest.pair}, {nearest.distance:.4f} m"
+
+
 def require_clear(model: ArmModel, path: Path, ways: Sequence[Reference], limits: MotionLimits) -> None:
     """Refuse a run that would come too near to anything.
 
@@ -90,8 +98,5 @@ def require_clear(model: ArmModel, path: Path, ways: Sequence[Reference], limits
                 f"{what} comes within {clearance.lower_bound:.4f} m at {clearance.pair}, {clearance.time:.2f} s; "
                 f"{least:g} m must remain"
             )
-    nearest = stop_clearance(path, limits, model)
-    if nearest.distance <= 0.0:
-        raise MotionRefused(
-            f"a stop out of the motion at {nearest.time:.2f} s would touch: {nearest.pair}, {nearest.distance:.4f} m"
-        )
+    if touching := touching_stop(path, limits, model):
+        raise MotionRefused(touching)

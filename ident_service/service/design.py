@@ -27,6 +27,7 @@ from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.information import Information
+from ident_service.motion.surroundings import touching_stop
 from ident_service.record.open import open_recording
 from ident_service.results.files import appearing_folder, write_atomically
 from ident_service.results.parameter_file import read_parameters
@@ -97,6 +98,7 @@ def design_files(
     design = _changed(model.config.design, request.changes)
     noise = known_noise(model, request.knowledge)
     basis, base = family(design, model)
+    limits = motion_limits(model.config)
     whitening = np.ones_like(noise.deviation) if design.criterion == "condition_number" else noise.deviation
     added = known_information(model, base, request.knowledge, whitening)
     task = settled(model, design, basis, base, noise.deviation, added)
@@ -109,6 +111,7 @@ def design_files(
         noise=noise.deviation,
         added=added,
         earlier=earlier,
+        veto=lambda path: touching_stop(path, limits, model),
         tell=tell,
         cancelled=cancelled,
     )

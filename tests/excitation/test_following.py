@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ident_service.config.limits import motion_limits
-from ident_service.excitation.following import ExpectedFriction, expected_friction, forecast
+from ident_service.excitation.following import ExpectedFriction, expected_friction, forecast, rate_of_change
 from ident_service.model.regressor import joint_regressor
 
 Array = np.ndarray
@@ -67,3 +67,11 @@ def test_friction_is_the_prior_s_or_a_share_of_the_limits_where_it_has_none() ->
     known = expected_friction(replace(model, prior=prior), limits, (0.02, 0.05))
     np.testing.assert_allclose(known.coulomb, [guessed.coulomb[0], 0.7])
     np.testing.assert_allclose(known.viscous, [guessed.viscous[0], 0.0])
+
+
+def test_rates_of_change_know_where_one_stretch_ends_and_another_begins() -> None:
+    rising, falling = np.linspace(0.05, 1.95, 20), 60.0 - np.linspace(0.05, 1.95, 20)
+    times = np.concatenate([rising, np.linspace(2.0, 20.0, 181), falling])
+    rates = rate_of_change(times) @ np.column_stack([np.sin(times), times])
+    np.testing.assert_allclose(rates[:, 1], 1.0, rtol=1e-12)
+    np.testing.assert_allclose(rates[:, 0], np.cos(times), atol=0.06)

@@ -49,7 +49,8 @@ def test_the_gradient_is_what_central_differences_say_with_all_limits_broken(
     problem, rng = Problem(task, 30), np.random.default_rng(seed)
     x = 3.0 * rng.normal(size=problem.size)
     state = problem.state(x, 4.0)
-    assert [name for name in problem.names if name != "clearance"] == ALL_LIMITS[:-1]
+    # What the arm will do differs from the velocity asked for by how fast it falls behind.
+    assert [name for name in problem.names if name not in ("clearance", "forecast speed")] == ALL_LIMITS[:-1]
     for name in ALL_LIMITS[:-1]:
         assume(state.limits[name].max() > 0.0)
     slope, difference, size = slope_and_difference(problem, x, rng)
@@ -73,7 +74,8 @@ def test_the_gradient_of_each_kind_of_limit_alone(name: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
     x = problem.variables(narrow.coefficients(2.0 * rng.normal(size=problem.size)))
     broken = {key for key, values in problem.state(x, 4.0).limits.items() if values.max() > 0.0}
-    assert broken == {name}
+    assert broken == {name} or broken == {name, "forecast speed"}
+    assert (name == "velocity") >= ("forecast speed" in broken)
     # Variables of a problem with wide limits are small; the direction is what counts.
     multipliers = problem.no_multipliers(1e3)
     direction = problem.variables(narrow.coefficients(rng.normal(size=problem.size))) - problem.variables(
