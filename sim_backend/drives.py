@@ -1,6 +1,10 @@
-"""The simulated drives: which torque acts from which stamp on, and what noise acts with it.
+"""The simulated drives: which torque acts from which stamp on, what noise acts with it, and when they give up.
 
-Boundary: torques only, cycle by cycle; who may send one is `arm.py`, what a drive can make of it `imperfections.py`.
+A drive is on, off, or idle. Off, an axis coasts. Idle, its windings are shorted and brake it like viscous friction,
+`tau = -b dq`, as the WAM's do. Without a torque frame for the watchdog's time, whatever the host believes, all drives
+go idle and stay so until they are enabled again.
+
+Boundary: torques only, period by period; who may send one is `arm.py`, what a drive can make of it `imperfections.py`.
 """
 
 from __future__ import annotations
@@ -10,63 +14,176 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from drivers.arm import Vector
+from drivers.arm import StopKind, Vector
+from drivers.status import AxisStatus
 from sim_backend.faults import Fault, FaultKind
 from sim_backend.imperfections import Imperfections
 
+_SILENT = 1 << 16  # an axis that no longer talks; no host ever reads this bit
+# What a fault latches in the axes it strikes. All but a drive's own fault leave the axis idle.
+_TRIPS: dict[FaultKind, int] = {
+    FaultKind.DRIVE_FAULT: AxisStatus.FAULT,
+    FaultKind.EMERGENCY_STOP: AxisStatus.EMERGENCY_STOP | AxisStatus.IDLE,
+    FaultKind.NODE_SILENT: _SILENT | AxisStatus.IDLE,
+}
+_WHY = {
+    FaultKind.DRIVE_FAULT: "its drive has a fault",
+    FaultKind.EMERGENCY_STOP: "the emergency stop is pressed",
+    FaultKind.NODE_SILENT: "it does not answer",
+}
+
 
 class Drives:
-    """A latch behind a queue, for all axes; it starts without torque."""
+    """A latch behind a queue, for all axes; it starts without torque.
 
-    def __init__(self, imperfections: Imperfections, delay_cycles: int, noise: np.random.Generator) -> None:
+    Attributes:
+        acting: what a sample says acts from the last stamp on, without noise [N m or N], shape (joints,), read-only.
+        torque: what really does, where these differ; as `acting`.
+        damping: with what idle axes are braked [N m s/rad or N s/m], shape (joints,), read-only.
+        on: whether the host has energised them.
+    """
+
+    def __init__(
+        self,
+        imperfections: Imperfections,
+        delay_cycles: int,
+        noise: np.random.Generator,
+        braking: Vector,
+        watchdog: int,
+    ) -> None:
         """Set up the queue.
 
         Args:
             imperfections: clip, steps and noise.
             delay_cycles: 1 for torques that act from the stamp of their cycle on, more to let them wait.
-            noise: draws once per cycle that the drives are on, if there is noise at all.
+            noise: draws once per period that the drives are on, if there is noise at all.
+            braking: damping of an idle axis [N m s/rad or N s/m], shape (joints,).
+            watchdog: periods without a torque frame after which the drives go idle.
         """
         self._imperfections = imperfections
         self._waiting = delay_cycles - 1
         self._noise = noise
         self._noisy = bool(imperfections.torque_noise.any())
-        self._on = False
-        self.acting = _frozen(np.zeros_like(imperfections.torque_limit))
-        self.forget()
+        self._braking = braking
+        self._watchdog = watchdog
+        joints = imperfections.torque_limit.size
+        self._none = _frozen(np.zeros(joints))
+        self._trips = np.zeros(joints, dtype=np.int64)
+        self._full = _frozen(np.ones(joints))
+        self._powered = self._none
+        self._energised = False
+        self._silent = 0
+        self.on = False
+        self.acting = self.torque = self.damping = self._none
+        self._words = (0,) * joints
+        self._command = self._wanted = self._none
+        self._queue: deque[Vector] = deque()
+        self._forget()
 
-    def forget(self) -> None:
-        """Drop every torque that has not begun to act; nothing acts from the next latch on."""
-        self._command = _frozen(np.zeros_like(self.acting))
-        self._queue = deque([self._command] * self._waiting)
+    @property
+    def gave_up(self) -> bool:
+        """Whether the watchdog's time has passed without a frame."""
+        return self._silent >= self._watchdog
 
-    def latch(self, torque: Vector | None, faults: Sequence[Fault], on: bool) -> Vector:
+    @property
+    def status(self) -> tuple[int, ...]:
+        """Bits of `AxisStatus` per axis."""
+        return self._words
+
+    def enable(self) -> None:
+        """Energise without torque, and forget why the drives had given up."""
+        self._forget()
+        self._trips[:] = 0
+        self._silent = 0
+        self.on = True
+
+    def release(self, kind: StopKind) -> None:
+        """Drop every torque that has not begun to act; a quick stop leaves all axes idle until enabled again."""
+        self._forget()
+        self.on = False
+        if kind is StopKind.QUICK_STOP:
+            self._trips |= int(AxisStatus.IDLE)
+
+    def restart(self) -> None:
+        """Begin anew, off; drives that gave up stay as they are until enabled."""
+        self.release(StopKind.TORQUE_OFF)
+        self._silent = 0
+        self.acting = self.torque = self.damping = self._none
+
+    def refusal(self, faults: Sequence[Fault], names: Sequence[str]) -> str | None:
+        """Why the drives cannot be enabled while these faults strike; None if they can."""
+        for fault in faults:
+            if fault.kind in _WHY:
+                which = "all axes" if fault.joint is None else names[fault.joint]
+                return f"{which}: {_WHY[fault.kind]}"
+        return None
+
+    def latch(self, torque: Vector | None, faults: Sequence[Fault]) -> Vector:
         """Begin the period from this stamp to the next.
 
         Args:
-            torque: asked for [N m or N], shape (joints,); None asks for the last one again.
+            torque: asked for [N m or N], shape (joints,); None asks for the last one again, and is no torque frame.
             faults: those active.
-            on: whether the drives are energised; noise needs power.
 
         Returns:
-            What acts from this stamp on, without noise [N m or N], shape (joints,), read-only.
+            `acting`.
         """
         if torque is not None:
             self._command = _frozen(self._imperfections.drive(torque))
+        self._silent = self._silent + 1 if torque is None and self.on else 0
         self._queue.append(self._command)
-        acting = self._queue.popleft()
-        for fault in faults:
-            if fault.kind is FaultKind.STUCK_TORQUE:
-                acting = acting.copy()
-                acting[fault.axes] = self.acting[fault.axes]
-        self.acting = _frozen(acting)
-        self._on = on
-        return self.acting
+        self._wanted = self._queue.popleft()
+        return self._begin(faults)
+
+    def hold(self, faults: Sequence[Fault]) -> None:
+        """Begin a period in which no frame came at all."""
+        self._silent += 1
+        self._begin(faults)
 
     def output(self) -> Vector:
-        """What moves the plant for one period: the acting torque and its noise [N m or N], shape (joints,)."""
-        if not (self._noisy and self._on):
-            return self.acting
-        return self.acting + self._imperfections.torque_noise * self._noise.standard_normal(self.acting.size)
+        """What moves the plant for one period: the torque and its noise [N m or N], shape (joints,)."""
+        if not (self._noisy and self._energised):
+            return self.torque
+        noise = self._imperfections.torque_noise * self._noise.standard_normal(self.torque.size)
+        return self.torque + noise * self._powered
+
+    def _forget(self) -> None:
+        self._command = self._wanted = self._none
+        self._queue = deque([self._command] * self._waiting)
+
+    def _begin(self, faults: Sequence[Fault]) -> Vector:
+        trips, wanted = self._trips, self._wanted
+        self._energised = self.on
+        if self._silent >= self._watchdog:
+            trips |= int(AxisStatus.IDLE | AxisStatus.WATCHDOG if self.on else AxisStatus.IDLE)
+        for fault in faults:
+            trips[fault.axes] |= _TRIPS.get(fault.kind, 0)
+        if not faults and not trips.any():
+            self.acting = self.torque = wanted
+            self.damping = self._none
+            self._powered = self._full if self.on else self._none
+            self._words = (int(self.on),) * wanted.size
+            return wanted
+        told = wanted.copy()
+        for fault in faults:
+            axes = fault.axes
+            if fault.kind is FaultKind.STUCK_TORQUE:
+                told[axes] = self.acting[axes]
+            elif fault.kind is FaultKind.TORQUE_SATURATION:
+                reach = fault.size * self._imperfections.torque_limit[axes]
+                told[axes] = np.clip(told[axes], -reach, reach)
+        told[(trips & ~(_SILENT | int(AxisStatus.IDLE))) != 0] = 0.0
+        told[trips == int(AxisStatus.IDLE)] = 0.0
+        really = np.where(trips != 0, 0.0, told)
+        for fault in faults:
+            if fault.kind is FaultKind.TORQUE_SIGN:
+                really[fault.axes] *= -1.0
+        self.acting, self.torque = _frozen(told), _frozen(really)
+        self.damping = _frozen(np.where(trips & int(AxisStatus.IDLE), self._braking, 0.0))
+        self._powered = _frozen(np.where((trips == 0) & self.on, 1.0, 0.0))
+        words = np.where(trips == 0, int(self.on), trips & ~_SILENT)
+        self._words = tuple(words.tolist())
+        return self.acting
 
 
 def _frozen(array: Vector) -> Vector:

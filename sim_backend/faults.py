@@ -1,29 +1,25 @@
 """Faults to inject into the simulated arm, so that whoever guards a motion can be seen to notice them.
 
+`FAULT_RULES` says in words what each kind does. What it does to readings is the table `_SHOWN` here, to drives
+`drives.py`, to the body `machine.py`, to time `schedule.py`.
+
 Boundary: which fault strikes when, and what it does to one cycle's readings; the arm asks, nothing here has a clock.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 
 from drivers.arm import Counts, Flags, Vector
+from ident_service.config.simulation import FAULT_RULES, SimulatedFault
+from ident_service.config.simulation import FaultKind as FaultKind
+from ident_service.errors import DriverError
 
-
-class FaultKind(Enum):
-    """What can go wrong."""
-
-    LOST_FEEDBACK = "lost_feedback"  # no answer: invalid, ageing, the last position repeated
-    ENCODER_JUMP = "encoder_jump"  # `size` added to the position while it lasts
-    FROZEN_ENCODER = "frozen_encoder"  # the last position repeated, as if it were fresh
-    NAN_POSITION = "nan_position"  # not a number, as if it were one
-    STUCK_TORQUE = "stuck_torque"  # the torque of the cycle before goes on acting
-    BUS_GONE = "bus_gone"  # exchange raises, the torque of the cycle before goes on acting
-    LATE_CYCLE = "late_cycle"  # exchange returns `size` seconds after its deadline
+LONGEST_DELAY = 1000  # cycles of positions kept for delayed feedback
 
 
 @dataclass(frozen=True)
@@ -31,65 +27,140 @@ class Fault:
     """One fault.
 
     Attributes:
-        at_cycle: first cycle it strikes.
+        at_cycle: first cycle it strikes, counted from `open`; in a separate process in real time, first period.
         kind: what goes wrong.
         joint: index of the axis, None for all.
-        duration: cycles it lasts.
-        size: of a jump [rad or m], of a delay [s].
+        duration: cycles it lasts; None for one cycle or for good, as `FAULT_RULES` says.
+        size: what `FAULT_RULES` says.
+        offset: of a load, in the frame of the last link [m].
     """
 
     at_cycle: int
     kind: FaultKind
     joint: int | None = None
-    duration: int = 1
+    duration: int | None = None
     size: float = 0.0
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def axes(self) -> slice:
         """The axes it strikes."""
         return slice(None) if self.joint is None else slice(self.joint, self.joint + 1)
 
+    def strikes(self, cycle: int) -> bool:
+        """Whether it strikes in this cycle."""
+        if cycle < self.at_cycle:
+            return False
+        if self.duration is None:
+            return FAULT_RULES[self.kind].stays or cycle == self.at_cycle
+        return cycle < self.at_cycle + self.duration
+
 
 def active_faults(faults: Sequence[Fault], cycle: int) -> tuple[Fault, ...]:
     """The faults that strike in this cycle."""
-    return tuple(fault for fault in faults if fault.at_cycle <= cycle < fault.at_cycle + fault.duration)
+    return tuple([fault for fault in faults if fault.strikes(cycle)]) if faults else ()
 
 
-# What becomes of (the fresh position, the last one shown) of the axes struck, given the fault's size.
-_SHOWN: dict[FaultKind, Callable[[Vector, Vector, float], Vector]] = {
-    FaultKind.LOST_FEEDBACK: lambda fresh, last, size: last,
-    FaultKind.ENCODER_JUMP: lambda fresh, last, size: fresh + size,
-    FaultKind.FROZEN_ENCODER: lambda fresh, last, size: last,
-    FaultKind.NAN_POSITION: lambda fresh, last, size: np.full_like(fresh, np.nan),
+def configured_faults(faults: Sequence[SimulatedFault], names: Sequence[str], period: float) -> tuple[Fault, ...]:
+    """Faults as a configuration describes them, in cycles and joint numbers.
+
+    Args:
+        faults: from the driver section.
+        names: of the joints.
+        period: of the control loop [s].
+
+    Raises:
+        DriverError: a joint that the arm does not have.
+    """
+    found = []
+    for fault in faults:
+        if fault.joint is not None and fault.joint not in names:
+            raise DriverError(f"driver.faults: joint {fault.joint!r} is none of {', '.join(names)}")
+        at_cycle = fault.cycle if fault.cycle is not None else round((fault.at or 0.0) / period)
+        found.append(
+            Fault(
+                at_cycle,
+                fault.kind,
+                None if fault.joint is None else list(names).index(fault.joint),
+                None if fault.duration is None else max(1, round(fault.duration / period)),
+                fault.size or 0.0,
+                fault.offset or (0.0, 0.0, 0.0),
+            )
+        )
+    return tuple(found)
+
+
+# What becomes of (the fresh position, the last one shown, the one of `size` seconds ago) of the axes struck.
+_SHOWN: dict[FaultKind, Callable[[Vector, Vector, Vector, float], Vector]] = {
+    FaultKind.LOST_FEEDBACK: lambda fresh, last, old, size: last,
+    FaultKind.NODE_SILENT: lambda fresh, last, old, size: last,
+    FaultKind.DELAYED_FEEDBACK: lambda fresh, last, old, size: old,
+    FaultKind.HIDDEN_DELAY: lambda fresh, last, old, size: old,
+    FaultKind.ENCODER_JUMP: lambda fresh, last, old, size: fresh + size,
+    FaultKind.ENCODER_OFFSET: lambda fresh, last, old, size: fresh + size,
+    FaultKind.FROZEN_ENCODER: lambda fresh, last, old, size: last,
+    FaultKind.NAN_POSITION: lambda fresh, last, old, size: np.full_like(fresh, np.nan),
+    FaultKind.POSITION_SIGN: lambda fresh, last, old, size: -fresh,
 }
+_UNANSWERED = (FaultKind.LOST_FEEDBACK, FaultKind.NODE_SILENT)
 
 
 class Feedback:
-    """What the receiving side knows of the axes: last positions, their ages, frames lost."""
+    """What the receiving side knows of the axes: last positions and status words, their ages, frames lost."""
 
-    def __init__(self, joints: int) -> None:
+    def __init__(self, joints: int, period: float) -> None:
+        """Know nothing yet.
+
+        Args:
+            joints: their number.
+            period: of the cycles [s], in which delays are counted.
+        """
         # An axis that never answered has no position to repeat.
         self._last = np.full(joints, np.nan)
         self._age = np.zeros(joints, dtype=np.int64)
+        self._period = period
+        self._history: deque[Vector] = deque(maxlen=LONGEST_DELAY + 1)
+        self._status = (0,) * joints
         self.lost = 0
 
-    def receive(self, fresh: Vector, faults: Sequence[Fault]) -> tuple[Vector, Flags, Counts]:
-        """Pass one cycle's positions through the faults of that cycle.
+    def receive(
+        self, fresh: Vector, status: tuple[int, ...], faults: Sequence[Fault]
+    ) -> tuple[Vector, Flags, Counts, tuple[int, ...]]:
+        """Pass one cycle's answers through the faults of that cycle.
 
         Args:
-            fresh: what the encoders show [rad or m], shape (joints,); may be written into.
+            fresh: what the encoders show [rad or m], shape (joints,); kept.
+            status: what the drives say, per axis.
             faults: those active.
 
         Returns:
-            Positions, validity and age as a sample holds them, new arrays of shape (joints,).
+            Positions, validity, age and status words as a sample holds them, arrays new and of shape (joints,).
         """
+        self._history.append(fresh)
         answered = np.ones(fresh.shape, dtype=bool)
+        if not faults:
+            self._age = np.zeros_like(self._age)
+            self._last, self._status = fresh, status
+            return fresh.copy(), answered, self._age.copy(), status
+        shown, delayed = fresh.copy(), np.zeros_like(self._age)
         for fault in faults:
-            if (shown := _SHOWN.get(fault.kind)) is not None:
-                fresh[fault.axes] = shown(fresh[fault.axes], self._last[fault.axes], fault.size)
-            if fault.kind is FaultKind.LOST_FEEDBACK:
-                answered[fault.axes] = False
-        self._age = np.where(answered, 0, self._age + 1)
+            if (effect := _SHOWN.get(fault.kind)) is None:
+                continue
+            axes, old = fault.axes, fresh
+            if fault.kind in (FaultKind.DELAYED_FEEDBACK, FaultKind.HIDDEN_DELAY):
+                cycles = min(round(fault.size / self._period), len(self._history) - 1)
+                old = self._history[-1 - cycles]
+                if fault.kind is FaultKind.DELAYED_FEEDBACK:
+                    delayed[axes] = cycles
+            shown[axes] = effect(shown[axes], self._last[axes], old[axes], fault.size)
+            if fault.kind in _UNANSWERED:
+                answered[axes] = False
+        self._age = np.where(answered, delayed, self._age + 1)
         self.lost += int(answered.size - np.count_nonzero(answered))
-        self._last = fresh
-        return fresh.copy(), answered, self._age.copy()
+        if not answered.all():
+            status = tuple(
+                new if heard else before
+                for new, before, heard in zip(status, self._status, answered.tolist(), strict=True)
+            )
+        self._last, self._status = shown, status
+        return shown.copy(), answered & (delayed == 0), self._age.copy(), status

@@ -9,6 +9,9 @@ direction, and unconditionally sticking where one comes to rest::
     (M(q_m) + h/2 fv) (v+ - v)/h = tau - c(q_m, v_m) - g(q_m) - fo - fv v - lambda,  lambda_i in fc_i Sgn(v+_i)
     q+ = q + h/2 (v + v+)
 
+Idle drives brake like more of `fv`. A load is a point mass that moves with the last link, on which it appears without
+an impact.
+
 Boundary: the only file of this room that knows pinocchio; no clock, no encoder, no noise.
 """
 
@@ -22,6 +25,8 @@ from ident_service.model.chain import Array, Chain
 from ident_service.model.layout import Layout
 from ident_service.model.rigid_body import InverseDynamics, pinocchio_model
 from sim_backend.friction import stick_slip_velocity
+
+Load = tuple[float, tuple[float, float, float]]
 
 
 class Plant:
@@ -43,19 +48,17 @@ class Plant:
         """
         if position.shape != (chain.joints,):
             raise ModelError(f"{position.shape=} but the chain has {chain.joints} joints")
-        self._chain = chain
+        self._chain, self._layout, self._delta = chain, layout, np.array(delta, dtype=float)
         self._period = period
         self._half = 0.5 * period
-        self._inverse = InverseDynamics(chain, layout, delta)
         self._viscous = layout.term_values("viscous", delta)
         self._coulomb = layout.term_values("coulomb", delta)
         self._offset = layout.term_values("offset", delta)
         if (self._viscous < 0.0).any() or (self._coulomb < 0.0).any():
             raise ModelError("negative friction would drive the arm; fv and fc must not be negative")
-        # Implicit viscous friction acts like more drive inertia, so that it costs nothing to solve for.
-        self._model = pinocchio_model(chain, layout, delta)
-        self._model.armature = np.asarray(self._model.armature) + self._half * self._viscous
-        self._data = self._model.createData()
+        self._braking = np.zeros(chain.joints)
+        self._loads: tuple[Load, ...] = ()
+        self._build(self._delta)
         # What a velocity times its old sign must exceed for a joint to go on sliding; frictionless joints always do.
         self._keeps_on = np.where(self._coulomb > 0.0, 0.0, -np.inf)
         self._set(np.array(position, dtype=float), np.zeros(chain.joints), np.zeros(chain.joints))
@@ -87,6 +90,35 @@ class Plant:
         """Mean over the last step [rad/s^2 or m/s^2], shape (joints,), read-only."""
         return self._acceleration
 
+    @property
+    def inertia(self) -> Array:
+        """Of each joint, all others held, where the arm is: the diagonal of M(q) [kg m^2 or kg], shape (joints,)."""
+        return np.array(np.diag(self._inverse.mass_matrix(self._position)))
+
+    def brake(self, damping: Array) -> None:
+        """Add viscous friction to every step from now on [N m s/rad or N s/m], shape (joints,), none negative."""
+        if damping is not self._braking:
+            self._braking = damping
+            self._damp()
+
+    def load(self, loads: tuple[Load, ...]) -> None:
+        """Attach point masses to the last link, in place of those attached before.
+
+        Args:
+            loads: mass [kg] and offset in the frame of the last link [m] of each.
+        """
+        if loads == self._loads:
+            return
+        delta = self._delta.copy()
+        inertial = delta[self._layout.inertial(self._chain.joints - 1)]  # a view
+        for mass, offset in loads:
+            x, y, z = offset
+            inertial[:6] += mass * np.array([y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y])
+            inertial[6:9] += mass * np.array(offset)
+            inertial[9] += mass
+        self._loads = loads
+        self._build(delta)
+
     def step(self, torque: Array) -> None:
         """Advance by one period under a constant torque.
 
@@ -101,7 +133,7 @@ class Plant:
         q_m = self._position + self._half * v
         # A joint at rest is predicted to stay there: its last mean acceleration is the impact that stopped it.
         v_m = v + self._half * (self._acceleration * np.abs(sign))
-        smooth = torque - self._offset - self._viscous * v
+        smooth = torque - self._offset - self._damping * v
         a = pin.aba(self._model, self._data, q_m, v_m, smooth - self._coulomb * sign)
         v_next = v + self._period * a
         if not (v_next * sign > self._keeps_on).all():
@@ -121,6 +153,18 @@ class Plant:
         """
         friction = self._viscous * velocity + self._coulomb * np.sign(velocity) + self._offset
         return np.asarray(self._inverse.torque(position, velocity, acceleration) + friction)
+
+    def _build(self, delta: Array) -> None:
+        self._inverse = InverseDynamics(self._chain, self._layout, delta)
+        self._model = pinocchio_model(self._chain, self._layout, delta)
+        self._data = self._model.createData()
+        self._armature = np.array(self._model.armature)
+        self._damp()
+
+    def _damp(self) -> None:
+        # Implicit viscous friction acts like more drive inertia, so that it costs nothing to solve for.
+        self._damping = self._viscous + self._braking
+        self._model.armature = self._armature + self._half * self._damping
 
     def _stick_or_slip(self, q_m: Array, v_m: Array, smooth: Array) -> Array:
         A = np.array(pin.crba(self._model, self._data, q_m))

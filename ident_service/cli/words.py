@@ -137,6 +137,14 @@ def share(text: str) -> float:
     return value
 
 
+def speed(text: str) -> float:
+    """Above 0 and at most 1."""
+    value = _positive(text, "a speed is a share above 0 and at most 1")
+    if value > 1.0:
+        raise argparse.ArgumentTypeError("a speed is a share above 0 and at most 1")
+    return value
+
+
 def _positive(text: str, otherwise: str) -> float:
     try:
         value = float(text)

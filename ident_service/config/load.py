@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from ident_service.config import design, recording, workspace
+from ident_service.config import design, recording, simulation, workspace
 from ident_service.config.quantities import Section
 from ident_service.config.recording import RecordingFormat
 from ident_service.config.schema import ArmConfig, DHTable, FourierMotion, SimulatedDriver
@@ -125,6 +125,7 @@ def _disagreements(config: ArmConfig) -> Iterator[tuple[KeyPath, str]]:
             given = getattr(config.driver, key)
             if isinstance(given, tuple) and len(given) != len(names):
                 yield ("driver", key), f"driver.{key}: {len(given)} values for {len(names)} joints"
+        yield from simulation.disagreements(config.driver, names)
     yield from recording.disagreements(config.recording, config.transmission, names)
     yield from workspace.disagreements(config.geometry, config.workspace, config.supply, names)
     yield from design.disagreements(config.design, names)

@@ -25,6 +25,7 @@ from ident_service.config.quantities import (
     Vector3,
 )
 from ident_service.config.recording import RecordingFormat, Transmission
+from ident_service.config.simulation import SimulatedFault
 from ident_service.config.workspace import Geometry, Supply, Workspace
 
 JointTerm = Literal["drive_inertia", "viscous", "coulomb", "offset", "stribeck", "quadratic", "viscous_asymmetry"]
@@ -290,16 +291,28 @@ class Motions(Section):
 
 
 class SimulatedDriver(Section):
-    """The simulated arm: true parameters and imperfections, all per joint or one number for all."""
+    """The simulated arm: true parameters and imperfections, all per joint or one number for all.
+
+    `process` says where its plant lives; `bus` names a separate one that other processes may ask for, `status` the file
+    it reports to, `deadline` [s] how long an answer of it may take. `watchdog` [s] without a torque frame makes
+    the drives idle; idle drives brake with `braking` [N m s/rad].
+    """
 
     kind: Literal["simulated"]
     time: Literal["virtual", "real"] = "virtual"
+    process: Literal["own", "separate"] = "own"
+    bus: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")] | None = None
+    status: str | None = None
+    deadline: Positive | None = None
     seed: Seed = 0
     truth: ParameterTable | None = None
     encoder_resolution: PerJoint = 0.0
     torque_resolution: PerJoint = 0.0
     torque_noise: PerJoint = 0.0
     delay_cycles: Annotated[Count, Field(le=100)] = 1
+    watchdog: Positive = 0.01
+    braking: PerJoint | None = None
+    faults: tuple[SimulatedFault, ...] = ()
 
 
 class PluginDriver(Section):

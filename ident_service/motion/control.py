@@ -1,9 +1,11 @@
-"""Computed torque with a proportional and derivative loop (5.2.1, eq. 76, figure 3).
+"""Computed torque with a proportional and derivative loop (5.2.1, eq. 76, figure 3), and damping alone.
 
     alpha = ddq_r + K_d (dq_r - dq) + K_p (q_r - q)          tau = M(q) alpha + c(q, dq) + g(q)
 
 with the prior (CAD) model. Velocity comes from encoder differences through a first-order low-pass, because at 1 kHz
-one encoder step is a tenth of a radian per second.
+one encoder step is a tenth of a radian per second. An arm that is only held, or lowered, is asked for no position:
+
+    tau = -M(q) K_d dq + c(q, dq) + s g(q) + tau_0
 """
 
 from __future__ import annotations
@@ -20,9 +22,10 @@ class ComputedTorque:
     """The control law and its velocity filter.
 
     Attributes:
+        position: of the last update [rad or m], shape (joints,), predicted where it was not measured.
         velocity: filtered velocity of the last update [rad/s or m/s], shape (joints,).
         correction: what the errors added to the last torque, `M(q) (K_d (dq_r - dq) + K_p (q_r - q))` [N m or N],
-            shape (joints,).
+            shape (joints,); nothing when the arm is only damped.
     """
 
     def __init__(
@@ -41,9 +44,10 @@ class ComputedTorque:
         self._kp, self._kd = limits.kp, limits.kd
         self._period = period
         self._gain = 1.0 - float(np.exp(-2.0 * np.pi * velocity_cutoff * period))
-        self._position = position.copy()
+        self.position = position.copy()
         self.velocity = np.zeros_like(position)
-        self.correction = np.zeros_like(position)
+        self._none = np.zeros_like(position)
+        self.correction = self._none
 
     def torque(self, position: Vector, valid: Flags, reference: Setpoint) -> Vector:
         """One update.
@@ -56,10 +60,7 @@ class ComputedTorque:
         Returns:
             Torque [N m or N], shape (joints,), not yet limited.
         """
-        if not valid.all():
-            position = np.where(valid, position, self._position + self._period * self.velocity)
-        self.velocity = self.velocity + self._gain * ((position - self._position) / self._period - self.velocity)
-        self._position = position
+        position = self._filtered(position, valid)
         alpha = (
             reference.acceleration
             + self._kd * (reference.velocity - self.velocity)
@@ -68,3 +69,30 @@ class ComputedTorque:
         torque = self._dynamics.torque(position, self.velocity, alpha)
         self.correction = torque - self._dynamics.torque(position, self.velocity, reference.acceleration)
         return torque
+
+    def damping(self, position: Vector, valid: Flags, share: float = 1.0, added: Vector | float = 0.0) -> Vector:
+        """One update without a reference.
+
+        Args:
+            position: as for `torque`.
+            valid: as for `torque`.
+            share: of gravity to compensate.
+            added: tau_0, what else is needed to stand [N m or N], shape (joints,).
+
+        Returns:
+            Torque [N m or N], shape (joints,), not yet limited.
+        """
+        position = self._filtered(position, valid)
+        self.correction = self._none
+        torque = self._dynamics.torque(position, self.velocity, -self._kd * self.velocity) + added
+        if share < 1.0:
+            torque = torque - (1.0 - share) * self._dynamics.torque(position, self._none, self._none)
+        return torque
+
+    def _filtered(self, position: Vector, valid: Flags) -> Vector:
+        """Update the velocity; the position, with predictions where it was not measured."""
+        if not valid.all():
+            position = np.where(valid, position, self.position + self._period * self.velocity)
+        self.velocity = self.velocity + self._gain * ((position - self.position) / self._period - self.velocity)
+        self.position = position
+        return position

@@ -1,85 +1,105 @@
-"""What must be true in every cycle before a torque leaves, and what happens when it is not.
+"""What must be true of every sample and of every torque, before the torque leaves.
 
-One table, after FIELDBUS.md 5.2. A controlled stop needs fresh feedback of all axes; where that is missing, or the
-arm is where no controller should have brought it, torque is taken away. Escalation is one-way.
+Nearly all cycles are healthy, so all thresholds are compared at once, in one array. Only when one of them does not hold
+is each looked at by itself (`checks.py`) and put into words. A number that is none holds no threshold.
+
+Boundary: samples and torques; time is `deadlines.py`'s, what follows from a fault is the table in `faults.py` and
+`loop.py`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from enum import IntEnum
-
 import numpy as np
 
-from drivers.arm import Flags, Sample, Vector
+from drivers.arm import Counts, Flags, Sample, Vector
+from drivers.status import TRIPPED, AxisStatus
 from ident_service.config.limits import MotionLimits
+from ident_service.model.outline import Outline
+from ident_service.motion.checks import (
+    ENVELOPE,
+    ENVELOPE_SLACK,
+    FROZEN_CYCLES,
+    FROZEN_EFFORT,
+    JUMP,
+    NOT_APPLIED,
+    SUDDEN_CYCLES,
+    SUDDEN_SPEED,
+    VELOCITY_STOP,
+    Check,
+    Seen,
+    checks,
+    in_words,
+)
+from ident_service.motion.faults import Fault as Fault  # who uses a guard needs these too
+from ident_service.motion.faults import Findings
+from ident_service.motion.faults import Reaction as Reaction
 from ident_service.motion.reference import Setpoint
 
-
-class Reaction(IntEnum):
-    """What a fault leads to, from mild to severe."""
-
-    WARN = 0
-    CONTROLLED_STOP = 1
-    TORQUE_OFF = 2
-
-
-@dataclass(frozen=True)
-class Fault:
-    """Something that must not be, found in one cycle."""
-
-    code: str
-    reaction: Reaction
-    message: str
-
-
-REACTIONS: dict[str, Reaction] = {
-    "torque_saturated": Reaction.WARN,
-    "encoder_jump": Reaction.WARN,
-    "lost_feedback": Reaction.WARN,
-    "encoder_jumps": Reaction.CONTROLLED_STOP,
-    "position_limit": Reaction.CONTROLLED_STOP,
-    "over_velocity": Reaction.CONTROLLED_STOP,
-    "following_error": Reaction.CONTROLLED_STOP,
-    "recorder_behind": Reaction.CONTROLLED_STOP,
-    "feedback_gone": Reaction.TORQUE_OFF,
-    "feedback_not_finite": Reaction.TORQUE_OFF,
-    "frozen_encoder": Reaction.TORQUE_OFF,  # a controlled stop would turn against a position that never comes
-    "far_outside": Reaction.TORQUE_OFF,
-    "runaway": Reaction.TORQUE_OFF,
-    "torque_not_finite": Reaction.TORQUE_OFF,
-    "torque_absurd": Reaction.TORQUE_OFF,
-    "driver": Reaction.TORQUE_OFF,
-}
-
-MAX_AGE = 3  # cycles without an axis' feedback before it counts as gone (FIELDBUS.md: 3 to 5)
-VELOCITY_STOP, VELOCITY_OFF = 1.2, 2.0  # times the velocity limit
-JUMP = 4.0  # times what the velocity limit allows in one cycle, away from where the arm should have gone on to
-# A position that stays the same to the last bit for so many cycles, while the controller asks for more than this share
-# of the torque limit beyond the model's torque: no free joint stands that long against that much.
-FROZEN_CYCLES, FROZEN_EFFORT = 20, 0.2
 ABSURD = 3.0  # times the torque limit: no controller of ours asks for that
+# Change of torque: libfranka's 1000 N m/s; on small joints, of whom that asks nothing, from none to full in 10 ms.
+TORQUE_RATE, TORQUE_RATE_SHARE = 1000.0, 100.0  # N m/s or N/s; times the torque limit per second
 
 
 class Guard:
     """Checks every sample and every torque of one motion.
 
     Attributes:
-        warnings: how often each mild fault was seen.
+        findings: makes the faults and counts the warnings, of others than the guard too.
+        rate: largest change of torque per cycle [N m or N], shape (joints,).
     """
 
-    def __init__(self, joint_names: tuple[str, ...], limits: MotionLimits, period: float, position: Vector) -> None:
-        """Begin with the arm standing at `position` [rad or m], shape (joints,); `period` [s]."""
-        self.warnings: dict[str, int] = {}
-        self._names = joint_names
-        self._limits = limits
-        self._period = period
-        self._largest_jump = JUMP * limits.velocity * period
-        self._position = position.copy()
-        self._age = np.zeros(len(position), dtype=np.int64)
-        self._jumps = np.zeros(len(position), dtype=np.int64)
-        self._shown = position.copy()
-        self._still = np.zeros(len(position), dtype=np.int64)
+    def __init__(
+        self,
+        joint_names: tuple[str, ...],
+        limits: MotionLimits,
+        period: float,
+        position: Vector,
+        *,
+        revolute: tuple[bool, ...] | None = None,
+        outline: Outline | None = None,
+    ) -> None:
+        """Begin with the arm standing somewhere.
+
+        Args:
+            joint_names: for the sentences.
+            limits: of the arm.
+            period: of the loop [s].
+            position: where it stands [rad or m], shape (joints,).
+            revolute: which joints turn, for the units in the sentences; all when None.
+            outline: what may not pass planes; without one, nothing is checked.
+        """
+        joints = len(position)
+        self.findings = Findings()
+        self.rate = np.minimum(TORQUE_RATE, TORQUE_RATE_SHARE * limits.torque) * period
+        self._names, self._limits, self._period = joint_names, limits, period
+        self._units = tuple("rad" if turns else "m" for turns in revolute or (True,) * joints)
+        self._outline = outline if outline is not None and outline.pairs else None
+        self._pairs = outline.pairs if outline is not None else ()
+        self._position = self._shown = position.copy()
+        self._age: Counts = np.zeros(joints, dtype=np.int64)
+        self._jumps: Counts = np.zeros(joints, dtype=np.int64)
+        self._still: Counts = np.zeros(joints, dtype=np.int64)
+        self._unchanged: Counts = np.zeros(joints, dtype=np.int64)
+        self._sudden = np.zeros(joints, dtype=bool)
+        self._all_fresh = self._none_still = self._all_change = True
+        self._depths = np.zeros(len(self._pairs))
+        self._sent: Vector | None = None
+        self._healthy: tuple[int, ...] = ()
+        self._was_powered = np.zeros(joints, dtype=bool)
+        self._jump = JUMP * limits.velocity * period
+        self._push = FROZEN_EFFORT * limits.torque
+        self._not_applied = NOT_APPLIED * limits.torque
+        self._braking = 2.0 * ENVELOPE * limits.acceleration
+        zero, slack = np.zeros(joints), (ENVELOPE_SLACK * limits.velocity) ** 2
+        away = limits.following_error
+        self._bounds = np.array([zero, zero, slack, slack, VELOCITY_STOP * limits.velocity, away, self._jump])
+        self._values = np.zeros_like(self._bounds)
+        self._rows = tuple(self._values)
+
+    @property
+    def warnings(self) -> dict[str, int]:
+        """How often each warning was found."""
+        return self.findings.warnings
 
     def feedback(
         self, sample: Sample, reference: Setpoint, velocity: Vector, correction: Vector
@@ -95,48 +115,20 @@ class Guard:
         Returns:
             Which axes' positions may be used, and the most severe fault found, if any.
         """
-        limits, position = self._limits, sample.position
-        if not np.isfinite(position[sample.valid]).all():
-            bad = sample.valid & ~np.isfinite(position)
-            return sample.valid, self._fault("feedback_not_finite", bad, "position is not a number")
-        # A window that only grew with the age would let the second reading of a wrong position in.
-        expected = self._position + velocity * self._period * (1 + self._age)
-        jumped = sample.valid & (np.abs(position - expected) > self._largest_jump)
-        usable = sample.valid & ~jumped
-        self._jumps = np.where(jumped, self._jumps + 1, 0)
-        self._age = np.where(usable, 0, self._age + 1)
-        self._position = np.where(usable, position, self._position)
-        changed = sample.valid & (position != self._shown)
-        self._shown = np.where(changed, position, self._shown)
-        pushed = np.abs(correction) > FROZEN_EFFORT * limits.torque
-        self._still = np.where(pushed & ~changed, self._still + 1, 0)
-        if (self._age >= MAX_AGE).any():
-            return usable, self._fault("feedback_gone", self._age >= MAX_AGE, f"no feedback for {MAX_AGE} cycles")
-        if (frozen := self._still >= FROZEN_CYCLES).any():
-            return usable, self._fault("frozen_encoder", frozen, "position stands still however much torque pushes")
-        seen = self._position
-        beyond = np.maximum(limits.lower - seen, seen - limits.upper)
-        if (far := beyond > limits.following_error).any():
-            return usable, self._fault("far_outside", far, "far outside the position limits")
-        speed = np.abs(velocity)
-        if (fast := speed > VELOCITY_OFF * limits.velocity).any():
-            return usable, self._fault("runaway", fast, f"faster than {VELOCITY_OFF:g} times the velocity limit")
-        if (self._jumps >= 2).any():
-            return usable, self._fault("encoder_jumps", self._jumps >= 2, "position jumped in consecutive cycles")
-        if (out := beyond > 0.0).any():
-            return usable, self._fault("position_limit", out, "outside the position limits")
-        if (fast := speed > VELOCITY_STOP * limits.velocity).any():
-            return usable, self._fault("over_velocity", fast, f"faster than {VELOCITY_STOP:g} times the velocity limit")
-        if (away := np.abs(reference.position - seen) > limits.following_error).any():
-            return usable, self._fault("following_error", away, "too far from the reference")
-        if jumped.any():
-            return usable, self._fault("encoder_jump", jumped, "position jumped; not used")
-        if not usable.all():
-            return usable, self._fault("lost_feedback", ~usable, "no feedback in this cycle")
-        return usable, None
+        self.findings.cycle += 1
+        answered = bool(sample.valid.all())
+        self._count_still(sample, correction)
+        self._count_unchanged(sample, velocity)
+        held = answered and self._all_fresh and self._quiet(sample.position, reference.position, velocity)
+        if held and self._plain(sample):
+            # Copied, in case that a driver fills the same array again.
+            self._position = self._shown = sample.position.copy()
+            return sample.valid, None
+        with np.errstate(all="ignore"):
+            return self._judged(sample, reference.position, velocity)
 
     def torque(self, wanted: Vector) -> tuple[Vector, Fault | None]:
-        """Judge and limit a torque.
+        """Judge and limit a torque; the change to the first one is not limited, because the support gives way to it.
 
         Args:
             wanted: by the controller [N m or N], shape (joints,).
@@ -144,23 +136,144 @@ class Guard:
         Returns:
             The torque that may leave: within limits, or zero when the fault takes torque away.
         """
-        limit = self._limits.torque
-        if not np.isfinite(wanted).all():
-            return np.zeros_like(limit), self._fault(
-                "torque_not_finite", ~np.isfinite(wanted), "torque is not a number"
-            )
+        limit, before = self._limits.torque, self._sent
         size = np.abs(wanted)
-        if (absurd := size > ABSURD * limit).any():
-            return np.zeros_like(limit), self._fault(
-                "torque_absurd", absurd, f"more than {ABSURD:g} times the torque limit"
-            )
-        if (over := size > limit).any():
-            return np.clip(wanted, -limit, limit), self._fault("torque_saturated", over, "limited to the torque limit")
-        return wanted, None
+        if (size <= limit).all() and (before is None or (np.abs(wanted - before) <= self.rate).all()):
+            self._sent = wanted
+            return wanted, None
+        finite = np.isfinite(wanted)
+        what = f"a torque of {{}} N m (N) was asked for, more than {ABSURD:g} times the limit of {{}}"
+        for check in (
+            Check("torque_not_finite", ~finite, "the torque asked for is not a number"),
+            Check("torque_absurd", finite & (size > ABSURD * limit), what, (wanted, limit)),
+        ):
+            if check.hit.any():
+                return np.zeros_like(limit), self._found(check)
+        leaves = np.clip(wanted, -limit, limit)
+        over, fault = size > limit, None
+        if over.any():
+            what = "a torque of {} N m (N) was asked for, the limit is {}"
+            fault = self._found(Check("torque_saturated", over, what, (wanted, limit)))
+        if before is not None and (fast := np.abs(leaves - before) > self.rate).any():
+            change = (leaves - before) / self._period
+            what = "the torque was to change by {} N m/s (N/s), {} allowed"
+            found = self._found(Check("torque_rate", fast, what, (change, self.rate / self._period)))
+            leaves = np.clip(leaves, before - self.rate, before + self.rate)
+            fault = found if fault is None or found.reaction > fault.reaction else fault
+        self._sent = leaves
+        return leaves, fault
 
-    def _fault(self, code: str, joints: Flags, what: str) -> Fault:
-        names = ", ".join(name for name, hit in zip(self._names, joints, strict=True) if hit)
-        fault = Fault(code, REACTIONS[code], f"{names}: {what}")
-        if fault.reaction is Reaction.WARN:
-            self.warnings[code] = self.warnings.get(code, 0) + 1
-        return fault
+    def about(self, joint: int, what: str, velocity: float) -> str:
+        """The beginning of a sentence about one joint; `{}` in it stands for its velocity [rad/s or m/s]."""
+        return f"{self._names[joint]}: {what.format(f'{velocity:.4g} {self._units[joint]}/s')}"
+
+    def _quiet(self, position: Vector, wanted: Vector, velocity: Vector) -> bool:
+        """Whether positions that all answered hold every threshold of theirs."""
+        above, below, to_upper, to_lower, speed, away, jump = self._rows
+        np.subtract(position, self._limits.upper, out=above)
+        np.subtract(self._limits.lower, position, out=below)
+        np.abs(velocity, out=speed)
+        signed = velocity * speed
+        # v |v| - 2 a d, towards either limit.
+        np.multiply(self._braking, above, out=to_upper)
+        np.add(to_upper, signed, out=to_upper)
+        np.multiply(self._braking, below, out=to_lower)
+        np.subtract(to_lower, signed, out=to_lower)
+        np.subtract(wanted, position, out=away)
+        np.abs(away, out=away)
+        np.subtract(position, self._position, out=jump)
+        np.subtract(jump, velocity * self._period, out=jump)
+        np.abs(jump, out=jump)
+        return bool((self._values <= self._bounds).all())
+
+    def _plain(self, sample: Sample) -> bool:
+        """Whether nothing else is wrong: encoders, status, torque, the space the arm may be in."""
+        if not (self._none_still and self._all_change) and bool(self._frozen().any()):
+            return False
+        if sample.status is not self._healthy and not self._all_well(sample.status):
+            return False
+        if self._sent is not None and not bool((np.abs(sample.torque - self._sent) <= self._not_applied).all()):
+            return False
+        if sample.velocity is not None and not bool(np.isfinite(sample.velocity).all()):
+            return False
+        if self._outline is None:
+            return True
+        self._depths = self._outline.depths(sample.position)
+        return bool((self._depths <= 0.0).all())
+
+    def _all_well(self, status: tuple[int, ...]) -> bool:
+        """Whether no drive says that its torque does not act."""
+        if status != self._healthy:
+            powered = np.array([bool(word & AxisStatus.POWERED) for word in status])
+            if any(word & TRIPPED for word in status) or bool((self._was_powered & ~powered).any()):
+                return False
+            self._was_powered = powered
+        self._healthy = status
+        return True
+
+    def _judged(self, sample: Sample, wanted: Vector, velocity: Vector) -> tuple[Flags, Fault | None]:
+        """A sample with which something may be wrong."""
+        position = sample.position
+        # A window that only grew with the age would let the second reading of a wrong position in.
+        expected = self._position + velocity * self._period * (1 + self._age)
+        jumped = sample.valid & (np.abs(position - expected) > self._jump)
+        usable = sample.valid & ~jumped
+        self._jumps = np.where(jumped, self._jumps + 1, 0)
+        self._age = np.where(usable, 0, np.maximum(self._age + 1, sample.age))
+        self._position = np.where(usable, position, self._position)
+        self._all_fresh = not self._age.any()
+        self._shown = np.where(sample.valid, position, self._shown)
+        if sample.status:
+            self._all_well(sample.status)
+        if self._outline is not None and bool(np.isfinite(self._position).all()):
+            self._depths = self._outline.depths(self._position)
+        seen = Seen(
+            sample,
+            wanted,
+            self._position,
+            velocity,
+            usable,
+            jumped,
+            self._age,
+            self._jumps,
+            self._frozen(),
+            self._was_powered,
+            self._sent,
+            self._depths,
+            self._pairs,
+        )
+        for check in checks(seen, self._limits):
+            if check.hit.any():
+                return usable, self._found(check)
+        return usable, None
+
+    def _count_still(self, sample: Sample, correction: Vector) -> None:
+        """Count for how long each position has not changed against a push."""
+        pushed = np.abs(correction) > self._push
+        if pushed.any():
+            changed = sample.valid & (sample.position != self._shown)
+            self._still = np.where(pushed & ~changed, self._still + 1, 0)
+            self._none_still = False
+        elif not self._none_still:
+            self._still = np.zeros_like(self._still)
+            self._none_still = True
+
+    def _count_unchanged(self, sample: Sample, velocity: Vector) -> None:
+        """Count for how long each position has not changed at all, and whether that began in full motion."""
+        same = sample.position == self._shown
+        if same.any():
+            same &= sample.valid
+            fast = np.abs(velocity) > SUDDEN_SPEED * self._limits.velocity
+            self._sudden = np.where(self._unchanged == 0, same & fast, self._sudden)
+            self._unchanged = np.where(same, self._unchanged + 1, 0)
+            self._all_change = False
+        elif not self._all_change:
+            self._unchanged = np.zeros_like(self._unchanged)
+            self._all_change = True
+
+    def _frozen(self) -> Flags:
+        """Which encoders stand still although the joint cannot."""
+        return (self._still >= FROZEN_CYCLES) | (self._sudden & (self._unchanged >= SUDDEN_CYCLES))
+
+    def _found(self, check: Check) -> Fault:
+        return self.findings.found(check.code, in_words(check, self._names, self._units))

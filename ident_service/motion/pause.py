@@ -6,13 +6,13 @@ no step anywhere. Boundary: pure functions of time.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 
 from ident_service.config.limits import MotionLimits
 from ident_service.errors import MotionRefused
 from ident_service.motion.reference import Reference, Setpoint, rest
 from ident_service.motion.stop import stop
-from ident_service.motion.way import RuckigReference, way
+from ident_service.motion.way import RuckigReference, at_once, way_in_slices
 
 _SEARCH_STEP = 0.1  # s
 _SEARCH = 20  # steps to either side
@@ -26,17 +26,18 @@ class Paused:
         time: of the motion at which it was left [s].
     """
 
-    def __init__(self, motion: Reference, time: float, limits: MotionLimits) -> None:
+    def __init__(self, motion: Reference, time: float, limits: MotionLimits, start: Setpoint | None = None) -> None:
         """Leave a motion.
 
         Args:
             motion: within the limits.
-            time: of the motion [s]; the pause begins there.
+            time: of the motion [s], at which the pause begins and is to end.
             limits: of the arm.
+            start: where the pause begins, if not on the motion but on a way back onto it.
         """
         self._motion = motion
         self._limits = limits
-        self._stop = stop(motion.at(time), limits)
+        self._stop = stop(motion.at(time) if start is None else start, limits)
         self.time = min(time, motion.duration)
         self.duration = self._stop.duration
 
@@ -49,7 +50,7 @@ class Paused:
 
         It joins the motion where it was left. Where no way leads there within the limits, it joins a little earlier and
         repeats that little; else a little later; else it begins the motion again. This takes a millisecond or few where
-        the motion was left, but up to some tenths of a second when it must search: not to be called inside a cycle.
+        the motion was left, but up to some tenths of a second when it must search: too long for a cycle.
 
         Args:
             limits: of the way, by default the arm's; `slowed_limits` for one as slow as a rehearsal.
@@ -57,10 +58,19 @@ class Paused:
         Raises:
             MotionRefused: not even the motion's beginning can be reached from here.
         """
+        return at_once(self.resume_in_slices(limits))
+
+    def resume_in_slices(self, limits: MotionLimits | None = None) -> Generator[None, None, Resumed]:
+        """As `resume`, a bearable part of a control cycle at a time; the generator returns the way back.
+
+        Raises:
+            MotionRefused: as `resume`, from any of its steps.
+        """
         here = rest(self._stop.end)
         for time in _joining_times(self.time, self._motion.duration):
             try:
-                return Resumed(way(here, self._motion.at(time), limits or self._limits), self._motion, time)
+                back = yield from way_in_slices(here, self._motion.at(time), limits or self._limits)
+                return Resumed(back, self._motion, time)
             except MotionRefused as error:
                 refusal = error
         raise MotionRefused(f"no way leads from here back onto the motion: {refusal}") from refusal
@@ -73,18 +83,19 @@ class Resumed:
         duration: of both [s].
         back: length of the way back [s].
         joined: time of the motion at which the way back ends [s].
+        motion: the one it joins.
     """
 
     def __init__(self, back: RuckigReference, motion: Reference, joined: float) -> None:
         self._way = back
-        self._motion = motion
+        self.motion = motion
         self.back = back.duration
         self.joined = joined
         self.duration = back.duration + motion.duration - joined
 
     def at(self, time: float) -> Setpoint:
         """Setpoint at `time` [s] since the way back began."""
-        return self._way.at(time) if time < self.back else self._motion.at(self.joined + time - self.back)
+        return self._way.at(time) if time < self.back else self.motion.at(self.joined + time - self.back)
 
 
 def _joining_times(left: float, duration: float) -> Iterator[float]:

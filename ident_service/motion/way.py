@@ -5,7 +5,9 @@ Every way is a ruckig trajectory within the arm's velocity, acceleration and jer
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from dataclasses import replace
+from typing import TypeVar, cast
 
 import numpy as np
 import ruckig
@@ -14,6 +16,8 @@ from ident_service.config.limits import MotionLimits, Vector
 from ident_service.errors import MotionRefused
 from ident_service.motion.reference import Setpoint
 
+_Result = TypeVar("_Result")
+_SLICE = 50  # points of a way looked at in one go
 _EXTENT_STEP = 1e-3  # s; a turning point lies at most acceleration * step^2 / 8 outside: 2e-6 rad at 16 rad/s^2
 
 
@@ -37,10 +41,20 @@ class RuckigReference:
 
     def extent(self) -> tuple[Vector, Vector]:
         """Lowest and highest position on the way, each of shape (joints,), but for what happens between two points."""
+        return at_once(self.extent_in_slices())
+
+    def extent_in_slices(self) -> Generator[None, None, tuple[Vector, Vector]]:
+        """As `extent`, a bearable part of a control cycle at a time."""
         # The position_extrema of ruckig itself miss turning points (pantor/ruckig#215), here by more than 0.1 rad.
-        times = np.linspace(0.0, self.duration, 2 + int(self.duration / _EXTENT_STEP))
-        positions = np.array([self._trajectory.at_time(time)[0] for time in times])
-        return positions.min(axis=0), positions.max(axis=0)
+        times = np.linspace(0.0, self.duration, 2 + int(self.duration / _EXTENT_STEP)).tolist()
+        at_time = self._trajectory.at_time
+        lowest = highest = np.array(at_time(0.0)[0])
+        for first in range(0, len(times), _SLICE):
+            positions = np.array([at_time(time)[0] for time in times[first : first + _SLICE]])
+            lowest = np.minimum(lowest, positions.min(axis=0))
+            highest = np.maximum(highest, positions.max(axis=0))
+            yield
+        return lowest, highest
 
 
 _CALM = 0.5  # of the limits, on the way to a motion and back
@@ -70,6 +84,15 @@ def way(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference
     Raises:
         MotionRefused: no such way exists within the limits, or it would leave the position limits.
     """
+    return at_once(way_in_slices(start, end, limits))
+
+
+def way_in_slices(start: Setpoint, end: Setpoint, limits: MotionLimits) -> Generator[None, None, RuckigReference]:
+    """As `way`, a bearable part of a control cycle at a time; the generator returns the way.
+
+    Raises:
+        MotionRefused: as `way`, from any of its steps.
+    """
     parameters = ruckig.InputParameter(len(start.position))
     parameters.current_position = start.position.tolist()
     parameters.current_velocity = start.velocity.tolist()
@@ -83,7 +106,8 @@ def way(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference
     # From rest to rest all joints share one profile, so that the way is straight in joint space; else it cannot be.
     parameters.synchronization = ruckig.Synchronization.Phase
     reference = RuckigReference(parameters)
-    lowest, highest = reference.extent()
+    yield
+    lowest, highest = yield from reference.extent_in_slices()
     if bool(np.any(lowest < limits.lower) or np.any(highest > limits.upper)):
         joint = int(np.argmax(np.maximum(limits.lower - lowest, highest - limits.upper)))
         raise MotionRefused(
@@ -91,3 +115,12 @@ def way(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference
             f"outside {limits.lower[joint]:g}..{limits.upper[joint]:g}; begin nearer to it or slower"
         )
     return reference
+
+
+def at_once(slices: Generator[None, None, _Result]) -> _Result:
+    """What a generator returns."""
+    while True:
+        try:
+            next(slices)
+        except StopIteration as end:
+            return cast(_Result, end.value)

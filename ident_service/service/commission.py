@@ -19,6 +19,7 @@ from ident_service.excitation.excitation import Excitation
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.urdf import urdf_text
+from ident_service.motion.controls import StopWhen
 from ident_service.motion.factory import make_arm
 from ident_service.motion.run import RunReport, run
 from ident_service.motion.states import State
@@ -29,6 +30,7 @@ from ident_service.results.files import appearing_folder, write_atomically
 from ident_service.results.run_folder import write_manifest, write_results
 from ident_service.service.score import Score, score, true_parameters
 from sim_backend.arm import SimulatedArm, Truth
+from sim_backend.remote_arm import RemoteArm
 
 Tell = Callable[[str], None]
 
@@ -78,7 +80,7 @@ def record_motion(
     description = urdf_text(model, model.prior)
     writer = RecordingWriter(path, model.chain.names, description, arm.clock.utc_offset_ns, attachments, metadata)
     with arm, Recorder(writer, lock_step=arm.clock.lock_step) as recorder:
-        return run(arm, model, motion, recorder, stop_requested)
+        return run(arm, model, motion, recorder, StopWhen(stop_requested))
 
 
 def simulate(
@@ -122,7 +124,7 @@ def simulate(
             tell(f"{planned.name} motion: {planned.duration:g} s at {config.control.rate:g} Hz")
             observed = []
             arm = make_arm(config, clock)
-            if isinstance(arm, SimulatedArm):
+            if isinstance(arm, SimulatedArm | RemoteArm):
                 arm.observer = observed.append
             report = record_motion(arm, model, planned, path, stop_requested)
             if report.state is not State.DONE:

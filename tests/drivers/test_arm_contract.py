@@ -56,7 +56,14 @@ def simulated() -> Bench:
     return Bench(arm, lambda: arm.plant.velocity, lambda: arm.plant.position)
 
 
-BACKENDS: dict[str, Callable[[], Bench]] = {"simulated": simulated}
+def separate() -> Bench:
+    from sim_backend.arm import from_config
+
+    arm = from_config(bench_config(process="separate"))
+    return Bench(arm, lambda: arm.truth.velocity, lambda: arm.truth.position)
+
+
+BACKENDS: dict[str, Callable[[], Bench]] = {"separate": separate, "simulated": simulated}
 
 
 @pytest.fixture(params=sorted(BACKENDS))

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 from motion_bench import bench_limits
 
 from drivers.arm import Sample
-from ident_service.motion.guard import (
-    JUMP,
-    REACTIONS,
-    Fault,
-    Guard,
-    Reaction,
-)
+from ident_service.motion.checks import JUMP
+from ident_service.motion.faults import FAULTS, Fault, Reaction
+from ident_service.motion.guard import Guard
 from ident_service.motion.reference import rest
 
 Array = np.ndarray
@@ -22,7 +21,8 @@ PERIOD = 1e-3
 HOME = np.array([0.1, -0.1])
 STILL = np.zeros(2)
 WINDOW = JUMP * LIMITS.velocity * PERIOD
-OFF, STOP, WARN = Reaction.TORQUE_OFF, Reaction.CONTROLLED_STOP, Reaction.WARN
+OFF, QUICK, LOWER = Reaction.TORQUE_OFF, Reaction.QUICK_STOP, Reaction.DAMPED_LOWERING
+STOP, WARN = Reaction.CONTROLLED_STOP, Reaction.WARN
 
 
 def unit(joint: int) -> Array:
@@ -32,8 +32,8 @@ def unit(joint: int) -> Array:
 class Bench:
     """A guard that is shown one position after another."""
 
-    def __init__(self, position: Array = HOME) -> None:
-        self.guard = Guard(NAMES, LIMITS, PERIOD, position)
+    def __init__(self, position: Array = HOME, **options: Any) -> None:
+        self.guard = Guard(NAMES, LIMITS, PERIOD, position, **options)
         self.cycle = 0
 
     def see(
@@ -43,10 +43,13 @@ class Bench:
         velocity: Array = STILL,
         valid: tuple[bool, bool] = (True, True),
         correction: Array = STILL,
+        measured: Array | None = None,
+        **other: Any,
     ) -> tuple[list[bool], Fault | None]:
         flags = np.array(valid)
         age = np.where(flags, 0, 1)
-        sample = Sample(self.cycle, self.cycle * 1_000_000, np.array(position), None, np.zeros(2), flags, age)
+        sample = Sample(self.cycle, self.cycle * 1_000_000, np.array(position), measured, np.zeros(2), flags, age)
+        sample = replace(sample, **other)
         self.cycle += 1
         setpoint = rest(position if reference is None else reference)
         usable, fault = self.guard.feedback(sample, setpoint, velocity, correction)
@@ -57,7 +60,7 @@ def is_fault(fault: Fault | None, code: str, joint: int | None = None) -> str:
     """Check a fault's code, reaction and joint; its code."""
     assert fault is not None
     assert fault.code == code
-    assert fault.reaction is REACTIONS[code]
+    assert fault.reaction is FAULTS[code].reaction
     if joint is not None:
         assert fault.message.startswith(f"{NAMES[joint]}: ")
     return code

@@ -72,7 +72,7 @@ class WatchedArm(Arm):
         self.enable_error: BaseException | None = None
         self.stop_error: BaseException | None = None
         self.shown: Callable[[Sample], Sample] = lambda sample: sample
-        self._cycle = 0
+        self.cycle = 0  # exchanges so far
 
     def open(self) -> None:
         self.inner.open()
@@ -90,8 +90,8 @@ class WatchedArm(Arm):
     def exchange(self, torque: Array | None) -> Sample:
         if torque is not None:
             self.torques.append(torque.copy())
-        self.before_exchange(self._cycle)
-        self._cycle += 1
+        self.before_exchange(self.cycle)
+        self.cycle += 1
         return self.shown(self.inner.exchange(torque))
 
     def stop(self, kind: StopKind) -> None:
@@ -147,8 +147,8 @@ class Story:
 
     @property
     def errors(self) -> list[str]:
-        """Errors in the order told."""
-        return [message for _, level, message in self.events if level == 40]
+        """Faults in the order told."""
+        return [message for _, level, message in self.events if level >= 40]
 
     def column(self, name: str) -> Array:
         """One quantity of all samples."""

@@ -14,6 +14,7 @@ from ident_service.errors import ArmFault, DriverError
 from ident_service.excitation.excitation import Excitation
 from ident_service.excitation.fourier import FourierSeries
 from ident_service.excitation.path import FourierPath
+from ident_service.motion.controls import StopWhen
 from ident_service.motion.run import RunReport, run
 from sim_backend.arm import Truth
 
@@ -24,6 +25,7 @@ MOTION = bench_excitation()
 PERIOD = 1e-3
 MIDWAY = 900  # a cycle in the middle of the excitation, both joints moving
 FOREVER = 10**6
+HOLD = 0.1  # s; shorter than usual, for short tests
 
 
 @dataclass
@@ -38,7 +40,7 @@ class Bench:
     def run(self, stop_requested: Callable[[], bool] = lambda: False, motion: Excitation = MOTION) -> RunReport:
         """Run; whatever comes of it, no torque was too large and none is left."""
         try:
-            return run(self.arm, self.model, motion, self.story, stop_requested)
+            return run(self.arm, self.model, motion, self.story, StopWhen(stop_requested), hold_seconds=HOLD)
         finally:
             assert all((np.abs(torque) <= LIMITS.torque).all() for torque in self.arm.torques)
             self.arm.inner.faults = ()  # mended, to see what is left of the run

@@ -10,15 +10,17 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from drivers.arm import Sample
-from ident_service.motion.guard import (
-    ABSURD,
+from ident_service.motion.checks import (
     FROZEN_CYCLES,
     FROZEN_EFFORT,
     MAX_AGE,
+    SUDDEN_CYCLES,
+    SUDDEN_SPEED,
     VELOCITY_OFF,
     VELOCITY_STOP,
-    Fault,
 )
+from ident_service.motion.faults import Fault
+from ident_service.motion.guard import ABSURD
 from ident_service.motion.reference import Setpoint
 
 Array = np.ndarray
@@ -266,3 +268,18 @@ def test_a_moving_reference_is_compared_by_its_position_only() -> None:
     moving = Setpoint(HOME, LIMITS.velocity, LIMITS.acceleration)
     sample = Sample(0, 0, HOME.copy(), None, np.zeros(2), np.ones(2, dtype=bool), np.zeros(2, dtype=np.int64))
     assert Bench().guard.feedback(sample, moving, STILL, STILL)[1] is None
+
+
+@pytest.mark.parametrize(("share", "frozen"), [(0.99, False), (1.01, True)])
+@pytest.mark.parametrize("joint", [0, 1])
+def test_an_encoder_that_stops_in_full_motion_is_frozen(joint: int, share: float, frozen: bool) -> None:
+    bench, velocity = Bench(), share * SUDDEN_SPEED * LIMITS.velocity * unit(joint)
+    assert bench.see(HOME + 1e-5, velocity=velocity)[1] is None
+    for _ in range(SUDDEN_CYCLES - 1):
+        assert bench.see(HOME + 1e-5, velocity=velocity)[1] is None
+    fault = bench.see(HOME + 1e-5, velocity=velocity)[1]
+    assert (fault is not None) == frozen
+    if fault is not None:
+        is_fault(fault, "frozen_encoder", joint)
+    # A step forgives.
+    assert bench.see(HOME + 2e-5, velocity=velocity)[1] is None

@@ -12,6 +12,8 @@ from run_bench import HOME, LIMITS, MIDWAY, MOTION, PERIOD, Bench, with_series
 
 from drivers.arm import Sample
 from ident_service.errors import UsageError
+from ident_service.motion.controls import StopWhen
+from ident_service.motion.loop import REST_CYCLES
 from ident_service.motion.run import run
 from ident_service.motion.states import State
 
@@ -22,7 +24,7 @@ def test_a_run_goes_out_and_comes_back(make: Callable[..., Bench]) -> None:
     bench = make()
     report = bench.run()
     assert report.state is State.DONE
-    assert bench.story.states == ["approaching", "exciting", "returning", "done"]
+    assert bench.story.states == ["checked", "armed", "approaching", "exciting", "returning", "done"]
     assert bench.story.errors == []
     assert report.warnings == {}
     np.testing.assert_allclose(bench.truth[0].position, HOME, atol=1e-9)
@@ -126,11 +128,18 @@ def test_a_stop_out_of_a_rehearsal_is_not_slowed(make: Callable[..., Bench]) -> 
     bench = make()
     stopping = 5 * MIDWAY
     report = run(
-        bench.arm, bench.model, MOTION, bench.story, lambda: len(bench.story.samples) >= stopping - LOOKED, speed=0.2
+        bench.arm,
+        bench.model,
+        MOTION,
+        bench.story,
+        StopWhen(lambda: len(bench.story.samples) >= stopping - LOOKED),
+        speed=0.2,
     )
     assert report.state is State.STOPPED
     told = {message: stamp for stamp, _, message in bench.story.events}
-    longest = 0.2 * LIMITS.velocity / LIMITS.acceleration + 3.0 * LIMITS.acceleration / LIMITS.jerk
+    longest = (
+        REST_CYCLES * PERIOD + 0.2 * LIMITS.velocity / LIMITS.acceleration + 3.0 * LIMITS.acceleration / LIMITS.jerk
+    )
     assert (told["stopped"] - told["stopping"]) * 1e-9 <= longest.max()
 
 

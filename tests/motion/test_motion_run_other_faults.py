@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 from motion_bench import LOOKED
-from run_bench import HOME, LIMITS, MIDWAY, Bench
+from run_bench import HOME, LIMITS, MIDWAY, PERIOD, Bench
 
 from drivers.arm import StopKind
 from ident_service.errors import DriverError
 from ident_service.motion.control import ComputedTorque
+from ident_service.motion.guard import TORQUE_RATE, TORQUE_RATE_SHARE
 from ident_service.motion.states import State
 from sim_backend.faults import Fault, FaultKind
 
@@ -73,8 +74,8 @@ def test_a_stop_that_is_asked_for_is_controlled(make: Callable[..., Bench], cycl
 def test_a_stop_before_the_first_cycle_moves_nothing(make: Callable[..., Bench]) -> None:
     bench = make()
     assert bench.run(lambda: True).state is State.STOPPED
-    assert bench.story.states == ["approaching", "stopping", "stopped"]
-    assert (np.abs(bench.truth[-1].position - HOME) < 1e-3).all()
+    assert bench.story.states == ["checked", "armed", "approaching", "stopping", "stopped"]
+    assert (np.abs(bench.truth[-1].position - HOME) < 0.02).all()  # held without asking for a position
 
 
 def test_a_fault_during_a_stop_that_was_asked_for_is_not_swallowed(make: Callable[..., Bench]) -> None:
@@ -90,9 +91,9 @@ def test_an_arm_that_cannot_be_enabled_is_left_without_torque(make: Callable[...
     bench.arm.enable_error = DriverError("drive 3 does not answer")
     with pytest.raises(DriverError, match="drive 3"):
         bench.run()
-    assert bench.arm.stops == [StopKind.TORQUE_OFF]
+    assert bench.arm.stops == [StopKind.QUICK_STOP]
     assert bench.arm.torques == []
-    assert bench.story.states == ["faulted"]
+    assert bench.story.states == ["checked", "faulted"]
 
 
 class _Broken(Exception):
@@ -112,7 +113,7 @@ def test_a_mistake_in_the_control_law_takes_the_torque(
     monkeypatch.setattr(ComputedTorque, "torque", broken)
     with pytest.raises(_Broken):
         bench.run()
-    assert bench.arm.stops == [StopKind.TORQUE_OFF]
+    assert bench.arm.stops == [StopKind.QUICK_STOP]
     assert bench.story.states[-1] == "faulted"
     assert bench.story.errors == ["_Broken"]
 
@@ -143,13 +144,16 @@ def test_a_torque_beyond_the_limit_is_clipped_and_counted(
 
     def strong(self: ComputedTorque, *arguments: Any) -> Array:
         torque = law(self, *arguments)
-        return 2.0 * LIMITS.torque if len(bench.arm.torques) in (500, 501) else torque
+        return 2.0 * LIMITS.torque if 500 <= len(bench.arm.torques) < 503 else torque
 
     monkeypatch.setattr(ComputedTorque, "torque", strong)
     report = bench.run()
     assert report.state is State.DONE
-    assert report.warnings == {"torque_saturated": 2}
-    np.testing.assert_array_equal(report.peak_torque, LIMITS.torque)
+    assert report.warnings["torque_saturated"] == 3
+    assert set(report.warnings) == {"torque_saturated", "torque_rate"}
+    torques = np.array(bench.arm.torques)
+    rate = np.minimum(TORQUE_RATE, TORQUE_RATE_SHARE * LIMITS.torque)
+    assert (np.abs(np.diff(torques, axis=0)) <= rate * PERIOD * (1 + 1e-9)).all()
 
 
 @pytest.mark.parametrize("where", ["sample", "event", "exchange", "enable"])
@@ -172,7 +176,7 @@ def test_an_interrupt_takes_the_torque(make: Callable[..., Bench], where: str) -
         bench.arm.after_enable = lambda: interrupt() and None
     with pytest.raises(KeyboardInterrupt):
         bench.run()
-    assert bench.arm.stops == [StopKind.TORQUE_OFF]
+    assert bench.arm.stops == [StopKind.QUICK_STOP]
     assert bench.story.states[-1] == "faulted"
 
 

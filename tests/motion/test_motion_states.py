@@ -1,4 +1,4 @@
-"""Only lawful ways between states."""
+"""Only lawful ways between states, and none to an armed arm past a fault that nobody has acknowledged."""
 
 from __future__ import annotations
 
@@ -6,39 +6,94 @@ from itertools import product
 
 import pytest
 
-from ident_service.errors import ArmError
-from ident_service.motion.states import LAWFUL, MOVING, State, next_state
+from ident_service.errors import ArmError, UsageError
+from ident_service.motion.latch import Latch
+from ident_service.motion.states import LAWFUL, MOVING, STOPPABLE, State, States
 
+MOVES = ("approaching", "exciting", "returning")
 WAYS = {
-    ("idle", "approaching"),
+    ("idle", "checked"),
+    ("checked", "armed"),
+    ("checked", "idle"),
+    ("armed", "approaching"),
     ("approaching", "exciting"),
     ("exciting", "returning"),
     ("returning", "done"),
+    ("pausing", "paused"),
+    ("paused", "resuming"),
+    ("resuming", "pausing"),
     ("stopping", "stopped"),
-    *product(("approaching", "exciting", "returning"), ("stopping", "faulted")),
-    *product(("idle", "stopping"), ("faulted",)),
+    *product(MOVES, ("pausing",)),
+    *product(("resuming",), MOVES),
+    *product(("armed", *MOVES, "pausing", "paused", "resuming"), ("stopping",)),
+    *product(("done", "stopped", "faulted"), ("idle",)),
+    *product({state.value for state in State} - {"faulted"}, ("faulted",)),
 }
+
+
+def states_in(state: State, latch: Latch | None = None) -> States:
+    states = States(latch or Latch())
+    states.state = state
+    return states
 
 
 @pytest.mark.parametrize(("current", "wanted"), list(product(State, State)), ids=lambda state: state.value)
 def test_exactly_the_lawful_ways_are_open(current: State, wanted: State) -> None:
+    states = states_in(current)
     if (current.value, wanted.value) in WAYS:
-        assert next_state(current, wanted) is wanted
+        states.enter(wanted)
+        assert states.state is wanted
     else:
         with pytest.raises(ArmError, match=f"from {current.value} to {wanted.value}"):
-            next_state(current, wanted)
+            states.enter(wanted)
+        assert states.state is current
 
 
-@pytest.mark.parametrize("state", [State.DONE, State.STOPPED, State.FAULTED])
-def test_nothing_leads_out_of_an_end(state: State) -> None:
-    assert LAWFUL[state] == ()
-
-
-@pytest.mark.parametrize("state", MOVING)
-def test_whatever_moves_can_stop_and_fault(state: State) -> None:
+@pytest.mark.parametrize("state", STOPPABLE)
+def test_whatever_is_energised_can_stop_and_fault(state: State) -> None:
     assert {State.STOPPING, State.FAULTED} <= set(LAWFUL[state])
 
 
-def test_every_state_but_the_ends_can_fault() -> None:
-    ends = {state for state in State if not LAWFUL[state]}
-    assert {state for state in State if State.FAULTED in LAWFUL[state]} == set(State) - ends
+def test_nothing_moves_on_from_a_stop() -> None:
+    for state in (State.STOPPING, State.STOPPED, State.FAULTED, State.DONE):
+        assert not set(LAWFUL[state]) & {*MOVING, State.RESUMING, State.PAUSING, State.ARMED}
+
+
+def test_every_state_is_reached_and_left() -> None:
+    assert set(LAWFUL) == set(State)
+    assert {state for ways in LAWFUL.values() for state in ways} == set(State)
+
+
+def test_who_wants_to_know_is_told() -> None:
+    told: list[State] = []
+    states = States(Latch(), told.append)
+    states.enter(State.CHECKED)
+    states.enter(State.ARMED)
+    assert told == [State.CHECKED, State.ARMED]
+
+
+@pytest.mark.parametrize(("state", "wanted"), [(State.CHECKED, State.ARMED), (State.FAULTED, State.IDLE)])
+def test_a_latched_fault_stands_in_the_way(state: State, wanted: State) -> None:
+    latch = Latch()
+    latch.set("runaway", "elbow: fast", 5)
+    latch.set("driver", "bus: gone", 6)
+    states = states_in(state, latch)
+    for code in ("runaway", "driver"):
+        with pytest.raises(ArmError, match=f"before {code} is acknowledged"):
+            states.enter(wanted)
+        latch.acknowledge(code)
+    states.enter(wanted)
+
+
+def test_a_fault_is_acknowledged_by_its_name_and_no_other() -> None:
+    latch = Latch()
+    with pytest.raises(UsageError, match="latched: none"):
+        latch.acknowledge("runaway")
+    latch.set("runaway", "elbow: fast", 5)
+    latch.set("runaway", "elbow: faster", 9)
+    with pytest.raises(UsageError, match=r"no fault 'driver' is latched \(latched: runaway"):
+        latch.acknowledge("driver")
+    (fault,) = latch.faults
+    assert (fault.code, fault.cause, fault.since_ns) == ("runaway", "elbow: fast", 5)
+    assert latch.acknowledge("runaway") is fault
+    assert latch.faults == ()

@@ -1,0 +1,94 @@
+"""What one control cycle computes: control law and guard for the seven joints of the WAM, without arm and recorder.
+
+Two clocks: the wall's, which counts whatever else the machine does meanwhile, and this thread's own computing time.
+"""
+
+from __future__ import annotations
+
+import gc
+import time
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.harness import Row, table, write
+from drivers.arm import Sample
+from ident_service.config.limits import motion_limits
+from ident_service.config.load import load_arm
+from ident_service.excitation.plan import excitation
+from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.model.outline import Outline
+from ident_service.model.rigid_body import InverseDynamics
+from ident_service.motion.control import ComputedTorque
+from ident_service.motion.deadlines import Deadlines
+from ident_service.motion.guard import Guard
+from ident_service.motion.reference import PathReference
+
+CYCLES = 20_000  # one period of the motion, which is played twice
+WARM_UP = 1_000
+MEDIAN, TAIL = "< 120, ring included", "< 300, ring included"
+
+
+def measure(model: ArmModel) -> list[Row]:
+    """Times along the shipped motion; samples are where the reference is, in steps of the encoders."""
+    limits, prior, period = motion_limits(model.config), model.prior, 1e-3
+    assert prior is not None  # noqa: S101  # the shipped WAM has one
+    reference = PathReference(excitation(model, "identification").path)
+    steps = np.array([3.65e-5, 5.4e-5, 5.4e-5, 8.5e-5, 7.9e-5, 7.9e-5, 1.03e-4])
+    home = reference.at(0.0).position
+    guard = Guard(model.chain.names, limits, period, home, outline=Outline(model, prior))
+    control = ComputedTorque(InverseDynamics(model.chain, model.layout, prior), limits, period, 30.0, home)
+    deadlines = Deadlines(guard.findings, period)
+    valid, age = np.ones(7, dtype=bool), np.zeros(7, dtype=np.int64)
+    wanted = control.torque(home, valid, reference.at(0.0))
+    torque, _ = guard.torque(wanted)
+    rows: list[Row] = []
+    gc.collect()
+    gc.freeze()
+    for part, clock in (("wall", time.perf_counter_ns), ("thread", time.thread_time_ns)):
+        spent = np.zeros((CYCLES, 3))
+        for cycle in range(CYCLES):
+            stamp_ns = len(rows) * CYCLES * 1_000_000 + cycle * 1_000_000
+            begin = clock()
+            setpoint = reference.at(cycle * period)
+            middle = clock()
+            position = np.rint(setpoint.position / steps) * steps
+            sample = Sample(cycle, stamp_ns, position, None, torque, valid, age, 0, (1,) * 7)
+            start = clock()
+            deadlines.cycle(stamp_ns, stamp_ns)
+            usable, _ = guard.feedback(sample, setpoint, control.velocity, control.correction)
+            seen = clock()
+            wanted = control.torque(position, usable, setpoint)
+            law = clock()
+            torque, _ = guard.torque(wanted)
+            spent[cycle] = middle - begin, seen - start + clock() - law, law - seen
+        for name, times in (
+            ("reference", spent[:, 0]),
+            ("guard with planes", spent[:, 1]),
+            ("control law", spent[:, 2]),
+            ("guard and control law", spent[:, 1] + spent[:, 2]),
+        ):
+            kept, whole = times[WARM_UP:] * 1e-3, name.startswith("guard and")
+            rows.append(
+                Row(f"{name}, seven joints, {part}, median", float(np.median(kept)), "us", MEDIAN if whole else None)
+            )
+            rows.append(
+                Row(
+                    f"{name}, seven joints, {part}, 99.9 %",
+                    float(np.quantile(kept, 0.999)),
+                    "us",
+                    TAIL if whole else None,
+                )
+            )
+    gc.unfreeze()
+    return rows
+
+
+def main() -> None:
+    rows = measure(arm_model(load_arm("wam7_sim")))
+    print(table(rows))
+    print(f"written to {write(rows, Path(__file__).parent / 'results', 'cycle')}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,175 @@
+"""Verbs at an arm: `watch`, `check`, `rehearse`, `run`; and `stop`, `pause`, `resume`, `ack` from any terminal.
+
+Boundary: words to requests, results to words; the work is `service/run.py`. `stop` asks for nothing, waits for nobody.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
+from ident_service.cli.words import Parser, Verbs, seconds, speed
+from ident_service.errors import MotionRefused
+
+if TYPE_CHECKING:
+    from ident_service.config.schema import ArmConfig
+    from ident_service.excitation.excitation import Excitation
+
+_REHEARSAL = 0.2
+_HELP_ARM = "description file, or the name of a shipped one"
+
+
+def add(verbs: Verbs) -> None:
+    """Register the verbs."""
+    sub = verbs.add("watch", _watch, "look at the arm without a torque or a change of state")
+    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    sub.add_argument("--seconds", type=seconds, default=2.0)
+    sub = verbs.add("check", _check, "preflight: what must be true before the arm moves (exit code 3: it is not)")
+    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
+    sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person: the arm is supported")
+    sub = verbs.add("run", _run, "move the arm along a motion and record it")
+    _motion(sub)
+    sub.add_argument("--speed", type=speed, default=1.0, metavar="SHARE", help="of the motion's own speed")
+    sub = verbs.add("rehearse", _run, "the run at a fifth of its speed; Ctrl-C stops")
+    _motion(sub)
+    sub.add_argument("--speed", type=speed, default=_REHEARSAL, metavar="SHARE", help="of the motion's own speed")
+    for name, text in (
+        ("stop", "bring the arm to a controlled stop; needs no lease and always works"),
+        ("pause", "let the arm stand"),
+        ("resume", "let it go on"),
+    ):
+        sub = verbs.add(name, _ask, text)
+        sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+        sub.set_defaults(asks=name)
+    sub = verbs.add("ack", _ack, "acknowledge a latched fault by its name")
+    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    sub.add_argument("fault", metavar="FAULT")
+
+
+def _motion(sub: Parser) -> None:
+    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
+    sub.add_argument(
+        "--out", type=Path, metavar="DIR", help="run folder; must not exist (default: below the state folder)"
+    )
+
+
+def _chosen(config: ArmConfig, motion: Path | None) -> Excitation:
+    from ident_service.excitation.excitation import read_excitation
+    from ident_service.excitation.plan import excitation
+    from ident_service.model.arm_model import arm_model
+
+    return excitation(arm_model(config), "identification") if motion is None else read_excitation(motion)
+
+
+def _watch(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.load import load_arm
+    from ident_service.motion.factory import make_arm
+    from ident_service.motion.watch import watch
+    from ident_service.service.preflight import watch_document, watch_text
+
+    stopping = StopOnSignal()
+    with stopping:
+        seen = watch(make_arm(load_arm(arguments.arm)), arguments.seconds, stop_requested=stopping.requested)
+    return DONE, watch_text(seen), watch_document(seen)
+
+
+def _check(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.load import load_arm
+    from ident_service.model.arm_model import arm_model
+    from ident_service.motion.factory import make_arm
+    from ident_service.motion.preflight import preflight
+    from ident_service.motion.preflight_check import Verdict
+    from ident_service.service.arm_state import ticket_path
+    from ident_service.service.preflight import ticket_document, ticket_text, write_ticket
+
+    config = load_arm(arguments.arm)
+
+    def confirm(question: str) -> str:
+        if arguments.confirm is not None:
+            return str(arguments.confirm)
+        return input(f"{question} ") if sys.stdin.isatty() and not arguments.json else ""
+
+    ticket = preflight(make_arm(config), arm_model(config), _chosen(config, arguments.motion), confirm=confirm)
+    path = ticket_path(state_folder(arguments), config.name)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_ticket(path, ticket)
+    code = DONE if ticket.verdict is Verdict.PASSED else VERDICT_NO
+    return code, ticket_text(ticket) + f"ticket: {path}\n", {"path": str(path), "ticket": ticket_document(ticket)}
+
+
+def _run(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.load import load_arm
+    from ident_service.motion.preflight_ticket import read_ticket
+    from ident_service.service.arm_state import ticket_path
+    from ident_service.service.commission import new_run_folder
+    from ident_service.service.run import run_motion
+
+    config = load_arm(arguments.arm)
+    motion = _chosen(config, arguments.motion)
+    state = state_folder(arguments)
+    path = ticket_path(state, config.name)
+    if not path.exists():
+        raise MotionRefused(f"{config.name}: not checked yet; `ident check` comes before every motion")
+    folder = arguments.out or new_run_folder(state, config.name)
+    tell(arguments, f"{config.name}: {motion.name} motion of {motion.duration / arguments.speed:g} s, into {folder}")
+    stopping = StopOnSignal()
+    with stopping:
+        ran = run_motion(
+            config,
+            motion,
+            folder,
+            state,
+            read_ticket(path),
+            speed=arguments.speed,
+            tell=lambda word: tell(arguments, word),
+            stop_requested=stopping.requested,
+        )
+    report = ran.report
+    warnings = ", ".join(f"{code} {count} times" for code, count in report["warnings"].items()) or "none"
+    lateness, compute = report["lateness"], report["compute"]
+    text = (
+        f"{report['state']} after {report['cycles']} cycles; warnings: {warnings}\n"
+        f"{report['real_time']}\n"
+        f"woke late by below {lateness['median_below_us']:g} us (median), {lateness['p999_below_us']:g} us (99.9 %), "
+        f"at worst {lateness['worst_us']:.0f} us\n"
+        f"computed for below {compute['median_below_us']:g} us (median), {compute['p999_below_us']:g} us (99.9 %), "
+        f"at worst {compute['worst_us']:.0f} us\n"
+        f"files: {folder}\n" + "".join(f"  {path.name}\n" for path in sorted(folder.iterdir()))
+    )
+    return DONE, text, {"folder": str(folder), "report": report}
+
+
+def _ask(arguments: argparse.Namespace) -> Answer:
+    from ident_service.motion.control_file import ControlFile
+
+    name, path = _control(arguments)
+    with ControlFile.reach(path) as controls:
+        if arguments.asks == "stop":
+            controls.ask_stop()
+        else:
+            controls.ask_pause(arguments.asks == "pause")
+        pid = controls.pid
+    document: dict[str, Any] = {"arm": name, "asked": arguments.asks, "pid": pid}
+    return DONE, f"{name}: {arguments.asks} asked of process {pid}\n", document
+
+
+def _ack(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.load import load_arm
+    from ident_service.service.arm_state import FaultFile
+
+    name = load_arm(arguments.arm).name
+    cause = FaultFile(state_folder(arguments), name).acknowledge(arguments.fault)
+    return DONE, f"{name}: acknowledged {arguments.fault} ({cause})\n", {"arm": name, "acknowledged": arguments.fault}
+
+
+def _control(arguments: argparse.Namespace) -> tuple[str, Path]:
+    from ident_service.config.load import load_arm
+    from ident_service.service.arm_state import control_path
+
+    name = load_arm(arguments.arm).name
+    return name, control_path(state_folder(arguments), name)

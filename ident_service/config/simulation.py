@@ -1,0 +1,152 @@
+"""Faults to inject into a simulated arm, as a configuration names them: kind, joint, time, duration, size.
+
+Boundary: data only. What each kind does to readings and to the plant is `sim_backend`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import TYPE_CHECKING, Annotated
+
+from pydantic import Field, model_validator
+
+from ident_service.config.quantities import NonNegative, Number, Positive, Section, Vector3
+
+if TYPE_CHECKING:
+    from ident_service.config.schema import SimulatedDriver
+
+
+class FaultKind(Enum):
+    """What can go wrong; `FAULT_RULES` says what each means."""
+
+    LOST_FEEDBACK = "lost_feedback"
+    DELAYED_FEEDBACK = "delayed_feedback"
+    HIDDEN_DELAY = "hidden_delay"
+    ENCODER_JUMP = "encoder_jump"
+    ENCODER_OFFSET = "encoder_offset"
+    FROZEN_ENCODER = "frozen_encoder"
+    NAN_POSITION = "nan_position"
+    POSITION_SIGN = "position_sign"
+    STUCK_TORQUE = "stuck_torque"
+    TORQUE_SIGN = "torque_sign"
+    TORQUE_SATURATION = "torque_saturation"
+    DRIVE_FAULT = "drive_fault"
+    NODE_SILENT = "node_silent"
+    EMERGENCY_STOP = "emergency_stop"
+    LOAD_ATTACHED = "load_attached"
+    BUS_GONE = "bus_gone"
+    LATE_CYCLE = "late_cycle"
+    CLOCK_JUMP = "clock_jump"
+
+
+@dataclass(frozen=True)
+class FaultRule:
+    """How one kind of fault is described.
+
+    Attributes:
+        does: what it does, in words.
+        size: what its size is, with the unit; None where it has none.
+        of_joint: whether it may be one joint's.
+        stays: whether it stays when no duration is given, instead of striking for one cycle.
+    """
+
+    does: str
+    size: str | None = None
+    of_joint: bool = True
+    stays: bool = False
+
+
+FAULT_RULES: dict[FaultKind, FaultRule] = {
+    # What the host reads; the plant does not notice.
+    FaultKind.LOST_FEEDBACK: FaultRule("no answer: invalid, ageing, the last position repeated, counted as lost"),
+    FaultKind.DELAYED_FEEDBACK: FaultRule("old positions, invalid and of that age", "delay [s]", stays=True),
+    FaultKind.HIDDEN_DELAY: FaultRule("old positions, as if they were fresh", "delay [s]", stays=True),
+    FaultKind.ENCODER_JUMP: FaultRule("size added to the position", "[rad or m]"),
+    FaultKind.ENCODER_OFFSET: FaultRule("size added to the position for good", "[rad or m]", stays=True),
+    FaultKind.FROZEN_ENCODER: FaultRule("the last position repeated, as if it were fresh"),
+    FaultKind.NAN_POSITION: FaultRule("not a number, as if it were one"),
+    FaultKind.POSITION_SIGN: FaultRule("the position with the wrong sign", stays=True),
+    # What the drives make of a torque; a sample says what acts, unless the fault is that nobody knows.
+    FaultKind.STUCK_TORQUE: FaultRule("the torque of the cycle before goes on acting"),
+    FaultKind.TORQUE_SIGN: FaultRule("the opposite torque acts, and the sample does not say so", stays=True),
+    FaultKind.TORQUE_SATURATION: FaultRule("torques clipped below the limit", "share of the limit", stays=True),
+    FaultKind.DRIVE_FAULT: FaultRule("no torque until enabled again, the axis coasts; status says fault", stays=True),
+    FaultKind.NODE_SILENT: FaultRule(
+        "as lost feedback, and no torque but resistive braking until enabled again, which no sample says",
+        stays=True,
+    ),
+    FaultKind.EMERGENCY_STOP: FaultRule(
+        "no torque but resistive braking until enabled again; status says so", of_joint=False, stays=True
+    ),
+    # What happens to the plant.
+    FaultKind.LOAD_ATTACHED: FaultRule("a point mass on the last link", "mass [kg]", of_joint=False, stays=True),
+    # What happens on the way.
+    FaultKind.BUS_GONE: FaultRule("exchange raises; drives hear nothing, their watchdogs run", of_joint=False),
+    FaultKind.LATE_CYCLE: FaultRule("exchange returns late", "lateness [s]", of_joint=False),
+    FaultKind.CLOCK_JUMP: FaultRule("stamps are wrong by size", "[s]", of_joint=False, stays=True),
+}
+_NOT_NEGATIVE = (
+    FaultKind.DELAYED_FEEDBACK,
+    FaultKind.HIDDEN_DELAY,
+    FaultKind.TORQUE_SATURATION,
+    FaultKind.LOAD_ATTACHED,
+    FaultKind.LATE_CYCLE,
+)
+
+
+class SimulatedFault(Section):
+    """One fault to inject, at a time [s] or in a cycle, counted from the first cycle after the arm was opened.
+
+    Attributes:
+        kind: what goes wrong.
+        joint: of which joint; all of them when left out.
+        at: when [s].
+        cycle: or in which cycle.
+        duration: how long [s]; when left out, one cycle or for good, as `FAULT_RULES` says.
+        size: what `FAULT_RULES` says.
+        offset: of a load, in the frame of the last link [m].
+    """
+
+    kind: FaultKind
+    joint: str | None = None
+    at: NonNegative | None = None
+    cycle: Annotated[int, Field(strict=True, ge=0)] | None = None
+    duration: Positive | None = None
+    size: Number | None = None
+    offset: Vector3 | None = None
+
+    @model_validator(mode="after")
+    def _fits_its_kind(self) -> SimulatedFault:
+        rule, name = FAULT_RULES[self.kind], self.kind.value
+        if (self.at is None) == (self.cycle is None):
+            raise ValueError("give exactly one of at and cycle")
+        if (self.size is None) != (rule.size is None):
+            raise ValueError(f"{name} needs a size: {rule.size}" if rule.size else f"{name} has no size")
+        if self.size is not None and self.size < 0.0 and self.kind in _NOT_NEGATIVE:
+            raise ValueError(f"{name}: size {self.size:g} is negative; it is the {rule.size}")
+        if self.kind is FaultKind.TORQUE_SATURATION and self.size is not None and self.size > 1.0:
+            raise ValueError(f"{name}: size {self.size:g} is above 1; it is the {rule.size}")
+        if self.joint is not None and not rule.of_joint:
+            raise ValueError(f"{name} strikes the whole arm; it has no joint")
+        if self.offset is not None and self.kind is not FaultKind.LOAD_ATTACHED:
+            raise ValueError(f"{name} has no offset")
+        return self
+
+
+def disagreements(driver: SimulatedDriver, joints: Sequence[str]) -> Iterator[tuple[tuple[str | int, ...], str]]:
+    """What does not fit an arm of these joints: the place in the arm's file, and what is wrong.
+
+    Args:
+        driver: the section `driver`.
+        joints: names of the arm's joints; none where the file does not name them.
+    """
+    if not joints:
+        return
+    if isinstance(driver.braking, tuple) and len(driver.braking) != len(joints):
+        yield ("driver", "braking"), f"driver.braking: {len(driver.braking)} values for {len(joints)} joints"
+    for number, fault in enumerate(driver.faults):
+        if fault.joint is not None and fault.joint not in joints:
+            where = ("driver", "faults", number, "joint")
+            yield where, f"driver.faults.{number}.joint: {fault.joint!r} is none of {', '.join(joints)}"

@@ -1,0 +1,190 @@
+"""Every threshold of a sample by itself, from severe to mild, in words; asked only when one of them does not hold.
+
+Boundary: judging one sample; what is remembered between samples, and whether to ask at all, is `guard.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.arm import Counts, Flags, Sample, Vector
+from drivers.status import AxisStatus
+from ident_service.config.limits import MotionLimits
+
+MAX_AGE = 3  # cycles without an axis' feedback before it counts as gone (FIELDBUS.md: 3 to 5)
+VELOCITY_STOP, VELOCITY_OFF = 1.2, 2.0  # times the velocity limit (ODrive stops at 1.2)
+JUMP = 4.0  # times what the velocity limit allows in one cycle, away from where the arm should have gone on to
+# A position that stays the same to the last bit for so many cycles, while the controller asks for more than this share
+# of the torque limit beyond the model's torque: no free joint stands that long against that much.
+FROZEN_CYCLES, FROZEN_EFFORT = 20, 0.2
+# And of one that moved at more than this share of its velocity limit when it stood still to the last bit from one cycle
+# to the next, for so many cycles: only a hard stop does that. Behind light joints the push above may never come.
+SUDDEN_CYCLES, SUDDEN_SPEED = 10, 0.1
+FOLLOWING_LOST = 2.0  # times the following error allowed
+# Towards a position limit no motion within the acceleration limit a is faster than sqrt(2 a d) at a distance d from it
+# (FIELDBUS.md). The arm itself may brake by so much harder, and be by so much of its velocity limit faster, than that.
+ENVELOPE, ENVELOPE_SLACK = 1.5, 0.2
+NOT_APPLIED = 0.1  # of the torque limit, by which the torque that acts may differ from the one asked for
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing looked at.
+
+    Attributes:
+        code: of the fault it would be.
+        hit: where it is wrong, shape (joints,) or (names,).
+        what: the sentence's middle; `{}` stands for numbers, `{u}` for their unit.
+        numbers: one array, shaped like `hit`, for each `{}`.
+        names: of what `hit` is about, the joints when None.
+    """
+
+    code: str
+    hit: Flags
+    what: str
+    numbers: tuple[Vector, ...] = ()
+    names: Sequence[str] | None = None
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A sample, and what is known from those before it.
+
+    Attributes:
+        sample: of this cycle.
+        wanted: where the arm should be [rad or m], shape (joints,).
+        position: last usable one of each axis [rad or m], shape (joints,).
+        velocity: filtered [rad/s or m/s], shape (joints,).
+        usable: which axes' positions may be used.
+        jumped: which have just jumped.
+        age: cycles since each was usable.
+        jumps: jumps of each in a row.
+        frozen: which encoders stand still although the joint cannot.
+        was_powered: which axes' drives have said so before.
+        sent: last torque asked for [N m or N], shape (joints,), or None.
+        depths: how deep what of the arm reaches beyond a plane [m].
+        pairs: names for them.
+    """
+
+    sample: Sample
+    wanted: Vector
+    position: Vector
+    velocity: Vector
+    usable: Flags
+    jumped: Flags
+    age: Counts
+    jumps: Counts
+    frozen: Flags
+    was_powered: Flags
+    sent: Vector | None
+    depths: Vector
+    pairs: tuple[str, ...]
+
+
+def checks(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
+    """All of them, in the order in which they are to be believed."""
+    yield from _what_cannot_be_believed(seen, limits)
+    yield from _what_has_failed(seen)
+    yield from _what_must_end(seen, limits)
+    yield from _what_can_be_bridged(seen, limits)
+
+
+def _what_cannot_be_believed(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
+    """Torque off."""
+    sample, position, speed = seen.sample, seen.position, np.abs(seen.velocity)
+    bad = sample.valid & ~np.isfinite(sample.position)
+    yield Check("feedback_not_finite", bad, "position is not a number")
+    if sample.velocity is not None:
+        yield Check("feedback_not_finite", sample.valid & ~np.isfinite(sample.velocity), "velocity is not a number")
+    yield Check("feedback_not_finite", ~np.isfinite(sample.torque), "torque that acts is not a number")
+    yield Check("emergency_stop", _says(seen, AxisStatus.EMERGENCY_STOP), "the drive reports an emergency stop")
+    what = "position unchanged to the last bit while the joint moved or was pushed hard"
+    yield Check("frozen_encoder", seen.frozen, what)
+    beyond, limit = _beyond(position, limits)
+    what = "at {} {u}, more than a following error beyond the position limit of {} {u}"
+    yield Check("far_outside", beyond > limits.following_error, what, (position, limit))
+    what = f"moves at {{}} {{u}}/s, more than {VELOCITY_OFF:g} times the limit of {{}} {{u}}/s"
+    yield Check("runaway", speed > VELOCITY_OFF * limits.velocity, what, (seen.velocity, limits.velocity))
+
+
+def _what_has_failed(seen: Seen) -> Iterator[Check]:
+    """Quick stop."""
+    yield Check("drive_fault", _says(seen, AxisStatus.FAULT), "the drive reports a fault")
+    yield Check("drive_watchdog", _says(seen, AxisStatus.WATCHDOG), "the drive's watchdog has struck")
+    unpowered = seen.was_powered & ~_says(seen, AxisStatus.POWERED) & bool(seen.sample.status)
+    yield Check("drive_fault", unpowered, "the drive is no longer energised")
+    yield Check("feedback_gone", seen.age >= MAX_AGE, f"no usable feedback for {MAX_AGE} cycles")
+
+
+def _what_must_end(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
+    """Damped lowering, then controlled stops."""
+    position, velocity, speed = seen.position, seen.velocity, np.abs(seen.velocity)
+    away, allowed = np.abs(seen.wanted - position), limits.following_error
+    what = "{} {u} from where it should be, {} {u} allowed"
+    yield Check("following_lost", away > FOLLOWING_LOST * allowed, what, (away, allowed))
+    yield Check("encoder_jumps", seen.jumps >= 2, "position jumped in consecutive cycles")
+    beyond, limit = _beyond(position, limits)
+    yield Check("position_limit", beyond > 0.0, "at {} {u}, beyond the limit of {} {u}", (position, limit))
+    towards = np.where(velocity > 0.0, limits.upper - position, position - limits.lower)
+    envelope = approach_speed(towards, limits)
+    what_near = "moves towards its position limit at {} {u}/s, {} {u}/s allowed so near to it"
+    yield Check("position_envelope", speed > envelope, what_near, (velocity, envelope))
+    what_fast = f"moves at {{}} {{u}}/s, more than {VELOCITY_STOP:g} times the limit of {{}} {{u}}/s"
+    yield Check("over_velocity", speed > VELOCITY_STOP * limits.velocity, what_fast, (velocity, limits.velocity))
+    yield Check("following_error", away > allowed, what, (away, allowed))
+    yield Check("workspace", seen.depths > 0.0, "{} m too deep", (seen.depths,), seen.pairs)
+
+
+def _what_can_be_bridged(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
+    """Warnings."""
+    jumped_to = seen.sample.position
+    yield Check("encoder_jump", seen.jumped, "position jumped to {} {u} from {} {u}", (jumped_to, seen.position))
+    yield Check("lost_feedback", ~seen.usable, "no feedback in this cycle")
+    if seen.sent is not None:
+        differs = np.abs(seen.sample.torque - seen.sent) > NOT_APPLIED * limits.torque
+        what = "the drive gives {} of the {} N m (N) it was told"
+        yield Check("torque_not_applied", differs, what, (seen.sample.torque, seen.sent))
+
+
+def approach_speed(distance: Vector, limits: MotionLimits) -> Vector:
+    """Speed towards a position limit that is too much.
+
+    Args:
+        distance: from the limit, negative beyond it [rad or m], shape (joints,).
+        limits: of the arm.
+
+    Returns:
+        sqrt(2 a d) with the allowances above [rad/s or m/s], shape (joints,).
+    """
+    squared = np.maximum(2.0 * ENVELOPE * limits.acceleration * distance, 0.0)
+    return np.asarray(np.sqrt(squared + (ENVELOPE_SLACK * limits.velocity) ** 2))
+
+
+def in_words(check: Check, names: Sequence[str], units: Sequence[str]) -> str:
+    """A check that does not hold: whose, and what.
+
+    Args:
+        check: with at least one hit.
+        names: of the joints.
+        units: of their positions.
+    """
+    hit: list[int] = np.flatnonzero(check.hit).tolist()
+    names = check.names or names
+    texts = [", ".join(f"{number[k]:.4g}" for k in hit) for number in check.numbers]
+    unit = "" if check.names else units[hit[0]]
+    return f"{', '.join(dict.fromkeys(names[k] for k in hit))}: {check.what.format(*texts, u=unit)}"
+
+
+def _beyond(position: Vector, limits: MotionLimits) -> tuple[Vector, Vector]:
+    """How far outside the position limits, and which one it is."""
+    above, below = position - limits.upper, limits.lower - position
+    return np.maximum(above, below), np.where(above > below, limits.upper, limits.lower)
+
+
+def _says(seen: Seen, bit: AxisStatus) -> Flags:
+    """Which axes' status words have a bit."""
+    status = seen.sample.status or (0,) * len(seen.position)
+    return np.array([bool(word & bit) for word in status])

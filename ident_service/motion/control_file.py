@@ -1,0 +1,139 @@
+"""Controls that a second terminal reaches: one small file, mapped into the loop's memory and into whoever asks.
+
+| offset | type | what |
+|---|---|---|
+| 0 | 8 bytes | `identctl` |
+| 8 | uint32 | version |
+| 12 | uint32 | pid of the process that moves the arm |
+| 16 | uint8 | stop: not 0 for a controlled stop; never taken back |
+| 17 | uint8 | pause: not 0 while the arm shall stand |
+| 24 | int64 | when the lease was renewed last [ns of the machine's monotonic clock] |
+| 32 | int64 | how long it lasts [ns]; 0 for none |
+
+Every word is written by one side at a time and read whole. The loop reads memory, so asking costs it nothing and nobody
+can make it wait. Whoever moves the arm holds an exclusive lock on the file, which vanishes with the process: a second
+one is refused, and a file without a lock is nobody's.
+
+The lease is measured on the machine's clock, in virtual time too: it is about a process that lives, not about the arm.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import mmap
+import os
+import struct
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from ident_service.errors import DriverError, UsageError
+
+_MAGIC, _VERSION, _SIZE = b"identctl", 1, 64
+_PID, _STOP, _PAUSE, _RENEWED, _LENGTH = 12, 16, 17, 24, 32
+
+
+class ControlFile:
+    """The controls of one arm; `motion/controls.py` says how the loop reads them."""
+
+    def __init__(self, fd: int, memory: mmap.mmap, now_ns: Callable[[], int]) -> None:
+        self._fd, self._memory, self._now_ns = fd, memory, now_ns
+
+    @classmethod
+    def take(cls, path: Path, lease_seconds: float | None, now_ns: Callable[[], int] = time.monotonic_ns) -> Self:
+        """Become the one who moves the arm, with all controls off and the lease renewed.
+
+        Args:
+            path: of the file; made where it is missing.
+            lease_seconds: how long the arm may move after `renew` [s]; None for a run that needs no lease.
+            now_ns: the lease's clock.
+
+        Raises:
+            DriverError: another process moves the arm.
+        """
+        path.parent.mkdir(parents=True, exist_ok=True)
+        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            pid = _pid_in(fd)
+            os.close(fd)
+            raise DriverError(f"the arm is in use by process {pid}; `ident stop` stops it") from None
+        os.ftruncate(fd, _SIZE)
+        memory = mmap.mmap(fd, _SIZE)
+        length = 0 if lease_seconds is None else round(lease_seconds * 1e9)
+        memory[:] = _MAGIC + struct.pack("<IIBB6xqq24x", _VERSION, os.getpid(), 0, 0, now_ns(), length)
+        return cls(fd, memory, now_ns)
+
+    @classmethod
+    def reach(cls, path: Path, now_ns: Callable[[], int] = time.monotonic_ns) -> Self:
+        """The controls of an arm that another process moves.
+
+        Raises:
+            UsageError: nobody moves the arm.
+        """
+        try:
+            fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+        except OSError:
+            raise UsageError(f"nobody moves the arm ({path} does not exist)") from None
+        try:
+            fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except OSError:
+            if os.fstat(fd).st_size == _SIZE and os.pread(fd, 8, 0) == _MAGIC:
+                return cls(fd, mmap.mmap(fd, _SIZE), now_ns)
+        os.close(fd)
+        raise UsageError(f"nobody moves the arm ({path} is left from a run that has ended)")
+
+    @property
+    def pid(self) -> int:
+        """Of the process that moves the arm."""
+        return int(struct.unpack_from("<I", self._memory, _PID)[0])
+
+    @property
+    def stop(self) -> bool:
+        """Whether the arm is to be brought to a controlled stop."""
+        return self._memory[_STOP] != 0
+
+    def ask_stop(self) -> None:
+        """Bring the arm to a controlled stop; needs no lease and cannot be taken back."""
+        self._memory[_STOP] = 1
+
+    @property
+    def pause(self) -> bool:
+        """Whether the arm is to stand."""
+        return self._memory[_PAUSE] != 0
+
+    def ask_pause(self, wanted: bool) -> None:
+        """Let the arm stand, or go on."""
+        self._memory[_PAUSE] = int(wanted)
+
+    def renew(self) -> None:
+        """Say that whoever asked for motion is still there."""
+        struct.pack_into("<q", self._memory, _RENEWED, self._now_ns())
+
+    def lease_ok(self, now_ns: int) -> bool:
+        """Whether the lease has been renewed in time; the loop's own clock is not asked."""
+        renewed, length = struct.unpack_from("<qq", self._memory, _RENEWED)
+        return bool(length == 0 or self._now_ns() - renewed <= length)
+
+    def close(self) -> None:
+        """Give the lock back."""
+        self._memory.close()
+        os.close(self._fd)
+
+    def __enter__(self) -> Self:
+        """Nothing more to do."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close."""
+        self.close()
+
+
+def _pid_in(fd: int) -> int:
+    head = os.pread(fd, 16, 0)
+    return int(struct.unpack_from("<I", head, _PID)[0]) if len(head) == 16 else 0

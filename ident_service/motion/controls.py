@@ -1,0 +1,78 @@
+"""What people and programs may ask of a motion while it runs: stop, pause, and that they are still there.
+
+The loop reads this once per cycle, so it must answer at once: a word of shared memory, an attribute, never a lock.
+Stop needs no lease. Hold-to-run is nothing but a short lease.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+LEASE_SECONDS = 2.0  # ARCHITECTURE.md: renewed every 0.5 s
+HOLD_TO_RUN_SECONDS = 0.25
+
+
+class Controls(Protocol):
+    """Read once per cycle; whatever it raises stops the arm."""
+
+    @property
+    def stop(self) -> bool:
+        """Whether the arm is to be brought to a controlled stop; the run ends with it."""
+
+    @property
+    def pause(self) -> bool:
+        """Whether the arm is to stand; it goes on when this is False again."""
+
+    def lease_ok(self, now_ns: int) -> bool:
+        """Whether whoever asked for motion is still there at this time of the loop's clock [ns]."""
+
+
+class StopWhen:
+    """Controls of a run that nobody pauses: stops when a function says so."""
+
+    pause = False
+
+    def __init__(self, asked: Callable[[], bool] = lambda: False) -> None:
+        self._asked = asked
+
+    @property
+    def stop(self) -> bool:
+        """What the function says."""
+        return self._asked()
+
+    def lease_ok(self, now_ns: int) -> bool:
+        """There is no lease to lose."""
+        return True
+
+
+class Switches:
+    """Controls in this process, for whoever holds them; each is one attribute, written and read whole.
+
+    Attributes:
+        stop: the arm is to stop.
+        pause: the arm is to stand.
+    """
+
+    def __init__(self, lease_seconds: float | None = None) -> None:
+        """Begin with everything off.
+
+        Args:
+            lease_seconds: how long the arm may move after `renew` [s]; None for a run that needs no lease.
+        """
+        self.stop = False
+        self.pause = False
+        self._length_ns = None if lease_seconds is None else round(lease_seconds * 1e9)
+        self._renewed_ns: int | None = None
+
+    def renew(self, now_ns: int) -> None:
+        """Say at a time of the loop's clock [ns] that somebody is still there."""
+        self._renewed_ns = now_ns
+
+    def lease_ok(self, now_ns: int) -> bool:
+        """Whether the lease has been renewed in time; until it is for the first time, the first question begins it."""
+        if self._length_ns is None:
+            return True
+        if self._renewed_ns is None:
+            self._renewed_ns = now_ns
+        return now_ns - self._renewed_ns <= self._length_ns

@@ -1,0 +1,183 @@
+"""What can be wrong while an arm moves, and what is done about it: one table, after FIELDBUS.md 5.2.
+
+Reactions, from mild to severe; a motion only ever goes from a milder one to a more severe one.
+
+* **warn**: the cycle goes on; a single axis without usable feedback is taken to go on as it went. The same warning in
+  too many of the last 100 cycles becomes a controlled stop.
+* **controlled stop**: the loop stays closed on a stop within limits (`stop.py`). The arm must then be measured at rest
+  within `SETTLE` of the end of the stop, and is held: gravity compensated, motion damped, what else it needed to stand
+  kept on, no position asked for, so that it gives way to whoever pushes it. After `HOLD` seconds the drives are told to
+  quick-stop, which on arms without brakes is resistive braking (IDLE): torque is never ramped out by itself over an arm
+  that nobody supports.
+* **damped lowering**: for an arm that does not follow although it can be measured. No position is asked for any more:
+  `LOWER_AFTER` seconds of damped gravity compensation, which is ramped out over `LOWER` seconds, then a quick stop.
+* **quick stop**: in the same cycle the drives brake by themselves; for faults of ours or of single axes, where the
+  drives still know what they do.
+* **torque off**: in the same cycle; where the drives' own measurement or sign cannot be believed either.
+
+A run that ends in DONE stands where it stood, supported, before it began; its torque is just taken off.
+
+Where this table differs from FIELDBUS.md 5.2: a frozen encoder takes the torque (decision 0008); beyond a position
+limit the stop is controlled as long as the arm is no further out than a following error, because these limits are
+ours and lie inside the hardware's; faults of the program and of single axes quick-stop instead of dropping the arm.
+
+Boundary: data, and what counts warnings; who finds a fault is `guard.py`, `deadlines.py` and `loop.py`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from enum import IntEnum
+
+from drivers.arm import StopKind
+
+SETTLE = 0.5  # s after the end of a stop or pause within which the arm must be at rest
+HOLD = 2.0  # s that a stopped arm is held
+LOWER_AFTER, LOWER = 0.5, 2.0  # s
+WINDOW = 100  # cycles over which warnings are counted (libfranka's success rate looks at as many)
+
+
+class Reaction(IntEnum):
+    """What a fault leads to, from mild to severe."""
+
+    WARN = 0
+    CONTROLLED_STOP = 1
+    DAMPED_LOWERING = 2
+    QUICK_STOP = 3
+    TORQUE_OFF = 4
+
+    @property
+    def stop_kind(self) -> StopKind:
+        """How torque ends, at once or at last."""
+        return StopKind.TORQUE_OFF if self is Reaction.TORQUE_OFF else StopKind.QUICK_STOP
+
+
+class Severity(IntEnum):
+    """How bad it is, as levels of rcl_interfaces/msg/Log."""
+
+    WARNING = 30
+    ERROR = 40
+    FATAL = 50
+
+
+@dataclass(frozen=True)
+class Rule:
+    """One row of the table.
+
+    Attributes:
+        reaction: to the fault.
+        means: what may be the cause, the end of the sentence that a person reads.
+        often: of a warning, in how many of the last 100 cycles it is still only a warning.
+        becomes: the fault that one more makes of it.
+    """
+
+    reaction: Reaction
+    means: str
+    often: int = 20
+    becomes: str = "repeated_warnings"
+
+    @property
+    def severity(self) -> Severity:
+        """How bad it is."""
+        if self.reaction is Reaction.WARN:
+            return Severity.WARNING
+        return Severity.FATAL if self.reaction >= Reaction.QUICK_STOP else Severity.ERROR
+
+
+_WARN, _STOP, _LOWER, _QUICK, _OFF = Reaction
+
+FAULTS: dict[str, Rule] = {
+    # Counted and bridged.
+    "lost_feedback": Rule(_WARN, "a frame was lost or came too late"),
+    "encoder_jump": Rule(_WARN, "a reading was disturbed, and is not used"),
+    "torque_saturated": Rule(_WARN, "the motion asks for more than the arm may give; the torque was limited"),
+    "torque_rate": Rule(_WARN, "the torque jumped, from noise or a gain that is too high; its change was limited"),
+    "torque_not_applied": Rule(_WARN, "a drive limits, delays or ignores what it is told"),
+    "late_cycle": Rule(_WARN, "the machine was busy with something else", often=5, becomes="late_cycles"),
+    # The loop can still be trusted to stop the arm.
+    "repeated_warnings": Rule(_STOP, "what is bridged once must not go on"),
+    "late_cycles": Rule(_STOP, "this machine does not keep the rate; look for other load and at its scheduling"),
+    "encoder_jumps": Rule(_STOP, "the encoder or its cable is disturbed"),
+    "position_envelope": Rule(_STOP, "it could hardly be stopped before its position limit"),
+    "position_limit": Rule(_STOP, "it overshot, or was pushed"),
+    "over_velocity": Rule(_STOP, "it was pushed, or model or gains are wrong"),
+    "following_error": Rule(_STOP, "something blocks or pushes it, or model or gains are wrong"),
+    "workspace": Rule(_STOP, "the arm left the space it may move in"),
+    "lease_lost": Rule(_STOP, "whoever asked for motion has gone silent"),
+    "controls_failed": Rule(_STOP, "nobody could stop the arm any more"),
+    "no_way_back": Rule(_STOP, "the pause cannot be ended by going on"),
+    "recorder_behind": Rule(_STOP, "a motion that is not recorded is worth nothing"),
+    # It can be measured, but does not do what it is told.
+    "following_lost": Rule(_LOWER, "it is blocked, loaded, or a drive does not give its torque"),
+    # The host, the bus or single axes; the other drives can brake.
+    "feedback_gone": Rule(_QUICK, "the axis, its encoder or its cable failed"),
+    "drive_fault": Rule(_QUICK, "the drive gives no torque; read its own fault code before anything else"),
+    "drive_watchdog": Rule(_QUICK, "the drive heard nothing from us in time"),
+    "not_at_rest": Rule(_QUICK, "something moves the arm that we do not control"),
+    "hold_lost": Rule(_QUICK, "gravity is not what the model says, or somebody pushes"),
+    "bus_silent": Rule(_QUICK, "nobody guarded the arm in between"),
+    "clock_jump": Rule(_QUICK, "nothing timed can be trusted"),
+    "torque_not_finite": Rule(_QUICK, "a mistake in the program or the model"),
+    "torque_absurd": Rule(_QUICK, "the arm is overloaded, or program or model are wrong"),
+    "driver": Rule(_QUICK, "the bus or its adapter failed"),
+    "program": Rule(_QUICK, "the program failed or was interrupted"),
+    # What the axis itself measures or does cannot be believed.
+    "emergency_stop": Rule(_OFF, "somebody pressed it, or its circuit is open"),
+    "feedback_not_finite": Rule(_OFF, "the driver does not know where the axis is"),
+    # A controlled stop would turn against a position that never comes (decision 0008).
+    "frozen_encoder": Rule(_OFF, "the encoder stands still, or the joint is jammed"),
+    "far_outside": Rule(_OFF, "no controller can have brought it there: a wrong zero, or it was dragged"),
+    "runaway": Rule(_OFF, "a sign may be wrong"),
+}
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something that must not be, found in one cycle.
+
+    Attributes:
+        code: its name in the table.
+        reaction: to it.
+        message: one plain sentence: which joint, what was measured, what is allowed, what it may mean.
+    """
+
+    code: str
+    reaction: Reaction
+    message: str
+
+    @property
+    def severity(self) -> Severity:
+        """How bad it is."""
+        return FAULTS[self.code].severity
+
+
+class Findings:
+    """Makes faults, and makes too many warnings into one.
+
+    Attributes:
+        cycle: number of the present cycle, for whoever counts cycles to advance.
+        warnings: how often each warning was found.
+    """
+
+    def __init__(self) -> None:
+        self.cycle = 0
+        self.warnings: dict[str, int] = {}
+        self._recent: dict[str, deque[int]] = {}
+
+    def found(self, code: str, what: str) -> Fault:
+        """A fault of the table, or what a warning becomes when it is found too often.
+
+        Args:
+            code: in the table.
+            what: begins the sentence: which joint, what was measured, what is allowed.
+        """
+        rule = FAULTS[code]
+        if rule.reaction is Reaction.WARN:
+            self.warnings[code] = self.warnings.get(code, 0) + 1
+            recent = self._recent.setdefault(code, deque(maxlen=rule.often + 1))
+            recent.append(self.cycle)
+            if len(recent) > rule.often and recent[0] > self.cycle - WINDOW:
+                what = f"{code} in more than {rule.often} of the last {WINDOW} cycles ({what})"
+                code, rule = rule.becomes, FAULTS[rule.becomes]
+        return Fault(code, rule.reaction, f"{what}: {rule.means}")

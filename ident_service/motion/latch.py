@@ -1,0 +1,52 @@
+"""Faults that stay until a person has acknowledged each by its name.
+
+Boundary: memory only; the state table asks it before an arm is armed (`states.py`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ident_service.errors import UsageError
+
+
+@dataclass(frozen=True)
+class Latched:
+    """A fault that nobody has acknowledged yet.
+
+    Attributes:
+        code: its name.
+        cause: one plain sentence.
+        since_ns: when it was found, on the loop's clock [ns].
+    """
+
+    code: str
+    cause: str
+    since_ns: int
+
+
+class Latch:
+    """The unacknowledged faults of one arm, the earliest first; it outlives the single run."""
+
+    def __init__(self) -> None:
+        self._faults: dict[str, Latched] = {}
+
+    @property
+    def faults(self) -> tuple[Latched, ...]:
+        """What is latched."""
+        return tuple(self._faults.values())
+
+    def set(self, code: str, cause: str, since_ns: int) -> None:
+        """Latch a fault; one that is latched already keeps its first cause and time."""
+        self._faults.setdefault(code, Latched(code, cause, since_ns))
+
+    def acknowledge(self, code: str) -> Latched:
+        """Take note of one fault.
+
+        Raises:
+            UsageError: no fault of this name is latched; whoever acknowledges must know what.
+        """
+        if code not in self._faults:
+            known = ", ".join(self._faults) or "none"
+            raise UsageError(f"no fault {code!r} is latched (latched: {known})")
+        return self._faults.pop(code)

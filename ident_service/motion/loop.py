@@ -1,0 +1,277 @@
+"""The cycle: exchange, judge, follow, limit, record, react. Every torque that leaves has passed the guard.
+
+    exchange -> deadlines -> course -> guard.feedback -> control law -> guard.torque -> sink -> reaction -> controls
+
+Reactions that end torque are an `ArmFault` out of `Loop.run`; taking the torque away is `run.py`'s. After a stop the
+loop goes on until the arm has been measured at rest and held for a while, see `faults.py`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+
+from drivers.arm import Arm, Flags, Sample, Vector
+from ident_service.config.limits import MotionLimits
+from ident_service.errors import ArmFault, DriverError
+from ident_service.motion.control import ComputedTorque
+from ident_service.motion.controls import Controls
+from ident_service.motion.course import Course
+from ident_service.motion.deadlines import Deadlines
+from ident_service.motion.faults import LOWER, LOWER_AFTER, SETTLE, Fault, Reaction
+from ident_service.motion.guard import Guard
+from ident_service.motion.latch import Latch
+from ident_service.motion.reference import Setpoint, rest
+from ident_service.motion.sink import Sink
+from ident_service.motion.states import State, States
+
+KEPT_SAMPLES: Final = 100
+REST_SPEED: Final = 0.05  # of the velocity limit, below which a joint counts as at rest
+REST_CYCLES: Final = 20  # of rest in a row
+HOLD_SPEED: Final = 0.25  # of the velocity limit, above which an arm that is held has come loose
+
+
+@dataclass
+class Peaks:
+    """Largest following error [rad or m] and torque [N m or N] so far, each of shape (joints,)."""
+
+    following_error: Vector
+    torque: Vector
+
+
+@dataclass
+class Loop:
+    """One motion, cycle by cycle.
+
+    Attributes:
+        ended_by: the fault that stopped the arm under control, if one did.
+        last: the latest samples.
+        peaks: so far.
+    """
+
+    arm: Arm
+    guard: Guard
+    control: ComputedTorque
+    course: Course
+    states: States
+    deadlines: Deadlines
+    controls: Controls
+    sink: Sink
+    latch: Latch
+    limits: MotionLimits
+    hold_seconds: float
+    peaks: Peaks
+    ended_by: Fault | None = None
+    last: deque[Sample] = field(default_factory=lambda: deque(maxlen=KEPT_SAMPLES))
+
+    def __post_init__(self) -> None:
+        self._level = Reaction.WARN
+        self._rested = 0
+        self._needed = np.zeros_like(self.limits.torque)  # beside gravity, to stand: the sum over the cycles of rest
+        self._since_ns = 0  # of the hold or the lowering
+        self._lowering = False
+        self._told: set[str] = set()
+        self._rest_speed = REST_SPEED * self.limits.velocity
+        self._hold_speed = HOLD_SPEED * self.limits.velocity
+
+    def run(self, torque: Vector) -> None:
+        """Cycle until DONE, or until STOPPED and held.
+
+        Args:
+            torque: of the first cycle, that holds the arm where it stands [N m or N], shape (joints,).
+
+        Raises:
+            ArmFault: torque must end now.
+        """
+        wanted: Vector | None = torque
+        while wanted is not None:
+            wanted = self._cycle(wanted)
+
+    def _cycle(self, torque: Vector) -> Vector | None:
+        """Send a torque; the next one, or None at the end."""
+        try:
+            sample = self.arm.exchange(torque)
+        except DriverError as error:
+            raise self._end(self.guard.findings.found("driver", str(error))) from error
+        woken_ns, stamp_ns = self.arm.clock.now_ns(), sample.stamp_ns
+        self.last.append(sample)
+        found = self.deadlines.cycle(stamp_ns, woken_ns)
+        if found is not None:
+            self._react(found, stamp_ns)
+        reference = self.course.at(stamp_ns)
+        if self.states.state is State.DONE:
+            return None
+        free = self._lowering or self.states.state is State.STOPPED
+        if free:  # no position is asked for
+            reference = rest(self.control.position)
+        usable, fault = self.guard.feedback(sample, reference, self.control.velocity, self.control.correction)
+        torque, torque_fault = self.guard.torque(self._law(sample, usable, reference, free))
+        compute_ns = self.arm.clock.now_ns() - woken_ns
+        kept = sample if fault is None or fault.code != "feedback_not_finite" else self._finite(sample)
+        for found in (fault, torque_fault, self._record(kept, reference, compute_ns)):
+            if found is not None:
+                self._react(found, stamp_ns)
+        self._remember(sample, usable, reference)
+        if self._rests(stamp_ns):
+            return None
+        self._obey(woken_ns, stamp_ns)
+        return torque
+
+    def _law(self, sample: Sample, usable: Flags, reference: Setpoint, free: bool) -> Vector:
+        """The torque wanted [N m or N], shape (joints,)."""
+        if not free:
+            return self.control.torque(sample.position, usable, reference)
+        if not self._lowering:
+            return self.control.damping(sample.position, usable, added=self._needed / REST_CYCLES)
+        left = 1.0 - ((sample.stamp_ns - self._since_ns) * 1e-9 - LOWER_AFTER) / LOWER
+        return self.control.damping(sample.position, usable, min(max(left, 0.0), 1.0))
+
+    def _react(self, fault: Fault, stamp_ns: int) -> None:
+        """Do what the table says, unless something as severe is being done already.
+
+        Raises:
+            ArmFault: torque must end now.
+        """
+        if fault.reaction is Reaction.WARN:
+            if fault.code not in self._told:  # the report counts the others
+                self._told.add(fault.code)
+                self.tell(fault.severity, stamp_ns, f"{fault.code}: {fault.message}")
+            return
+        if fault.reaction <= self._level:
+            return
+        self._level = fault.reaction
+        if fault.reaction >= Reaction.QUICK_STOP:
+            raise self._end(fault)
+        self.ended_by = fault
+        self.latch.set(fault.code, fault.message, stamp_ns)
+        self.course.stop(stamp_ns)
+        self.tell(fault.severity, stamp_ns, f"{fault.code}: {fault.message}")
+        if fault.reaction is Reaction.DAMPED_LOWERING:
+            self._lowering, self._since_ns = True, stamp_ns
+
+    def _rests(self, stamp_ns: int) -> bool:
+        """See to the ends of stops, pauses, holds and lowerings; whether this was the last cycle.
+
+        Raises:
+            ArmFault: lowered; not at rest in time; or at rest no more.
+        """
+        state, since = self.states.state, (stamp_ns - self._since_ns) * 1e-9
+        if self._lowering:
+            if since < LOWER_AFTER + LOWER or self.ended_by is None:
+                return False
+            raise self._end(self.ended_by)
+        if state is State.STOPPED:
+            if (np.abs(self.control.velocity) > self._hold_speed).any():
+                raise self._end(self._named("hold_lost", "moves at {} while it is held"))
+            return since >= self.hold_seconds
+        if state not in (State.STOPPING, State.PAUSING):
+            return False
+        overdue = self.course.overdue(stamp_ns)
+        if overdue >= 0.0 and (np.abs(self.control.velocity) <= self._rest_speed).all():
+            self._rested += 1
+            self._needed = self._needed + self.control.correction
+        else:
+            self._forget_rest()
+        if self._rested >= REST_CYCLES:
+            if state is State.PAUSING:
+                self.course.stood()
+                self._forget_rest()
+                return False
+            self.states.enter(State.STOPPED)
+            self._since_ns = stamp_ns
+            return self.hold_seconds <= 0.0
+        if overdue > SETTLE:
+            raise self._end(self._named("not_at_rest", f"moves at {{}} {SETTLE:g} s after it was to rest"))
+        return False
+
+    def _forget_rest(self) -> None:
+        self._rested, self._needed = 0, np.zeros_like(self._needed)
+
+    def _obey(self, now_ns: int, stamp_ns: int) -> None:
+        """Do what is asked from outside; whatever is wrong with that, too, stops the arm."""
+        try:
+            stop, pause, lease = self.controls.stop, self.controls.pause, self.controls.lease_ok(now_ns)
+        except Exception as error:  # noqa: BLE001 - whatever reading it died of, the arm must not fall for it
+            self._react(
+                self.guard.findings.found("controls_failed", f"reading the controls failed ({error!r})"), stamp_ns
+            )
+            return
+        if stop:
+            self.course.stop(stamp_ns)
+        elif not lease:
+            self._lapse(stamp_ns)
+        elif pause:
+            self.course.pause(stamp_ns)
+        if self.states.state is State.PAUSED:
+            refusal = self.course.look_for_way_back()
+            if refusal is not None:
+                self._react(self.guard.findings.found("no_way_back", refusal), stamp_ns)
+            elif not pause:
+                self.course.go_on(stamp_ns)
+
+    def _lapse(self, stamp_ns: int) -> None:
+        """The lease is lost; a stop that is under way already does not become a fault by it."""
+        if self.states.state not in (State.STOPPING, State.STOPPED):
+            self._react(self.guard.findings.found("lease_lost", "the lease was not renewed in time"), stamp_ns)
+
+    def _record(self, sample: Sample, reference: Setpoint, compute_ns: int) -> Fault | None:
+        try:
+            kept = self.sink.put(
+                sample.stamp_ns,
+                sample.position,
+                sample.velocity,
+                sample.torque,
+                reference.position,
+                reference.velocity,
+                sample.cycle,
+                self.deadlines.lateness_ns,
+                compute_ns,
+                sample.valid,
+                sample.age,
+                sample.lost,
+            )
+        except Exception as error:  # noqa: BLE001 - whatever a recorder died of, the arm must not fall for it
+            why = f"the recorder failed ({error})"
+        else:
+            why = "" if kept else "the recorder cannot keep up"
+        if not why or self.states.state in (State.STOPPING, State.STOPPED):
+            return None
+        return self.guard.findings.found("recorder_behind", why)
+
+    def _finite(self, sample: Sample) -> Sample:
+        """A sample as readers of recordings can use it: what is no number is invalid, and what it was before."""
+        before = self.last[-2] if len(self.last) > 1 else sample
+        position, velocity = sample.position, sample.velocity
+        good = np.isfinite(position)
+        return replace(
+            sample,
+            position=np.nan_to_num(np.where(good, position, before.position)),
+            velocity=None if velocity is None else np.nan_to_num(velocity),
+            torque=np.nan_to_num(sample.torque),
+            valid=sample.valid & good,
+        )
+
+    def _remember(self, sample: Sample, usable: Flags, reference: Setpoint) -> None:
+        error = np.abs(reference.position - sample.position)
+        if not usable.all():
+            error = np.where(usable, error, 0.0)
+        np.maximum(self.peaks.following_error, error, out=self.peaks.following_error)
+        np.maximum(self.peaks.torque, np.abs(sample.torque), out=self.peaks.torque)
+
+    def _named(self, code: str, what: str) -> Fault:
+        """A fault of the joint that moves most, in terms of its limit; `{}` stands for its velocity."""
+        joint = int(np.argmax(np.abs(self.control.velocity) / self.limits.velocity))
+        return self.guard.findings.found(code, self.guard.about(joint, what, self.control.velocity[joint]))
+
+    def _end(self, fault: Fault) -> ArmFault:
+        """The error that takes the torque away."""
+        return ArmFault(fault.code, fault.message, self.last)
+
+    def tell(self, level: int, stamp_ns: int, message: str) -> None:
+        """Tell the sink a line of the story."""
+        with suppress(Exception):  # a recorder that has failed says so at its next sample
+            self.sink.event(stamp_ns, int(level), message)

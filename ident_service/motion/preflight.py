@@ -1,0 +1,248 @@
+"""Preflight: every check there is, in an order in which none endangers what a later one would have found.
+
+First what needs no arm, then what only looks, then what holds the arm, moves it a little, and at last lets the drives
+stop it. The first failed check that makes touching the arm unsafe ends it; the rest are skipped and say because of
+what. Whatever happens, the arm is without torque and closed afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from datetime import timedelta
+
+import numpy as np
+
+from drivers.arm import Arm, ArmDescription, Sample, StopKind
+from drivers.clock import Clock, RealClock
+from ident_service.config.limits import MotionLimits, motion_limits
+from ident_service.errors import ArmError, ArmFault, ModelError, MotionRefused
+from ident_service.excitation.excitation import Excitation
+from ident_service.excitation.following import ExpectedFriction, expected_friction
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.rigid_body import InverseDynamics
+from ident_service.motion.control import ComputedTorque
+from ident_service.motion.preflight_check import CODES, Check, Verdict, failed, skipped
+from ident_service.motion.preflight_direction import (
+    answer,
+    direction_check,
+    follow_stroke,
+    sign_failure,
+    strokes,
+    went_against,
+    wrong_signs,
+)
+from ident_service.motion.preflight_gravity import HOLD, SETTLE, gravity_check, holdable
+from ident_service.motion.preflight_gravity import REMEDY as GRAVITY_REMEDY
+from ident_service.motion.preflight_look import (
+    at_rest_check,
+    identities_check,
+    look,
+    noise_check,
+    rate_check,
+    unreachable,
+)
+from ident_service.motion.preflight_plan import (
+    configuration_check,
+    motion_fits_check,
+    motion_proven_check,
+    stability_check,
+    ways_check,
+)
+from ident_service.motion.preflight_session import Session
+from ident_service.motion.preflight_ticket import VALID, Ticket, new_ticket, subject_of
+from ident_service.motion.preflight_watchdog import Confirm, consent, watchdog_check
+from ident_service.motion.reference import hold, rest
+
+LOOK = 1.0  # s
+_LEAST_CYCLES = 100
+_LOOK_AGAIN = 20  # cycles
+# A motion that does not fit or is not proven is not run; holding the arm where it stands is as safe as ever.
+_ABOUT_THE_MOTION = ("motion_fits", "motion_proven", "ways_clear")
+
+Tell = Callable[[Check], None]
+
+
+def preflight(
+    arm: Arm,
+    model: ArmModel,
+    excitation: Excitation,
+    *,
+    confirm: Confirm = lambda question: "",
+    clock: Clock | None = None,
+    identities: Sequence[str] | None = None,
+    tell: Tell = lambda check: None,
+    valid: timedelta = VALID,
+    look_seconds: float = LOOK,
+) -> Ticket:
+    """Check an arm and a motion.
+
+    Args:
+        arm: not open; it stands on its support, without torque.
+        model: of the arm.
+        excitation: to be run.
+        confirm: shows a question and returns what a person typed; asked once, before anything is energised.
+        clock: whose UTC the ticket is stamped with; by default the machine's. The loop has the arm's own.
+        identities: of the drives, as an earlier ticket has them; None accepts whatever answers.
+        tell: called with every check as soon as it is made.
+        valid: how long the ticket counts.
+        look_seconds: how long rate and noise are measured.
+
+    Returns:
+        The ticket, whatever its verdict; what fails is in its checks, and nothing the arm does is raised.
+    """
+    clock = RealClock() if clock is None else clock
+    flight = _Preflight(arm, model, excitation, confirm, identities, tell, look_seconds)
+    flight.run()
+    subject = subject_of(model, excitation, flight.described)
+    return new_ticket(subject, flight.all_checks(), clock.now_ns() + clock.utc_offset_ns, valid)
+
+
+class _Ended(Exception):
+    """The arm has been let go, and why is among the checks."""
+
+
+class _Preflight:
+    def __init__(
+        self,
+        arm: Arm,
+        model: ArmModel,
+        excitation: Excitation,
+        confirm: Confirm,
+        identities: Sequence[str] | None,
+        tell: Tell,
+        look_seconds: float,
+    ) -> None:
+        self.arm, self.model, self.excitation = arm, model, excitation
+        self.confirm, self.identities, self.tell = confirm, identities, tell
+        self.look_seconds = look_seconds
+        self.described: ArmDescription | None = None
+        self.checks: dict[str, Check] = {}
+
+    def run(self) -> None:
+        """Make every check that can be made safely."""
+        if not self._passed(configuration_check(self.model)):
+            return
+        limits = motion_limits(self.model.config)
+        if self._passed(motion_fits_check(self.model, self.excitation)):
+            self._passed(motion_proven_check(self.model, limits, self.excitation))
+        self._passed(stability_check(self.model, limits, self.excitation))
+        try:
+            with self.arm:
+                try:
+                    self._opened(limits)
+                except _Ended:
+                    return
+                finally:
+                    self.arm.stop(StopKind.TORQUE_OFF)
+        except ArmError as error:
+            self._broken(error)
+        finally:
+            self.arm.close()  # once more, for an arm that failed while it was opened
+
+    def all_checks(self) -> list[Check]:
+        """Every check; those that were not made say because of which."""
+        because = next((code for code, check in self.checks.items() if check.verdict is Verdict.FAILED), None)
+        why = "nothing before it failed, but it was not reached" if because is None else f"because {because} failed"
+        return [self.checks.get(code) or skipped(code, why) for code in CODES]
+
+    def _opened(self, limits: MotionLimits) -> None:
+        self.described = self.arm.describe()
+        period = 1.0 / self.described.rate
+        first = self.arm.exchange(None)
+        cycles = max(_LEAST_CYCLES, round(self.look_seconds / period))
+        looked = look(self.arm, cycles, period, self._load(first, limits, period))
+        if not self._passed(identities_check(self.described, self.model, limits, self.identities, looked)):
+            return
+        if not self._passed(at_rest_check(looked, self.model, limits)):
+            return
+        home = looked.samples[-1].position.copy()
+        if self.checks["motion_fits"].verdict is Verdict.PASSED:
+            self._passed(ways_check(self.model, limits, self.excitation, home))
+        self._passed(rate_check(looked, self.arm.clock.lock_step))
+        friction = expected_friction(self.model, limits, self.model.config.design.friction_guess)
+        session = Session(self.arm, self.model, limits, period, home, friction)
+        self._passed(noise_check(looked, self.described, self.model, limits, session.mass))
+        if any(c.verdict is Verdict.FAILED and c.code not in _ABOUT_THE_MOTION for c in self.checks.values()):
+            return
+        if (impossible := holdable(session.gravity, self.model, limits)) is not None:
+            self._passed(impossible)
+            return
+        agreed = consent(self.model, looked.samples[-1], self.confirm)
+        if agreed.check is not None:
+            self._passed(agreed.check)
+        # A person may have taken minutes to answer, and may have moved the arm meanwhile.
+        again = look(self.arm, _LOOK_AGAIN, period)
+        if (still := at_rest_check(again, self.model, limits)).verdict is not Verdict.PASSED:
+            self._passed(still)
+            return
+        session = Session(self.arm, self.model, limits, period, again.samples[-1].position, friction)
+        if self._touched(session, limits, friction) and agreed.given:
+            self._passed(watchdog_check(self.arm, self.model, period))
+        else:
+            session.release()
+
+    def _touched(self, session: Session, limits: MotionLimits, friction: ExpectedFriction) -> bool:
+        """Hold the arm and move it a little; True when it is held afterwards and all its joints are known."""
+        try:
+            planned = strokes(session, self.model, limits)
+        except (ModelError, MotionRefused) as error:
+            planned = []
+            self._passed(failed("direction", str(error), "Move the arm by hand to where every joint has room."))
+        session.energise()
+        try:
+            trace = session.follow(hold(session.home), SETTLE + HOLD)
+            if not self._passed(gravity_check(trace, session.gravity, self.model, limits, friction)) or not planned:
+                return False
+            answers = [answer(follow_stroke(session, one), one, session) for one in planned]
+            session.follow(hold(session.home), SETTLE)
+            return self._passed(direction_check(answers, self.model))
+        except ArmFault as error:
+            self.arm.stop(StopKind.TORQUE_OFF)
+            self._faulted(session, error)
+            raise _Ended from error
+
+    def _load(self, first: Sample, limits: MotionLimits, period: float) -> Callable[[Sample], None]:
+        """The control law of a run, computed and thrown away."""
+        prior = np.zeros(self.model.layout.size) if self.model.prior is None else self.model.prior
+        if first.position.shape != (self.model.chain.joints,) or not np.isfinite(first.position).all():
+            return lambda sample: None
+        dynamics = InverseDynamics(self.model.chain, self.model.layout, prior)
+        cutoff = self.model.config.control.velocity_cutoff
+        control = ComputedTorque(dynamics, limits, period, cutoff, first.position)
+        still = rest(first.position)
+
+        def work(sample: Sample) -> None:
+            control.torque(np.nan_to_num(sample.position), sample.valid, still)
+
+        return work
+
+    def _faulted(self, session: Session, error: ArmFault) -> None:
+        """Find out what ended the loop: a joint that went the wrong way, or something else."""
+        trace = session.trace()
+        astray = int(np.argmax(np.abs(trace.position[-1] - trace.reference[-1])))
+        name = self.model.chain.names[astray]
+        if "gravity" not in self.checks:
+            if wrong := wrong_signs(trace, session):
+                self._passed(sign_failure(wrong, self.model, str(error)))
+            else:
+                remedy = f"{GRAVITY_REMEDY} Check the signs of encoders and torques too."
+                self._passed(failed("gravity", f"the arm could not be held where it stands: {error}", remedy))
+        elif went_against(trace, astray, session):
+            self._passed(sign_failure([astray], self.model, str(error)))
+        else:
+            remedy = f"Free {name} if something blocks it or a brake holds it; check its encoder and its signs."
+            self._passed(failed("direction", f"{name} went astray: {error}", remedy))
+
+    def _broken(self, error: ArmError) -> None:
+        """The arm could not be opened, looked at or energised, or fell silent."""
+        if self.described is None or "identities" not in self.checks:
+            self._passed(unreachable(str(error)))
+        else:
+            code = next(code for code in CODES if code not in self.checks)
+            remedy = "Check power, cables, bus and the drives' own fault codes."
+            self._passed(failed(code, str(error), remedy))
+
+    def _passed(self, check: Check) -> bool:
+        self.checks[check.code] = check
+        self.tell(check)
+        return check.verdict is Verdict.PASSED

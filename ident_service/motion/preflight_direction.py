@@ -1,0 +1,309 @@
+"""Direction and scale of every joint, by a small jerk-limited motion there and back, one joint at a time.
+
+Two numbers per joint. How it follows: the displacement measured from dwell to dwell against the one asked for. And how
+it answers torque: measured acceleration against the one that the model expects of the torque that acted,
+`M^-1 (tau - g)`, friction and offset taken out. A loop closes over a wrong encoder scale as if nothing were wrong; only
+the answer to torque shows it, as it shows a wrong gear ratio, squared. A joint whose sign is wrong runs away from its
+reference, until the guard ends that at twice the amplitude; what it did on the way says whether the sign was why.
+
+Boundary: the motions and the judgement; the loop is `preflight_session.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.signal import savgol_filter
+
+from ident_service.config.limits import MotionLimits, Vector
+from ident_service.errors import MotionRefused
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.collision import CollisionModel
+from ident_service.motion.preflight_check import Check, Measure, failed, judged, measures
+from ident_service.motion.preflight_session import BAND, Session, Trace
+from ident_service.motion.preflight_stability import INERTIA
+from ident_service.motion.reference import Reference, Setpoint, rest
+from ident_service.motion.surroundings import way_clearance
+from ident_service.motion.way import RuckigReference, way
+
+AMPLITUDES = (0.04, -0.04, 0.02, -0.02)  # rad or m, the first that is free
+SPEED, ACCELERATION = 0.2, 1.2  # rad/s and rad/s^2, or m: at one metre 0.2 m/s, below the 0.25 of ISO 10218
+DWELL, _SETTLED = 0.25, 0.1  # s at each end, and of it what displacements are measured in
+LEARNING = (6.0, 3.0)  # 1/s, in turn: dry friction is learned at this rate, and taken as known the last time
+FOLLOWS = (0.8, 1.25)  # measured against commanded displacement
+# Where the model lacks the drive's inertia the loop's gain is too low for it, and it overshoots.
+FOLLOWS_LOOSELY = (0.5, 2.0)
+MOST_ANSWER = 1.0 / INERTIA[0]  # how much more a joint may answer to torque than the model says
+LEAST_ANSWER = 1.0 / (2.0 * INERTIA[1])  # and how much less, where the model knows the drive's inertia
+_DOUBT = 3.0  # standard deviations
+_EXPLAINS = 0.5  # of what is unexplained must remain at most when a wrong sign is put right
+_LEAST_CYCLES = 8
+_BEGUN = 0.95  # of the way that ended at the guard is still to come when a joint has begun to move
+_SEEN = 2e-3  # rad or m that a joint must have moved before it says anything about its sign
+_WINDOW = 0.06  # s, of the filter that differentiates
+_MOVING = 0.2  # of the largest speed
+SIGN_REMEDY = (
+    "Check the sign of this joint's transmission, of its encoder and of its torque in the driver's configuration."
+)
+
+
+@dataclass(frozen=True)
+class Stroke:
+    """A small motion of one joint from where it stands and back.
+
+    Attributes:
+        joint: index.
+        amplitude: signed [rad or m].
+        duration: [s].
+    """
+
+    joint: int
+    amplitude: float
+    there: RuckigReference
+    back: RuckigReference
+
+    @property
+    def duration(self) -> float:
+        """Both ways and the dwells [s]."""
+        return self.there.duration + self.back.duration + 3.0 * DWELL
+
+    def at(self, time: float) -> Setpoint:
+        """Setpoint at `time` [s]."""
+        time -= DWELL
+        if time < self.there.duration + DWELL:
+            return self.there.at(max(time, 0.0))
+        return self.back.at(time - self.there.duration - DWELL)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a joint did.
+
+    Attributes:
+        follows: measured against commanded displacement; not a number where it was not moved.
+        answers: measured against expected acceleration, likewise.
+        doubt: its standard deviation.
+    """
+
+    follows: float
+    answers: float
+    doubt: float
+
+
+def strokes(session: Session, model: ArmModel, limits: MotionLimits) -> list[Stroke]:
+    """A small motion for every joint.
+
+    Raises:
+        MotionRefused: a joint has no room within its position limits or its surroundings.
+    """
+    collision = CollisionModel(model)
+    own = np.diag(session.mass)
+    slow = replace(
+        limits,
+        velocity=np.minimum(limits.velocity, SPEED),
+        acceleration=np.minimum(np.minimum(limits.acceleration, ACCELERATION), 0.5 * BAND * limits.torque / own),
+    )
+    found = []
+    for joint, name in enumerate(model.chain.names):
+        if (free := _free_stroke(session.home, joint, collision, slow, model.config.workspace.clearance)) is None:
+            raise MotionRefused(f"{name}: no room to move by {min(np.abs(AMPLITUDES)):g} either way")
+        found.append(free)
+    return found
+
+
+def follow_stroke(session: Session, stroke: Stroke) -> Trace:
+    """Move one joint there and back, to learn its friction, and once more; the trace is of the last time.
+
+    Raises:
+        ArmFault, DriverError: from the loop.
+    """
+    reference: Reference = stroke
+    for learning in LEARNING:
+        session.follow(reference, stroke.duration, learning)
+    return session.follow(reference, stroke.duration)
+
+
+def answer(trace: Trace, stroke: Stroke, session: Session) -> Answer:
+    """Judge a stroke that the loop could follow to its end."""
+    answers, doubt = _answer_to_torque(trace, stroke.joint, session)
+    return Answer(_displaced(trace, stroke) / stroke.amplitude, answers, doubt)
+
+
+def _answer_to_torque(trace: Trace, joint: int, session: Session) -> tuple[float, float]:
+    """Measured against expected acceleration, and its standard deviation; no numbers where it hardly moved."""
+    nothing = float("nan"), float("nan")
+    rate = trace.rate[:, joint]
+    window = max(5, 2 * round(0.5 * _WINDOW / trace.period) + 1)
+    if len(rate) < 2 * window:
+        return nothing
+    largest = np.abs(rate).max()
+    measured = savgol_filter(trace.position[:, joint], window, 2, deriv=2, delta=trace.period)
+    speed = savgol_filter(trace.position[:, joint], window, 2, deriv=1, delta=trace.period)
+    # The same filter on the way that the model expects, so that what it distorts it distorts on both sides.
+    expected = savgol_filter(_expected_way(trace, session)[:, joint], window, 2, deriv=2, delta=trace.period)
+    sliding = (np.minimum(np.abs(rate), np.abs(speed)) > _MOVING * largest) & (np.sign(speed) == np.sign(rate))
+    if int(sliding.sum()) < 2 * window:
+        return nothing
+    ones = np.ones(int(sliding.sum()))
+    columns = np.column_stack([expected[sliding], np.sign(rate[sliding]), speed[sliding], ones])
+    return _fitted(columns, measured[sliding], window)
+
+
+def _displaced(trace: Trace, stroke: Stroke) -> float:
+    """Mean way there and back, from dwell to dwell [rad or m]."""
+    ends = (DWELL, stroke.there.duration + 2.0 * DWELL, stroke.duration)
+    last = max(1, round(_SETTLED / trace.period))
+    rows = [round(end / trace.period) for end in ends]
+    start, far, back = (float(trace.position[row - last : row, stroke.joint].mean()) for row in rows)
+    return far - 0.5 * (start + back)
+
+
+def went_against(trace: Trace, joint: int, session: Session) -> bool:
+    """Whether the joint that has gone astray went against its own torque, since it last stood.
+
+    Friction holds it until the torque is large enough, and is constant afterwards, so that only what comes after it has
+    begun to move counts, with a constant torque taken out.
+    """
+    position = trace.position[:, joint]
+    away = np.abs(position - position[-1])
+    begin = int(np.flatnonzero(away > _BEGUN * away.max())[-1]) if away.max() > _SEEN else len(position)
+    rows = slice(max(begin - _LEAST_CYCLES, 0), None)
+    moved, push = position[rows], (trace.torque[rows, joint] - session.gravity[joint]) / session.mass[joint, joint]
+    if len(moved) < _LEAST_CYCLES or not np.isfinite(moved).all():
+        return False
+    speed = np.concatenate([[0.0], np.cumsum(push)[:-1]]) * trace.period
+    expected = np.concatenate([[0.0], np.cumsum(speed)[:-1]]) * trace.period
+    time = np.linspace(0.0, 1.0, len(moved))
+    gain, _ = _fitted(np.column_stack([expected, time**2, time, np.ones_like(time)]), moved, 1.0)
+    return gain < 0.0
+
+
+def wrong_signs(trace: Trace, session: Session) -> list[int]:
+    """Joints whose sign explains how a loop ended at the guard.
+
+    Measured displacements against the twice integrated accelerations that the model expects, constant torques that the
+    model does not know (gravity's for example) taken out on both sides. Joints are coupled, so that one wrong sign
+    makes others go the wrong way too: a sign of torque or of position is wrong when turning it round explains at least
+    half of what is otherwise unexplained.
+
+    Returns:
+        Indices; empty where no sign explains it, or nothing has moved far enough to say.
+    """
+    moved = trace.position - trace.position[0]
+    cycles, joints = moved.shape
+    if cycles < _LEAST_CYCLES or np.abs(moved).max() < _SEEN or not np.isfinite(moved).all():
+        return []
+    time = np.linspace(0.0, 1.0, cycles)
+    basis = np.linalg.qr(np.column_stack([np.ones(cycles), time, time**2]))[0]
+
+    def varying(values: Vector) -> Vector:
+        return np.asarray(values - basis @ (basis.T @ values))
+
+    seen = varying(moved)
+    size = np.maximum(np.linalg.norm(seen, axis=0), 1e-9)
+
+    def unexplained(torque_sign: Vector, position_sign: Vector) -> float:
+        expected = varying(_expected_way(trace, session, torque_sign)) * position_sign
+        # How much more or less inertia there is than the model knows is not the question, but no less than none.
+        gain = (seen * expected).sum(axis=0) / np.maximum((expected**2).sum(axis=0), 1e-30)
+        return float((((seen - np.maximum(gain, 0.0) * expected) / size) ** 2).sum())
+
+    signs = [np.ones(joints), np.ones(joints)]
+    left = unexplained(*signs)
+    found: list[int] = []
+    while len(found) < joints:
+        tried = []
+        for kind in (0, 1):
+            for joint in range(joints):
+                other = [one.copy() for one in signs]
+                other[kind][joint] *= -1.0
+                tried.append((unexplained(*other), joint, other))
+        best, joint, other = min(tried, key=lambda one: one[0])
+        if best > _EXPLAINS * left or joint in found:
+            break
+        left, signs = best, other
+        found.append(joint)
+    return sorted(found)
+
+
+def sign_failure(joints: Sequence[int], model: ArmModel, why: str) -> Check:
+    """The direction check of an arm with joints that went the wrong way."""
+    names = ", ".join(model.chain.names[joint] for joint in joints)
+    return failed("direction", f"{names}: seems to move against its torque ({why})", SIGN_REMEDY)
+
+
+def direction_check(answers: Sequence[Answer], model: ArmModel) -> Check:
+    """Judge all strokes."""
+    names, ones = model.chain.names, ("",) * model.chain.joints
+    nothing = np.zeros(len(names))
+    follows = np.array([one.follows for one in answers])
+    most = np.full(len(names), MOST_ANSWER)
+    known = nothing if model.prior is None else model.layout.term_values("drive_inertia", model.prior)
+    least = np.where(known > 0.0, LEAST_ANSWER, 0.0)
+    response = np.array([one.answers for one in answers])
+    doubt = np.array([one.doubt for one in answers])
+    # The doubt is on the arm's side: only an answer that is certainly out of bounds is.
+    nearest = np.clip(response, least, most)
+    judged_at = np.where(np.abs(response - nearest) <= _DOUBT * doubt, nearest, response)
+    found: list[Measure] = [
+        *measures("displacement, measured against commanded", follows, ones, names,
+                  least=np.where(known > 0.0, FOLLOWS[0], FOLLOWS_LOOSELY[0]),
+                  most=np.where(known > 0.0, FOLLOWS[1], FOLLOWS_LOOSELY[1])),
+        *measures("answer to torque, measured against the model", response, ones, names),
+        *measures("answer to torque, the nearest within its doubt", judged_at, ones, names, least=least, most=most),
+    ]  # fmt: skip
+    # Where it cannot be told from friction how a joint answers torque, following is all there is to judge.
+    found = [one for one in found if one.value is not None or one.what.startswith("displacement")]
+    return judged(
+        "direction",
+        found,
+        "Check this joint's gear ratio, encoder steps per turn and torque constant in the driver's configuration, and "
+        "that no brake and nothing else holds it; a joint that answers too little may lack drive inertia in the prior.",
+    )
+
+
+def _free_stroke(
+    home: Vector, joint: int, collision: CollisionModel, slow: MotionLimits, clearance: float
+) -> Stroke | None:
+    for amplitude in AMPLITUDES:
+        target = home.copy()
+        target[joint] += amplitude
+        if not slow.lower[joint] <= target[joint] <= slow.upper[joint]:
+            continue
+        try:
+            there, back = way(rest(home), rest(target), slow), way(rest(target), rest(home), slow)
+        except MotionRefused:
+            continue
+        if not collision.pairs or way_clearance(collision, there, slow, clearance).proven:
+            return Stroke(joint, amplitude, there, back)
+    return None
+
+
+def _expected_way(trace: Trace, session: Session, sign: Vector | float = 1.0) -> Vector:
+    """How far the model expects the torque that acted, times `sign`, to have moved the arm, shape (cycles, joints)."""
+    acceleration = np.linalg.solve(session.mass, (sign * (trace.torque - session.gravity)).T).T
+    start = np.zeros((1, acceleration.shape[1]))
+    speed = np.vstack([start, np.cumsum(acceleration, axis=0)[:-1]]) * trace.period
+    steps = trace.period * (speed + 0.5 * trace.period * acceleration)
+    return np.vstack([start, np.cumsum(steps, axis=0)[:-1]])
+
+
+def _fitted(columns: Vector, values: Vector, correlated: float) -> tuple[float, float]:
+    """The first coefficient of a least-squares fit and its standard deviation.
+
+    Args:
+        columns: shape (samples, unknowns).
+        values: shape (samples,).
+        correlated: over how many samples residuals are not independent.
+    """
+    size = np.linalg.norm(columns, axis=0)
+    size = np.where(size > 0.0, size, 1.0)
+    solution, _, rank, _ = np.linalg.lstsq(columns / size, values, rcond=None)
+    if rank < columns.shape[1]:
+        return float("nan"), float("nan")
+    left = values - (columns / size) @ solution
+    variance = float(left @ left) / max(len(values) - columns.shape[1], 1) * correlated
+    inverse = np.linalg.inv((columns / size).T @ (columns / size))
+    return float(solution[0] / size[0]), float(np.sqrt(variance * inverse[0, 0]) / size[0])

@@ -1,0 +1,174 @@
+"""The part of preflight with torque: a closed loop that may go next to nowhere.
+
+The arm has just been seen at rest without torque, so it is supported where it stands. The loop is that of a run, but
+its guard stops it `FARTHEST` from where it should be, at a crawl, and its torque is kept to a band around the model's
+gravity torque: a wrong sign or a wrong scale then drives the arm no farther than a few hundredths of a radian, from
+where it can be let go. So every end here, good or bad, is torque off; a drive's own quick stop would trust the very
+sign that has not been proven yet.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drivers.arm import Arm, Sample, StopKind, Vector
+from ident_service.config.limits import MotionLimits
+from ident_service.errors import ArmFault
+from ident_service.excitation.following import ExpectedFriction
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.rigid_body import InverseDynamics
+from ident_service.motion.control import ComputedTorque
+from ident_service.motion.guard import Guard, Reaction
+from ident_service.motion.reference import Reference, Setpoint
+
+FARTHEST = 0.08  # rad or m from the reference, twice the amplitude of the motions that prove directions
+FASTEST = 1.0  # rad/s or m/s: where the guard stops; motions here are slower by far
+BAND = 0.25  # of the torque limit, beside the model's gravity torque and expected friction
+_CREEP = 0.02  # rad/s or m/s, below which friction is not compensated, so that nothing hunts at rest
+RELEASE = 0.5  # s over which torque is led to zero
+SUNK = 0.02  # rad or m: what sinks farther while torque fades has no support, and is let go at once
+
+
+@dataclass(frozen=True)
+class Trace:
+    """Cycles of the loop, as arrays of one row per cycle.
+
+    Attributes:
+        position: measured [rad or m], shape (cycles, joints).
+        torque: that acts from each stamp on [N m or N], shape (cycles, joints).
+        reference: position asked for [rad or m], shape (cycles, joints).
+        rate: velocity asked for [rad/s or m/s], shape (cycles, joints).
+        period: [s].
+    """
+
+    position: Vector
+    torque: Vector
+    reference: Vector
+    rate: Vector
+    period: float
+
+
+class Session:
+    """A guarded loop on an open arm at rest.
+
+    Attributes:
+        home: where the arm stood [rad or m], shape (joints,).
+        gravity: the model's torque there [N m or N], shape (joints,).
+        mass: the model's mass matrix there, shape (joints, joints).
+    """
+
+    def __init__(
+        self, arm: Arm, model: ArmModel, limits: MotionLimits, period: float, home: Vector, friction: ExpectedFriction
+    ) -> None:
+        """Prepare; nothing is sent.
+
+        Args:
+            arm: open, at rest, not enabled.
+            model: with a prior.
+            limits: of the arm.
+            period: [s].
+            home: where it stands [rad or m], shape (joints,).
+            friction: widens the band of torques.
+        """
+        prior = np.zeros(model.layout.size) if model.prior is None else model.prior
+        dynamics = InverseDynamics(model.chain, model.layout, prior)
+        still = np.zeros_like(home)
+        self.home = home.copy()
+        self.gravity = dynamics.torque(home, still, still)
+        self.mass = dynamics.mass_matrix(home)
+        self._arm = arm
+        self._period = period
+        self._band = np.minimum(BAND * limits.torque + friction.coulomb, limits.torque)
+        narrow = replace(
+            limits,
+            following_error=np.minimum(limits.following_error, FARTHEST),
+            velocity=np.minimum(limits.velocity, FASTEST),
+        )
+        self._guard = Guard(model.chain.names, narrow, period, home, revolute=model.chain.revolute)
+        self._control = ComputedTorque(dynamics, limits, period, model.config.control.velocity_cutoff, home)
+        self._torque = self.gravity.copy()
+        self._rows: list[tuple[Sample, Setpoint]] = []
+        self._friction = still
+        self._stiffness = limits.kp * np.diag(self.mass)
+
+    def energise(self) -> None:
+        """Enable; the first cycle of `follow` sends the torque that holds the arm.
+
+        Raises:
+            DriverError: the drives refuse.
+        """
+        self._arm.enable()
+        self._torque = self._limited(self.gravity)
+
+    def follow(self, reference: Reference, seconds: float, learning: float = 0.0) -> Trace:
+        """Follow a reference for some time.
+
+        Args:
+            reference: from here on.
+            seconds: how long.
+            learning: how fast the torque that dry friction takes is learned from the lag of moving joints, as a share
+                of `kp M` times that lag per second [1/s]. Without, small motions get lost in friction: what moves a
+                WAM's first joint takes 13 mrad of error.
+
+        Returns:
+            What happened.
+
+        Raises:
+            ArmFault: the guard or a drive found something that is more than a warning; `trace` tells the story.
+            DriverError: the arm does not answer.
+        """
+        self._rows = []
+        begin_ns: int | None = None
+        while True:
+            sample = self._arm.exchange(self._torque)
+            if begin_ns is None:
+                begin_ns = sample.stamp_ns
+            elapsed = (sample.stamp_ns - begin_ns) * 1e-9
+            setpoint = reference.at(elapsed)
+            self._rows.append((sample, setpoint))
+            usable, fault = self._guard.feedback(sample, setpoint, self._control.velocity, self._control.correction)
+            if fault is not None and fault.reaction is not Reaction.WARN:
+                raise ArmFault(fault.code, fault.message, [row[0] for row in self._rows[-100:]])
+            wanted = self._control.torque(sample.position, usable, setpoint)
+            self._torque = self._limited(wanted + self._against_friction(setpoint, learning))
+            if elapsed >= seconds:
+                return self.trace()
+
+    def trace(self) -> Trace:
+        """The cycles of the last `follow`, also of one that a fault ended."""
+        return Trace(
+            np.array([sample.position for sample, _ in self._rows]),
+            np.array([sample.torque for sample, _ in self._rows]),
+            np.array([setpoint.position for _, setpoint in self._rows]),
+            np.array([setpoint.velocity for _, setpoint in self._rows]),
+            self._period,
+        )
+
+    def release(self) -> None:
+        """Hand the arm back to its support: torque fades, then the drives are switched off."""
+        cycles = max(1, round(RELEASE / self._period))
+        held = self._torque
+        for left in range(cycles - 1, -1, -1):
+            sample = self._arm.exchange(self._torque)
+            if not bool((np.abs(sample.position - self.home) <= SUNK).all()):
+                break
+            self._torque = self._limited(held * (left / cycles), band=False)
+        self._arm.stop(StopKind.TORQUE_OFF)
+
+    def _against_friction(self, setpoint: Setpoint, learning: float) -> Vector:
+        """Torque that moving joints need besides the model's, learned from how they lag [N m or N], shape (joints,)."""
+        rate = setpoint.velocity
+        direction = np.where(np.abs(rate) > _CREEP, np.sign(rate), 0.0)
+        lag = (setpoint.position - self._control.position) * direction
+        self._friction = np.clip(self._friction + learning * self._period * self._stiffness * lag, 0.0, self._band)
+        return np.asarray(self._friction * np.clip(rate / _CREEP, -1.0, 1.0))
+
+    def _limited(self, wanted: Vector, *, band: bool = True) -> Vector:
+        if band:
+            wanted = np.clip(wanted, self.gravity - self._band, self.gravity + self._band)
+        torque, fault = self._guard.torque(wanted)
+        if fault is not None and fault.reaction is not Reaction.WARN:
+            raise ArmFault(fault.code, fault.message, [row[0] for row in self._rows[-100:]])
+        return torque

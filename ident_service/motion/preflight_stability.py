@@ -1,0 +1,276 @@
+"""Whether the gains are stable at this rate and delay, when the true inertia is not the model's.
+
+Around a posture computed torque (eq. 76) leaves a double integrator, `ddq = R alpha` with `R = M_true^-1 M_model`. In
+discrete time, with period h, low-pass gain g and torque constant over a period,
+
+    v_k = v_{k-1} + g ((q_k - q_{k-1}) / h - v_{k-1})          alpha_k = -K_p q_k - K_d v_k
+    q_{k+1} = q_k + h dq_k + h^2/2 R a_k,   dq_{k+1} = dq_k + h R a_k,   a_k = alpha_{k-d}
+
+exactly, d being the delay in cycles (1 by the Arm contract). The loop is stable where the spectral radius of this
+linear recursion is below 1. A delay between whole cycles is exact too: the torque changes within the period.
+
+The true inertia is any sum of the links' inertias, each between `INERTIA` times the model's, plus drive inertia that
+the model lacks. A model without any drive inertia for a joint (a CAD model of the links) lacks some, so that such a
+joint's link is taken to be no lighter than modelled. Friction and gravity's stiffness are left out: the first only
+damps, the second is small beside K_p. Margins are stated for the model's own inertia.
+
+Boundary: pure computation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from ident_service.config.limits import MotionLimits, Vector
+from ident_service.errors import UsageError
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.rigid_body import InverseDynamics
+
+INERTIA = (0.5, 2.0)  # every link's true inertia, as a share of the model's
+# Drive inertia that the model lacks, as a share of the joint's inertia: where it has some, and where it has none.
+# Behind the WAM's wrist the drives are forty times what its CAD model knows.
+KNOWN_DRIVE, UNKNOWN_DRIVE = 1.0, 50.0
+_MOST_GAIN, _MOST_DELAY = 1e3, 50.0
+_RANDOM_CASES, _RANDOM_POSTURES, _SEED = 8, 4, 20140101
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class Loop:
+    """What a linearised loop consists of.
+
+    Attributes:
+        kp: position gains [1/s^2], shape (joints,).
+        kd: velocity gains [1/s], shape (joints,).
+        period: [s].
+        cutoff: of the velocity low-pass [Hz].
+        delay: from a sample to the torque computed from it [cycles], at least 1, whole or not.
+    """
+
+    kp: Vector
+    kd: Vector
+    period: float
+    cutoff: float
+    delay: float = 1.0
+
+    @property
+    def filter_gain(self) -> float:
+        """Gain of the low-pass, as `ComputedTorque` has it."""
+        return 1.0 - float(np.exp(-2.0 * np.pi * self.cutoff * self.period))
+
+
+@dataclass(frozen=True)
+class JointStability:
+    """One joint's loop by itself.
+
+    Attributes:
+        joint: its name.
+        lightest: the least true inertia looked at, as a share of the model's.
+        radius: the largest spectral radius over the range of inertias.
+        gain_margin: the loop gain may rise by this factor above the model's before it oscillates; 1000 stands for more,
+            and 1 for none.
+        delay_margin: so much may be added to the delay at the model's inertia [s]; 0 for none.
+    """
+
+    joint: str
+    lightest: float
+    radius: float
+    gain_margin: float
+    delay_margin: float
+
+
+@dataclass(frozen=True)
+class StabilityReport:
+    """All joints, by themselves and together.
+
+    Attributes:
+        period: of the loop [s].
+        delay_cycles: assumed.
+        joints: each by itself.
+        coupled_radius: the largest spectral radius of all joints together over postures and inertias; None where no
+            model is known.
+    """
+
+    period: float
+    delay_cycles: int
+    joints: tuple[JointStability, ...]
+    coupled_radius: float | None
+
+    @property
+    def stable(self) -> bool:
+        """Whether there is nothing to object to."""
+        return not self.objections()
+
+    def objections(self) -> list[str]:
+        """What is not as it must be, in words."""
+        found = [
+            f"{one.joint}: unstable for some inertia from {one.lightest:g} times the model's up "
+            f"(spectral radius {one.radius:.4f}, gain margin {one.gain_margin:.2f})"
+            for one in self.joints
+            if not one.radius < 1.0
+        ]
+        if self.coupled_radius is not None and not self.coupled_radius < 1.0:
+            found.append(f"all joints together are unstable (spectral radius {self.coupled_radius:.4f})")
+        return found
+
+
+def stability(
+    model: ArmModel, limits: MotionLimits, delay_cycles: int = 1, postures: Vector | None = None
+) -> StabilityReport:
+    """Judge the gains of an arm.
+
+    Args:
+        model: without a prior, only each joint by itself is judged.
+        limits: for the gains, and for postures where none are given.
+        delay_cycles: from a sample to the torque computed from it; 1 is the Arm contract's.
+        postures: to judge the coupled loop at [rad or m], shape (samples, joints), of a motion for example; by default
+            home, the middle of the position limits and a few random ones.
+
+    Raises:
+        UsageError: a delay below one cycle.
+        ModelError: a model that no real body has.
+    """
+    if delay_cycles < 1:
+        raise UsageError(f"{delay_cycles=}, but no torque can act before it is computed")
+    control = model.config.control
+    loop = Loop(limits.kp, limits.kd, 1.0 / control.rate, control.velocity_cutoff, float(delay_cycles))
+    lightest, unknown = _lightest_and_unknown(model)
+    joints = tuple(
+        _joint(name, _alone(loop, k), float(lightest[k]), INERTIA[1] + float(unknown[k]))
+        for k, name in enumerate(model.chain.names)
+    )
+    coupled: float | None = None
+    if model.prior is not None:
+        some = _postures(limits) if postures is None else postures
+        coupled = max(
+            float(spectral_radius(loop, R).max()) for R in _ratios(model, model.prior, some, lightest, unknown)
+        )
+    return StabilityReport(loop.period, delay_cycles, joints, coupled)
+
+
+def transition(loop: Loop, ratio: Vector) -> Vector:
+    """The matrix of the recursion.
+
+    Args:
+        loop: gains, rate and delay.
+        ratio: `R = M_true^-1 M_model`, shape (..., joints, joints).
+
+    Returns:
+        Shape (..., size, size), size = joints * (4 + queued torques).
+    """
+    n, h, g = len(loop.kp), loop.period, loop.filter_gain
+    whole = int(np.floor(loop.delay + _ROUNDING))
+    late = max(loop.delay - whole, 0.0)  # share of the period in which the older torque still acts
+    queued = whole + (1 if late > 0.0 else 0)
+    eye = np.eye(n)
+
+    def at(block: int) -> slice:
+        return slice(block * n, (block + 1) * n)
+
+    q, dq, before, filtered = at(0), at(1), at(2), at(3)
+    A = np.zeros((*ratio.shape[:-2], (4 + queued) * n, (4 + queued) * n))
+    A[..., q, q] = A[..., dq, dq] = A[..., before, q] = eye
+    A[..., q, dq] = h * eye
+    older, newer = (at(4), at(5)) if late > 0.0 else (at(4), at(4))
+    A[..., q, older] += h * h * (late - 0.5 * late**2) * ratio
+    A[..., dq, older] += h * late * ratio
+    A[..., q, newer] += h * h * 0.5 * (1.0 - late) ** 2 * ratio
+    A[..., dq, newer] += h * (1.0 - late) * ratio
+    A[..., filtered, q] = g / h * eye
+    A[..., filtered, before] = -g / h * eye
+    A[..., filtered, filtered] = (1.0 - g) * eye
+    for place in range(queued - 1):
+        A[..., at(4 + place), at(5 + place)] = eye
+    last = at(3 + queued)
+    A[..., last, q] = -np.diag(loop.kp + loop.kd * g / h)
+    A[..., last, before] = np.diag(loop.kd * g / h)
+    A[..., last, filtered] = -np.diag(loop.kd * (1.0 - g))
+    return A
+
+
+def spectral_radius(loop: Loop, ratio: Vector) -> Vector:
+    """The spectral radius of the recursion, shape (...,), for ratios as `transition` takes them."""
+    return np.asarray(np.abs(np.linalg.eigvals(transition(loop, ratio))).max(axis=-1))
+
+
+def _alone(loop: Loop, joint: int) -> Loop:
+    kept = slice(joint, joint + 1)
+    return Loop(loop.kp[kept], loop.kd[kept], loop.period, loop.cutoff, loop.delay)
+
+
+def _joint(name: str, loop: Loop, least: float, most: float) -> JointStability:
+    factors = np.geomspace(least, most, 16)
+    radius = float(spectral_radius(loop, (1.0 / factors)[:, None, None]).max())
+    gains = np.geomspace(1.0, _MOST_GAIN, 64)
+    gain = _first(gains, lambda some: spectral_radius(loop, some[:, None, None]))
+    extra = np.linspace(0.0, _MOST_DELAY, 101)
+    delay = _first(extra, lambda some: np.array([_delayed(loop, float(more)) for more in some]))
+    return JointStability(name, least, radius, gain, delay * loop.period)
+
+
+def _delayed(loop: Loop, more: float) -> float:
+    later = Loop(loop.kp, loop.kd, loop.period, loop.cutoff, loop.delay + more)
+    return float(spectral_radius(later, np.ones((1, 1))))
+
+
+def _first(values: Vector, radii: Callable[[Vector], Vector]) -> float:
+    """The smallest value at which a radius reaches 1, refined; the first value where it does at once."""
+    low = float(values[0])
+    for high in values.tolist():
+        if not float(radii(np.array([high]))[0]) < 1.0:
+            break
+        low = high
+    else:
+        return low
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if float(radii(np.array([middle]))[0]) < 1.0 else (low, middle)
+    return low
+
+
+def _lightest_and_unknown(model: ArmModel) -> tuple[Vector, Vector]:
+    """The least true inertia of a link, and drive inertia that the model may lack, in shares, each shape (joints,)."""
+    n = model.chain.joints
+    if model.prior is None:
+        return np.full(n, INERTIA[0]), np.full(n, UNKNOWN_DRIVE)
+    known = model.layout.term_values("drive_inertia", model.prior) > 0.0
+    return np.where(known, INERTIA[0], 1.0), np.where(known, KNOWN_DRIVE, UNKNOWN_DRIVE)
+
+
+def _postures(limits: MotionLimits) -> Vector:
+    random = np.random.default_rng(_SEED).uniform(limits.lower, limits.upper, (_RANDOM_POSTURES, len(limits.home)))
+    return np.vstack([limits.home, 0.5 * (limits.lower + limits.upper), random])
+
+
+def _link_factors(lightest: Vector) -> Iterator[Vector]:
+    """All links as modelled, as light or heavy as can be, one of them alone, random ones; each shape (joints,)."""
+    heaviest = np.full_like(lightest, INERTIA[1])
+    rng = np.random.default_rng(_SEED)
+    yield np.ones_like(lightest)
+    for extreme in (lightest, heaviest):
+        yield extreme
+        for link, factor in enumerate(extreme):
+            yield np.where(np.arange(len(lightest)) == link, factor, 1.0)
+    for _ in range(_RANDOM_CASES):
+        yield np.where(rng.random(len(lightest)) < 0.5, lightest, heaviest)
+
+
+def _ratios(model: ArmModel, prior: Vector, postures: Vector, lightest: Vector, unknown: Vector) -> Iterator[Vector]:
+    """`M_true^-1 M_model` at all postures, case by case, each of shape (samples, joints, joints)."""
+    nominal = _mass_matrices(model, prior, postures)
+    own = np.einsum("skk->sk", nominal)
+    for factors in _link_factors(lightest):
+        delta = np.array(prior, dtype=float)
+        for link, factor in enumerate(factors):
+            delta[model.layout.inertial(link)] *= factor
+        rigid = _mass_matrices(model, delta, postures)
+        for drives in (0.0 * own, unknown * own):
+            yield np.linalg.solve(rigid + drives[:, :, None] * np.eye(own.shape[1]), nominal)
+
+
+def _mass_matrices(model: ArmModel, delta: Vector, postures: Vector) -> Vector:
+    dynamics = InverseDynamics(model.chain, model.layout, delta)
+    return np.array([dynamics.mass_matrix(posture) for posture in postures])

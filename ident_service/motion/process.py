@@ -1,0 +1,151 @@
+"""The motion process: the arm, the loop and nothing else, started by whoever wants the arm to move.
+
+It gets one JSON object on its standard input and says in lines of JSON on its standard output which state it enters and
+how the run ended; samples and story go through the ring to the recorder's process. It takes the arm's control file and
+holds its lock, so that `ident stop` reaches it whatever became of its parent; a parent that is gone lets the lease
+lapse, which stops the arm.
+
+A pipe that nobody reads must not make the loop wait: lines that do not fit are dropped.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivers.arm import Counts, Flags, Vector
+from ident_service.config.schema import ArmConfig
+from ident_service.errors import ArmFault, IdentError, MotionRefused
+from ident_service.excitation.excitation import excitation_from_json
+from ident_service.model.arm_model import arm_model
+from ident_service.motion.control_file import ControlFile
+from ident_service.motion.factory import make_arm
+from ident_service.motion.histogram import Histogram
+from ident_service.motion.preflight_ticket import subject_of, ticket_from_json
+from ident_service.motion.realtime import ask
+from ident_service.motion.run import RunReport, run
+from ident_service.motion.states import State
+from ident_service.record.ring_sink import RingSink, SinkEnds
+
+_STATES = frozenset(state.value for state in State)
+
+
+class TimedSink:
+    """Hands everything on to the ring, counts how late and how long cycles were, and tells the parent the states.
+
+    Attributes:
+        lateness: of waking.
+        compute: of everything between waking and the next wait.
+    """
+
+    def __init__(self, sink: RingSink) -> None:
+        self._sink = sink
+        self.lateness, self.compute = Histogram(), Histogram()
+
+    @property
+    def error(self) -> str:
+        """Why nothing is recorded any more, or empty."""
+        return self._sink.error
+
+    def put(
+        self,
+        stamp_ns: int,
+        position: Vector,
+        velocity: Vector | None,
+        torque: Vector,
+        reference_position: Vector,
+        reference_velocity: Vector,
+        cycle: int,
+        lateness_ns: int,
+        compute_ns: int,
+        valid: Flags,
+        age: Counts,
+        lost: int,
+    ) -> bool:
+        """Record one cycle."""
+        self.lateness.add(lateness_ns)
+        self.compute.add(compute_ns)
+        motion = (position, velocity, torque, reference_position, reference_velocity)
+        return self._sink.put(stamp_ns, *motion, cycle, lateness_ns, compute_ns, valid, age, lost)
+
+    def event(self, stamp_ns: int, level: int, message: str) -> bool:
+        """Record one line of the story; a state is told to the parent too."""
+        if message in _STATES:
+            say({"state": message})
+        return self._sink.event(stamp_ns, level, message)
+
+
+def say(line: dict[str, Any]) -> None:
+    """One line of JSON on standard output, or nothing where it does not fit at once."""
+    with suppress(OSError):
+        os.write(sys.stdout.fileno(), json.dumps(line).encode() + b"\n")
+
+
+def main() -> int:
+    """Do what standard input asks for; 0 when the run ended in DONE or STOPPED."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # the terminal's Ctrl-C is for the parent, which asks for a stop
+    request = json.loads(sys.stdin.readline())
+    os.set_blocking(sys.stdout.fileno(), False)
+    try:
+        with ControlFile.take(Path(request["controls"]), request["lease"]) as controls:
+            signal.signal(signal.SIGTERM, lambda *_: controls.ask_stop())
+            say({"pid": os.getpid()})
+            report, sink, sentence = _moved(request, controls)
+    except ArmFault as fault:
+        return _ended({"kind": "ArmFault", "code": fault.code, "message": str(fault)}, 4)
+    except IdentError as error:
+        return _ended({"kind": type(error).__name__, "message": str(error)}, 1)
+    os.set_blocking(sys.stdout.fileno(), True)
+    say(
+        {
+            "report": {
+                "state": report.state.value,
+                "cycles": report.cycles,
+                "peak_following_error": np.asarray(report.peak_following_error).tolist(),
+                "peak_torque": np.asarray(report.peak_torque).tolist(),
+                "warnings": report.warnings,
+                "real_time": sentence,
+                "lateness": sink.lateness.document(),
+                "compute": sink.compute.document(),
+            }
+        }
+    )
+    return 0
+
+
+def _ended(error: dict[str, str], code: int) -> int:
+    os.set_blocking(sys.stdout.fileno(), True)
+    say({"error": error})
+    return code
+
+
+def _moved(request: dict[str, Any], controls: ControlFile) -> tuple[RunReport, TimedSink, str]:
+    config = ArmConfig.model_validate(request["config"])
+    motion = excitation_from_json(request["excitation"])
+    model = arm_model(config)
+    arm = make_arm(config)
+    sink = TimedSink(RingSink(SinkEnds(*request["ends"]), request["recording"], lock_step=arm.clock.lock_step))
+    # Last, so that everything it freezes and locks is loaded.
+    sentence = "virtual time" if arm.clock.lock_step else ask().sentence()
+    with arm:
+        ticket = ticket_from_json(request["ticket"])
+        now = datetime.now(UTC)
+        if why := ticket.valid_for(subject_of(model, motion, arm.describe()), now):
+            raise MotionRefused(
+                f"the preflight ticket does not allow this: {'; '.join(why)}; `ident check` makes a new one"
+            )
+        sink.event(arm.clock.now_ns(), 20, sentence)
+        return run(arm, model, motion, sink, controls, speed=request["speed"]), sink, sentence
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,79 @@
+"""What a process asks of the kernel so that a loop wakes in time: priority, memory, a core, no garbage collection.
+
+Each is asked for by itself and none is needed: without privileges the loop works, later now and then, and says so. The
+answers go into the recording. Boundary: this process; nothing here knows what the loop does.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+from dataclasses import dataclass
+
+_PRIORITY = 50  # of SCHED_FIFO, below the kernel's own threads; ros2_control's choice (FIELDBUS.md 5.1)
+_MCL_CURRENT, _MCL_FUTURE = 1, 2  # sys/mman.h
+
+
+@dataclass(frozen=True)
+class Granted:
+    """What was got, and why the rest was not.
+
+    Attributes:
+        scheduling: SCHED_FIFO.
+        memory: locked, present and future.
+        core: the core that is this process' own, or None.
+        collector: frozen and switched off.
+        refusals: one sentence each.
+    """
+
+    scheduling: bool
+    memory: bool
+    core: int | None
+    collector: bool
+    refusals: tuple[str, ...]
+
+    def sentence(self) -> str:
+        """For people and for the recording."""
+        got = [
+            name
+            for name, one in (
+                ("SCHED_FIFO", self.scheduling),
+                ("locked memory", self.memory),
+                (f"core {self.core}", self.core is not None),
+                ("no garbage collection", self.collector),
+            )
+            if one
+        ]
+        return f"real time: got {', '.join(got) or 'nothing'}" + "".join(f"; {reason}" for reason in self.refusals)
+
+
+def ask() -> Granted:
+    """Ask for everything; call it once, in the process of the loop, when all that it needs is loaded."""
+    refusals = []
+    scheduling = memory = False
+    core: int | None = None
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
+        scheduling = True
+    except OSError as error:
+        refusals.append(f"SCHED_FIFO refused ({error.strerror})")
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) == 0:
+        memory = True
+    else:
+        refusals.append(f"locked memory refused ({os.strerror(ctypes.get_errno())})")
+    cores = sorted(os.sched_getaffinity(0))
+    if len(cores) > 1:
+        try:
+            # The last one: interrupts and whoever started us prefer the first.
+            os.sched_setaffinity(0, {cores[-1]})
+            core = cores[-1]
+        except OSError as error:
+            refusals.append(f"a core of its own refused ({error.strerror})")
+    else:
+        refusals.append("one core only")
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    return Granted(scheduling, memory, core, True, tuple(refusals))

@@ -1,0 +1,326 @@
+"""The simulated arm's plant as a process of its own, so that killing its host's processes means something.
+
+Time. The plant is always computed to the end of the period whose torque is known. In real time it moves by the
+machine's clock: a frame may come up to one period after its stamp; after that the period has been silent, the last
+torque acts on and the drives' watchdog counts. In lock-step each exchange is one period, and wall time means nothing:
+only a cycle without a torque, or a connection that ends, is silence.
+
+When the client is gone, silence goes on until the idle drives have braked the arm to rest, or `PATIENCE` has passed: at
+the machine's pace while somebody may come back in real time, otherwise as fast as it can be computed. When client and
+parent are gone the process ends after that. It knows its client's end by the connection and its parent's by the end of
+its standard input, so that it outlives neither for long, however they died.
+
+Boundary: sockets, the machine's clock and the process; what moves is `machine.py`, frames are `wire.py`.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import select
+import socket
+import struct
+import sys
+import time
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+
+from drivers.arm import StopKind
+from ident_service.config.schema import ArmConfig
+from ident_service.errors import DriverError
+from sim_backend import wire
+from sim_backend.build import build_machine
+from sim_backend.faults import Fault, FaultKind
+from sim_backend.machine import Machine
+from sim_backend.plant_status import PlantState
+from sim_backend.plant_story import PlantStory
+
+PATIENCE = 60.0  # simulated seconds that an abandoned arm is given; sinking against its brakes takes its time
+# rad/s or m/s. An arm without brakes sinks towards its lowest place ever more slowly; slower than this is at rest.
+REST_SPEED = 1e-2
+REST_TIME = 0.1  # simulated seconds that nothing may be faster
+_AT_ONCE = 100  # periods to make up for between two looks at the sockets
+_MOST_WAITING = 8  # connections that have not said who they are
+_LONGEST_FUTURE_NS = 1_000_000_000
+
+
+class PlantProcess:
+    """Serves one client at a time on a listening socket."""
+
+    def __init__(
+        self,
+        machine: Machine,
+        listener: socket.socket,
+        lifeline: int,
+        sha256: bytes,
+        story: PlantStory,
+        lock_step: bool,
+    ) -> None:
+        """Take the pieces.
+
+        Args:
+            machine: what moves.
+            listener: bound and listening, non-blocking.
+            lifeline: a descriptor that ends with the parent.
+            sha256: of the configuration, which a client must share.
+            story: where to say what happens.
+            lock_step: whether exchanges move time, instead of the machine's clock.
+        """
+        self._machine = machine
+        self._joints = machine.plant.chain.joints
+        self._period = machine.plant.period
+        self._period_ns = round(self._period * 1e9)
+        self._listener = listener
+        self._lifeline: int | None = lifeline
+        self._sha256 = sha256
+        self._story = story
+        self._lock_step = lock_step
+        self._client: socket.socket | None = None
+        self._client_pid = 0
+        self._strangers: list[socket.socket] = []
+        self._next_ns = 0  # stamp of the state that the plant has been moved to
+        self._begun = False  # whether this client has had a cycle
+        self._error: DriverError | None = None
+        self._quiet = self._abandoned = 0  # periods at rest, and without a client
+
+    def run(self) -> None:
+        """Serve until parent and client are gone and the arm is at rest."""
+        try:
+            while self._client is not None or self._lifeline is not None:
+                self._turn()
+                if self._lock_step or self._lifeline is None:
+                    self._settle()
+            self._settle()
+        finally:
+            self._story.end()
+            for sock in (self._client, self._listener, *self._strangers):
+                if sock is not None:
+                    sock.close()
+
+    def _turn(self) -> None:
+        """Wait for something to happen, and do it: frames of the client first, then newcomers, then time."""
+        sources: list[Any] = [self._listener, *self._strangers]
+        sources += [source for source in (self._client, self._lifeline) if source is not None]
+        readable, _, _ = select.select(sources, [], [], self._patience())
+        if self._client is not None and self._client in readable:
+            self._serve()
+        if self._lifeline is not None and self._lifeline in readable and not os.read(self._lifeline, 4096):
+            self._lifeline = None
+        for stranger in [sock for sock in self._strangers if sock in readable]:
+            self._strangers.remove(stranger)
+            self._meet(stranger)
+        if self._listener in readable:
+            with suppress(OSError):  # whoever knocked may be gone already
+                self._strangers.append(self._listener.accept()[0])
+                self._strangers[-1].setblocking(False)
+            for stranger in self._strangers[:-_MOST_WAITING]:
+                stranger.close()
+            del self._strangers[:-_MOST_WAITING]
+        if self._moves_by_clock():
+            for _ in range(_AT_ONCE):
+                if time.monotonic_ns() < self._next_ns + self._period_ns:
+                    break
+                self._silent_period()
+
+    def _moves_by_clock(self) -> bool:
+        return not self._lock_step and (self._client is not None or self._story.state is PlantState.SETTLING)
+
+    def _patience(self) -> float | None:
+        """How long nothing needs to happen [s]; None for ever."""
+        if not self._moves_by_clock():
+            return None
+        return max(0, self._next_ns + self._period_ns - time.monotonic_ns()) * 1e-9
+
+    def _meet(self, stranger: socket.socket) -> None:
+        """Take a newcomer for the client, or tell it why not."""
+        try:
+            number, hello = wire.decode_request(stranger.recv(wire.MAX_BYTES), self._joints)
+            if not isinstance(hello, wire.Hello):
+                raise wire.MalformedFrame("malformed frame: a newcomer says hello first")
+            pid, uid, _ = struct.unpack("3i", stranger.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+            refused = None
+            if uid != os.getuid():
+                refused = wire.Refused(wire.OTHER_USER, 0)
+            elif self._client is not None:
+                refused = wire.Refused(wire.IN_USE, self._client_pid)
+            elif hello.sha256 != self._sha256:
+                refused = wire.Refused(wire.OTHER_ARM, 0)
+            stranger.send(wire.encode(refused or wire.Welcome(os.getpid()), number, self._joints))
+        except OSError:  # malformed frames are such
+            stranger.close()
+            return
+        if refused is not None:
+            stranger.close()
+            return
+        self._client, self._client_pid = stranger, pid
+        self._machine.restart()
+        self._begun, self._error = False, None
+        self._next_ns = time.monotonic_ns()
+        self._story.serve(pid)
+
+    def _serve(self) -> None:
+        """One request of the client; its end, and a frame that cannot be meant, are the end of the connection."""
+        client = self._client
+        if client is None:
+            return
+        try:
+            data = client.recv(wire.MAX_BYTES)
+            if not data:
+                raise ConnectionResetError
+            number, request = wire.decode_request(data, self._joints)
+            client.send(wire.encode(self._reply(request), number, self._joints))
+        except OSError:  # malformed frames are such
+            client.close()
+            self._client, self._client_pid = None, 0
+            self._quiet = self._abandoned = 0
+            self._story.settle()
+        else:
+            if isinstance(request, wire.Exchange):
+                self._advance()
+
+    def _reply(self, request: wire.Request) -> wire.Reply:
+        machine = self._machine
+        try:
+            if isinstance(request, wire.Exchange):
+                return self._cycle(request)
+            if isinstance(request, wire.Enable):
+                machine.enable()
+            elif isinstance(request, wire.Stop):
+                machine.stop(StopKind.QUICK_STOP if request.brakes else StopKind.TORQUE_OFF)
+            else:
+                raise wire.MalformedFrame("malformed frame: a client says hello once")
+        except wire.MalformedFrame:
+            raise
+        except DriverError as error:
+            return wire.failed(error)
+        return wire.Done()
+
+    def _cycle(self, request: wire.Exchange) -> wire.Reply:
+        machine = self._machine
+        if not self._begun or self._lock_step:
+            if not self._begun:
+                machine.tick = 0
+            self._begun, self._next_ns = True, request.stamp_ns
+        if request.stamp_ns > time.monotonic_ns() + _LONGEST_FUTURE_NS and not self._lock_step:
+            raise wire.MalformedFrame(f"malformed frame: a stamp of {request.stamp_ns} has not come yet")
+        while request.stamp_ns >= self._next_ns + self._period_ns:
+            self._silent_period()
+        if self._error is not None:
+            machine.hold()
+            raise self._error
+        if request.sends and not machine.enabled:
+            raise DriverError("a torque for an arm that is not enabled")
+        reading = machine.cycle(request.torque if request.sends else None)
+        truth = machine.truth(self._next_ns)
+        self._story.heard()
+        return wire.Answer(
+            self._next_ns,
+            reading.lost,
+            reading.status_age,
+            reading.position,
+            reading.torque,
+            reading.valid,
+            reading.age,
+            reading.status,
+            truth.position,
+            truth.velocity,
+            truth.acceleration,
+            truth.torque,
+        )
+
+    def _silent_period(self) -> None:
+        self._machine.hold()
+        self._advance(silent=True)
+        machine = self._machine
+        slow = bool((np.abs(machine.plant.velocity) <= REST_SPEED).all())
+        self._quiet = self._quiet + 1 if slow and machine.gave_up else 0
+        if self._story.state is not PlantState.SETTLING:
+            return
+        self._abandoned += 1
+        if self._error is not None:
+            self._story.become(PlantState.RAN_AWAY)
+        elif machine.supported or self._quiet * self._period >= REST_TIME:
+            self._story.become(PlantState.AT_REST, quiet=self._quiet)
+        elif self._abandoned * self._period >= PATIENCE:
+            self._story.become(PlantState.STILL_MOVING)
+
+    def _settle(self) -> None:
+        """Let an abandoned arm come to rest, as fast as it can be computed."""
+        while self._client is None and self._story.state is PlantState.SETTLING:
+            self._silent_period()
+
+    def _advance(self, *, silent: bool = False) -> None:
+        self._error = None
+        try:
+            self._machine.advance()
+        except DriverError as error:
+            self._error = error
+        self._next_ns += self._period_ns
+        self._story.moved(silent=silent)
+
+
+def start_document(
+    config: ArmConfig, faults: tuple[Fault, ...], address: str, status: int, *, lock_step: bool
+) -> dict[str, object]:
+    """What a plant process is told on its standard input; see `main`."""
+    listed = [[f.at_cycle, f.kind.value, f.joint, f.duration, f.size, f.offset] for f in faults]
+    return {
+        "address": address,
+        "status": status,
+        "lock_step": lock_step,
+        "sha256": config.sha256,
+        "faults": listed,
+        "config": json.loads(config.model_dump_json()),
+    }
+
+
+def main() -> int:
+    """Read one line of JSON from standard input, serve, and end when told to or abandoned.
+
+    Says `ready`, `in use` (of the address) or an error, in one line on standard output.
+    """
+    line = b""
+    while not line.endswith(b"\n"):
+        if not (more := os.read(0, 65536)):
+            return 1
+        line += more
+    start = json.loads(line)
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    try:
+        # An abstract address has no file that could be left behind, and binding it is the lock.
+        listener.bind("\0" + start["address"])
+    except OSError:
+        listener.close()
+        _say("in use")
+        return 0
+    try:
+        config = ArmConfig.model_validate_json(json.dumps(start["config"]))
+        faults = [
+            Fault(at, FaultKind(kind), joint, duration, size, (offset[0], offset[1], offset[2]))
+            for at, kind, joint, duration, size, offset in start["faults"]
+        ]
+        machine = build_machine(config, faults)
+        story = PlantStory(machine, start["status"])
+    except Exception as error:  # noqa: BLE001 - whoever started this process must learn why it cannot begin
+        listener.close()
+        _say(f"{type(error).__name__}: {error}")
+        return 1
+    listener.setblocking(False)
+    listener.listen(_MOST_WAITING)
+    _say("ready")
+    gc.collect()
+    gc.freeze()
+    PlantProcess(machine, listener, 0, bytes.fromhex(start["sha256"]), story, start["lock_step"]).run()
+    return 0
+
+
+def _say(text: str) -> None:
+    with suppress(OSError):
+        os.write(1, text.replace("\n", " ").encode() + b"\n")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

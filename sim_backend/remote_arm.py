@@ -1,0 +1,264 @@
+"""The simulated arm whose plant lives in a process of its own: the same contract, over a local socket.
+
+The connection is the lock: a plant serves one client at a time, and the kernel closes a client's connection with its
+process, however that dies. In virtual time each exchange moves the plant by one period (lock-step), and gives the same
+samples bit for bit as a plant in this process. In real time the plant moves by the machine's clock: a loop that is late
+finds periods missing between its stamps, as on a real bus.
+
+Boundary: the contract and its deadline; frames are `wire.py`, the process `plant_launch.py`.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import struct
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+
+import numpy as np
+
+from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector
+from drivers.clock import Clock
+from ident_service.config.schema import ArmConfig, SimulatedDriver
+from ident_service.errors import DriverError
+from sim_backend import wire
+from sim_backend.build import build_machine
+from sim_backend.door import checked_torque, description
+from sim_backend.faults import Fault
+from sim_backend.machine import Truth
+from sim_backend.plant_launch import START_TIMEOUT, PlantLaunch, address_of, connect
+from sim_backend.plant_status import PlantStatus, read_status
+from sim_backend.schedule import Schedule
+
+# How long an answer may take [s]: in real time the drives have given up long before, in lock-step nothing waits.
+_DEADLINE_REAL, _DEADLINE_LOCK_STEP = 0.1, 10.0
+_STOP_DEADLINE = 0.1
+_REFUSALS = {
+    wire.IN_USE: "the arm is in use by pid {pid}",
+    wire.OTHER_ARM: "another arm, or another version of its description, is on this bus",
+    wire.OTHER_USER: "the plant on this bus is another user's",
+}
+
+
+class _PlantGone(DriverError):
+    """The connection has ended."""
+
+
+class RemoteArm(Arm):
+    """A client of a plant process, which it starts when there is none.
+
+    Attributes:
+        observer: called with the truth of every cycle; for scoring only.
+        truth: of the last cycle, None before the first.
+    """
+
+    def __init__(
+        self,
+        config: ArmConfig,
+        clock: Clock,
+        *,
+        faults: Sequence[Fault] = (),
+        observer: Callable[[Truth], None] | None = None,
+    ) -> None:
+        """Take the description; nothing is started before `open`.
+
+        Args:
+            config: with a simulated driver.
+            clock: the loop's; in lock-step with the plant if it is a virtual one.
+            faults: to inject besides those of the configuration, by period since the first cycle.
+            observer: called with the truth of every cycle.
+
+        Raises:
+            DriverError, ModelError, ParameterError: as for a plant in this process.
+        """
+        driver = config.driver
+        if not isinstance(driver, SimulatedDriver):
+            raise DriverError(f"{config.name}: the driver is not a simulated one")
+        self.clock = clock
+        self.observer = observer
+        self.truth: Truth | None = None
+        # The same construction tells what the plant will be, and which mistakes keep it from being.
+        twin = build_machine(config, faults)
+        self.faults = twin.faults
+        self._description = description(twin)
+        self._joints = twin.plant.chain.joints
+        self._none = np.zeros(self._joints)
+        self._config, self._added = config, tuple(faults)
+        self._schedule = Schedule(clock, round(twin.plant.period * 1e9), skips=not clock.lock_step)
+        self._deadline = driver.deadline or (_DEADLINE_LOCK_STEP if clock.lock_step else _DEADLINE_REAL)
+        self._address = address_of(driver.bus)
+        self._status = driver.status
+        self._launch: PlantLaunch | None = None
+        self._socket: socket.socket | None = None
+        self._enabled = False
+        self._cycle = self._number = 0
+        self.plant_pid = 0
+
+    def open(self) -> None:
+        """Take the arm, starting its plant if none listens; cycles count from 0, the plant stays where it was.
+
+        Raises:
+            DriverError: open already, somebody else's, another arm's, or the plant cannot be started.
+        """
+        if self._socket is not None:
+            raise DriverError("the simulated arm is already open")
+        try:
+            found = self._enter()
+        except _PlantGone:  # it was just dying
+            found = False
+        if not found:
+            if self._launch is not None:
+                self._launch.end()
+            self._launch = PlantLaunch(self._config, self._added, self._address, self._status)
+            if not self._launch.start(lock_step=self.clock.lock_step):
+                self.end_plant()  # somebody else's was faster
+            if not self._enter():
+                raise DriverError("the plant process does not listen")
+        self._enabled, self._cycle, self.truth = False, 0, None
+        self._schedule.restart()
+
+    def describe(self) -> ArmDescription:
+        """Say what is simulated; raises DriverError when not open."""
+        self._require_open()
+        return self._description
+
+    def enable(self) -> None:
+        """Energise with zero torque; raises DriverError when not open, or when a fault keeps a drive from it."""
+        self._require_open()
+        self._enabled = False
+        self._done(self._ask(wire.Enable(), self._deadline))
+        self._enabled = True
+
+    def exchange(self, torque: Vector | None) -> Sample:
+        """One cycle, as the contract has it; a cycle without a torque is silence for the drives' watchdog.
+
+        Raises:
+            DriverError: as in the contract; a fault took the bus; or the plant did not answer within the deadline,
+                or is gone. But for the first, the cycle is used up.
+        """
+        self._require_open()
+        command = checked_torque(torque, self._enabled, self._joints)
+        stamp_ns, cycle = self._schedule.wait(self.faults), self._cycle
+        self._cycle += 1
+        request = wire.Exchange(stamp_ns, int(command is not None), self._none if command is None else command)
+        reply = self._ask(request, self._deadline)
+        if not isinstance(reply, wire.Answer):
+            self._done(reply)
+            raise DriverError("the plant answered a cycle without a sample")
+        self._schedule.stamp_ns = reply.stamp_ns  # in real time, the plant may have gone on without us
+        for array in (reply.true_position, reply.true_velocity, reply.true_acceleration, reply.true_torque):
+            array.setflags(write=False)
+        reply.torque.setflags(write=False)
+        self.truth = Truth(
+            reply.stamp_ns, reply.true_position, reply.true_velocity, reply.true_acceleration, reply.true_torque
+        )
+        if self.observer is not None:
+            self.observer(self.truth)
+        return Sample(
+            cycle,
+            self._schedule.shown_ns(self.faults),
+            reply.position,
+            None,
+            reply.torque,
+            reply.valid,
+            reply.age,
+            reply.lost,
+            reply.status,
+            reply.status_age,
+        )
+
+    def stop(self, kind: StopKind) -> None:
+        """No torque from the end of this period on; drives that do not hear it stop by their own watchdog."""
+        self._enabled = False
+        if self._socket is not None:
+            with suppress(DriverError):
+                deadline = self._deadline if self.clock.lock_step else min(self._deadline, _STOP_DEADLINE)
+                self._ask(wire.Stop(int(kind is StopKind.QUICK_STOP)), deadline)
+
+    def close(self) -> None:
+        """Torque off and released; the plant lives on for the next `open`, until this object or process ends."""
+        self.stop(StopKind.TORQUE_OFF)
+        self._hang_up()
+
+    def end_plant(self) -> None:
+        """Close, and end the plant process, if this arm started it, once the arm is at rest."""
+        self.close()
+        if self._launch is not None:
+            self._launch.end()
+            self._launch = None
+
+    def plant_status(self) -> PlantStatus:
+        """What the plant says of itself.
+
+        Raises:
+            DriverError: this arm has not started it, and no status file is configured; or it has not said anything.
+        """
+        if self._status is not None:
+            return read_status(self._status)
+        if self._launch is None:
+            raise DriverError("only who has started a plant, or names a file in driver.status, can read its status")
+        return read_status(self._launch.status_path)
+
+    def _enter(self) -> bool:
+        """Become the client of the plant at the address; False if there is none."""
+        sock = connect(self._address)
+        if sock is None:
+            return False
+        self._socket = sock
+        try:
+            self._welcome(sock)
+        except BaseException:
+            self._hang_up()
+            raise
+        return True
+
+    def _welcome(self, sock: socket.socket) -> None:
+        _, uid, _ = struct.unpack("3i", sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+        if uid != os.getuid():  # anybody may listen on an abstract address
+            raise DriverError(_REFUSALS[wire.OTHER_USER])
+        reply = self._ask(wire.Hello(bytes.fromhex(self._config.sha256)), START_TIMEOUT)
+        if isinstance(reply, wire.Refused):
+            raise DriverError(_REFUSALS.get(reply.reason, "the plant refuses").format(pid=reply.pid))
+        if not isinstance(reply, wire.Welcome):
+            raise DriverError("the plant does not welcome its client")
+        self.plant_pid = reply.pid
+
+    def _ask(self, request: wire.Request, deadline: float) -> wire.Reply:
+        """Send a request and wait for its reply; replies that were given up are passed over."""
+        sock = self._require_open()
+        self._number += 1
+        ends = time.monotonic() + deadline
+        try:
+            sock.settimeout(deadline)
+            sock.send(wire.encode(request, self._number, self._joints))
+            while True:
+                data = sock.recv(wire.MAX_BYTES)
+                if not data:
+                    raise _PlantGone("the plant process is gone")
+                number, reply = wire.decode_reply(data, self._joints)
+                if number == self._number & 0xFFFFFFFF:
+                    return reply
+                sock.settimeout(max(1e-6, ends - time.monotonic()))
+        except TimeoutError:
+            raise DriverError(f"the plant did not answer within {deadline:g} s") from None
+        except DriverError:
+            raise
+        except OSError as error:
+            raise _PlantGone(f"the plant process is gone: {error.strerror or error}") from None
+
+    def _done(self, reply: wire.Reply) -> None:
+        if isinstance(reply, wire.Failed):
+            raise DriverError(wire.text_of(reply))
+
+    def _require_open(self) -> socket.socket:
+        if self._socket is None:
+            raise DriverError("the simulated arm is not open")
+        return self._socket
+
+    def _hang_up(self) -> None:
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+        self._enabled = False

@@ -1,0 +1,209 @@
+"""What the fault campaign injects, what the table promises of it, and how one case is run and looked at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from motion_bench import Story, WatchedArm, bench_config
+
+from ident_service.config.limits import MotionLimits, motion_limits
+from ident_service.config.load import load_arm
+from ident_service.config.schema import ArmConfig
+from ident_service.errors import ArmFault
+from ident_service.excitation.excitation import Excitation
+from ident_service.excitation.plan import excitation
+from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.model.urdf import urdf_text
+from ident_service.motion.checks import MAX_AGE
+from ident_service.motion.controls import Switches
+from ident_service.motion.faults import FAULTS
+from ident_service.motion.latch import Latch
+from ident_service.motion.run import run
+from ident_service.motion.states import State
+from ident_service.record.recorder import Recorder
+from ident_service.record.writer import RecordingWriter
+from sim_backend.arm import SimulatedArm, Truth, from_config
+from sim_backend.faults import Fault, FaultKind
+
+Array = np.ndarray
+HOLD = 0.3  # s
+PERIOD = 1e-3
+PAUSED_FOR = 300  # cycles from the wish to pause to the wish to go on
+# What a drive that is stuck, weak, loaded or lies can end in: physics says in which.
+_UNTRUE = {
+    *("following_error", "following_lost", "over_velocity", "runaway", "position_envelope", "position_limit"),
+    *("far_outside", "torque_absurd", "frozen_encoder", "not_at_rest", "hold_lost", "repeated_warnings"),
+}
+_READ_WRONGLY = _UNTRUE | {"encoder_jumps", "feedback_gone"}
+
+
+@dataclass(frozen=True)
+class Promise:
+    """What is injected of a kind, and what must come of it.
+
+    Attributes:
+        codes: of the fault that ends the run.
+        size: of the fault, see `FAULT_RULES`.
+        duration: in cycles; None for what the kind does by itself.
+        within: cycles until the fault is found, in every state that is energised; None where the run may also end as if
+            nothing had been, because nobody could tell.
+    """
+
+    codes: set[str]
+    size: float = 0.0
+    duration: int | None = None
+    within: int | None = None
+
+
+PROMISES: dict[FaultKind, Promise] = {
+    FaultKind.LOST_FEEDBACK: Promise({"feedback_gone"}, duration=50, within=MAX_AGE),
+    FaultKind.DELAYED_FEEDBACK: Promise({"feedback_gone"}, size=0.005, within=1),
+    FaultKind.HIDDEN_DELAY: Promise(_READ_WRONGLY, size=0.02),
+    FaultKind.ENCODER_JUMP: Promise({"encoder_jumps"}, size=0.5, duration=2, within=2),
+    FaultKind.ENCODER_OFFSET: Promise({"feedback_gone"}, size=0.5, within=MAX_AGE),
+    FaultKind.FROZEN_ENCODER: Promise(_UNTRUE, duration=10**6),
+    FaultKind.NAN_POSITION: Promise({"feedback_not_finite"}, within=1),
+    FaultKind.POSITION_SIGN: Promise(_READ_WRONGLY),
+    FaultKind.STUCK_TORQUE: Promise(_UNTRUE, duration=10**6),
+    FaultKind.TORQUE_SIGN: Promise(_UNTRUE),
+    FaultKind.TORQUE_SATURATION: Promise(_UNTRUE, size=0.05),
+    FaultKind.DRIVE_FAULT: Promise({"drive_fault"}, within=1),
+    FaultKind.NODE_SILENT: Promise({"feedback_gone"}, within=MAX_AGE),
+    FaultKind.EMERGENCY_STOP: Promise({"emergency_stop"}, within=1),
+    FaultKind.LOAD_ATTACHED: Promise(_UNTRUE, size=2.0),
+    FaultKind.BUS_GONE: Promise({"driver"}, duration=10**6, within=1),
+    FaultKind.LATE_CYCLE: Promise({"late_cycles"}, size=0.4e-3, duration=50, within=FAULTS["late_cycle"].often + 1),
+    FaultKind.CLOCK_JUMP: Promise({"clock_jump"}, size=-0.05, within=1),
+}
+
+
+@dataclass(frozen=True)
+class Subject:
+    """An arm to break.
+
+    Attributes:
+        pause: cycle of a script that pauses.
+        stop: cycle of a script that stops.
+    """
+
+    config: ArmConfig
+    model: ArmModel
+    motion: Excitation
+    limits: MotionLimits
+    pause: int
+    stop: int
+
+
+@cache
+def subject(name: str) -> Subject:
+    """`bench` or `wam`."""
+    if name == "bench":
+        config, pause = bench_config(), 900
+    else:
+        motions = {"identification": {"kind": "seeded", "seed": 7, "base_frequency": 0.4, "harmonics": 3, "periods": 1}}
+        document = load_arm("wam7_sim").model_dump(mode="json", by_alias=True)
+        config, pause = ArmConfig.model_validate(document | {"motions": motions}), 2600
+    model = arm_model(config)
+    motion = excitation(model, "identification")
+    return Subject(config, model, motion, motion_limits(config), pause, pause)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One fault in one state."""
+
+    arm: str
+    kind: FaultKind
+    state: State
+    share: float  # of the state's time at which it strikes
+    joint: int | None
+
+    def __str__(self) -> str:
+        return f"{self.arm}-{self.kind.value}-{self.state.value}-{self.share:.2f}-{self.joint}"
+
+
+class Script(Switches):
+    """Somebody who pauses and goes on, or stops, at given cycles of the loop."""
+
+    def __init__(self, which: Subject, state: State) -> None:
+        super().__init__()
+        pausing = state in (State.PAUSING, State.PAUSED, State.RESUMING)
+        stopping = state in (State.STOPPING, State.STOPPED)
+        self._pause = which.pause if pausing else 10**9
+        self._stop = which.stop if stopping else 10**9
+
+    def lease_ok(self, now_ns: int) -> bool:
+        cycle = now_ns // 1_000_000
+        self.pause = self._pause <= cycle < self._pause + PAUSED_FOR + 200
+        self.stop = cycle >= self._stop
+        return True
+
+
+@dataclass
+class Outcome:
+    """What came of a run."""
+
+    story: Story
+    arm: WatchedArm
+    truth: list[Truth]
+    latch: Latch
+    fault: ArmFault | None
+
+
+class _Both:
+    """A sink that keeps a story beside a recording."""
+
+    def __init__(self, story: Story, recorder: Recorder) -> None:
+        self._story, self._recorder = story, recorder
+
+    def put(self, *arguments: Any) -> bool:
+        self._story.put(*arguments)
+        return self._recorder.put(*arguments)
+
+    def event(self, *arguments: Any) -> bool:
+        self._story.event(*arguments)
+        return self._recorder.event(*arguments)
+
+
+def play(which: Subject, state: State, faults: tuple[Fault, ...], path: Path | None) -> Outcome:
+    """One run on a new arm, with what the script of a state does, recorded if a path is given."""
+    truth: list[Truth] = []
+    inner = from_config(which.config, faults=faults, observer=truth.append)
+    assert isinstance(inner, SimulatedArm)
+    arm, story, latch, fault = WatchedArm(inner), Story(), Latch(), None
+    options: dict[str, Any] = {"latch": latch, "hold_seconds": HOLD}
+    script = Script(which, state)
+    try:
+        if path is None:
+            with arm:
+                run(arm, which.model, which.motion, story, script, **options)
+        else:
+            text = urdf_text(which.model, which.model.prior)
+            writer = RecordingWriter(path, which.model.chain.names, text, 0, {}, {})
+            with arm, Recorder(writer, lock_step=True) as recorder:
+                run(arm, which.model, which.motion, _Both(story, recorder), script, **options)
+    except ArmFault as error:
+        fault = error
+    return Outcome(story, arm, truth, latch, fault)
+
+
+@cache
+def windows(name: str, state: State) -> dict[str, tuple[int, int]]:
+    """First and last cycle of every state of a healthy run of a script."""
+    healthy = play(subject(name), state, (), None)
+    assert healthy.fault is None
+    begins = [(message, stamp // 1_000_000) for stamp, level, message in healthy.story.events if level == 20]
+    ends = [begin for _, begin in begins[1:]] + [healthy.story.samples[-1]["cycle"]]
+    return {message: (begin + 1, end) for (message, begin), end in zip(begins, ends, strict=True)}
+
+
+def injected(case: Case) -> Fault:
+    """The fault of a case, at its time."""
+    first, last = windows(case.arm, case.state)[case.state.value]
+    promise = PROMISES[case.kind]
+    cycle = first + round(case.share * (last - 1 - first))
+    return Fault(cycle, case.kind, case.joint, promise.duration, promise.size)

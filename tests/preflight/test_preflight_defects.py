@@ -1,0 +1,318 @@
+"""An arm with one defect fails the check that is about it, with the remedy, and ends without torque."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from flight_bench import FOREVER, TRUTH, Flight, FlightArm, check_of, joint_changes, only_failure, verdicts
+
+from drivers.arm import Sample
+from drivers.clock import VirtualClock
+from ident_service.errors import DriverError
+from ident_service.motion.preflight_check import CODES, Verdict
+from sim_backend.arm import from_config
+from sim_backend.faults import Fault, FaultKind
+
+Array = np.ndarray
+TOUCHING = ("gravity", "direction", "watchdog")
+
+
+def untouched(flight: Flight) -> None:
+    assert flight.arm.torques == []
+    assert "enable" not in flight.arm.calls
+
+
+def test_a_description_that_lacks_limits_opens_nothing() -> None:
+    flight = Flight()
+    config = flight.model.config
+    joints = {name: joint.model_copy(update={"jerk": None}) for name, joint in config.joints.items()}
+    flight.model = replace(flight.model, config=config.model_copy(update={"joints": joints}))
+    ticket = flight.ticket()
+    assert "joints.shoulder.jerk" in only_failure(ticket, "configuration").reason
+    assert all(verdicts(ticket)[code] is Verdict.SKIPPED for code in CODES[1:])
+    assert check_of(ticket, "watchdog").reason == "because configuration failed"
+    assert flight.arm.calls == []
+
+
+def test_a_model_without_prior_opens_nothing() -> None:
+    flight = Flight()
+    flight.model = replace(flight.model, prior=None)
+    assert "prior" in only_failure(flight.ticket(), "configuration").reason
+    assert flight.arm.calls == []
+
+
+def test_a_motion_of_another_description_is_refused_but_the_arm_is_still_checked() -> None:
+    flight = Flight()
+    flight.motion = replace(flight.motion, arm_sha256="0" * 64)
+    ticket = flight.ticket()
+    assert "Design the motion again" in only_failure(ticket, "motion_fits").remedy
+    assert verdicts(ticket)["motion_proven"] is Verdict.SKIPPED
+    assert verdicts(ticket)["direction"] is Verdict.PASSED
+
+
+def test_a_motion_beyond_a_limit_is_refused() -> None:
+    flight = Flight()
+    slow = Flight(changes={"joints": joint_changes("elbow", velocity=0.3)})
+    flight.motion = replace(flight.motion, arm_sha256=slow.model.config.motion_sha256)
+    slow.motion = flight.motion
+    check = only_failure(slow.ticket(), "motion_proven")
+    assert "elbow: velocity" in check.reason
+    assert any(one.joint == "elbow" and not one.kept for one in check.measures)
+
+
+def test_gains_that_are_unstable_at_this_rate_keep_the_arm_untouched() -> None:
+    flight = Flight(changes={"joints": joint_changes("elbow", kp=40000.0, kd=400.0)})
+    check = only_failure(flight.ticket(), "stability")
+    assert "elbow" in check.reason
+    assert "velocity_cutoff" in check.remedy
+    untouched(flight)
+
+
+def test_an_arm_that_cannot_be_opened_is_a_failed_check_and_no_exception() -> None:
+    flight = Flight()
+
+    def refuse() -> None:
+        raise DriverError("the arm is in use by pid 7")
+
+    flight.arm.open = refuse  # type: ignore[method-assign]
+    ticket = flight.ticket()
+    assert "pid 7" in only_failure(ticket, "identities").reason
+    assert ticket.subject.identities == ()
+
+
+def test_another_arm_on_the_bus_is_not_touched() -> None:
+    flight = Flight()
+    flight.arm.description = lambda described: replace(described, joint_names=("elbow", "shoulder"))
+    assert "elbow, shoulder" in only_failure(flight.ticket(), "identities").reason
+    untouched(flight)
+
+
+def test_an_exchanged_drive_is_noticed() -> None:
+    flight = Flight()
+    expected = ("simulated axis shoulder, seed 0", "serial 42")
+    check = only_failure(flight.ticket(identities=expected), "identities")
+    assert check.reason.startswith("elbow: 'simulated axis elbow, seed 0' instead of 'serial 42'")
+    assert "exchanged on purpose" in check.remedy
+    untouched(flight)
+
+
+def test_a_driver_that_clips_below_the_limits_is_noticed() -> None:
+    flight = Flight()
+    flight.arm.description = lambda described: replace(described, torque_limit=np.array([40.0, 5.0]))
+    assert "elbow: torque limit of the driver 5 N m" in only_failure(flight.ticket(), "identities").reason
+    untouched(flight)
+
+
+def test_a_silent_axis_is_named() -> None:
+    flight = Flight(faults=(Fault(50, FaultKind.LOST_FEEDBACK, 1, FOREVER),))
+    check = only_failure(flight.ticket(), "identities")
+    assert check.reason.startswith("elbow: answers missing")
+    assert "power, cables" in check.remedy
+    untouched(flight)
+
+
+def test_a_pressed_emergency_stop_is_named() -> None:
+    flight = Flight(faults=(Fault(0, FaultKind.EMERGENCY_STOP, None, FOREVER),))
+    check = only_failure(flight.ticket(), "identities")
+    assert "emergency stop" in check.reason
+    assert "Release the emergency stop" in check.remedy
+    untouched(flight)
+
+
+def drifting(arm: FlightArm) -> None:
+    arm.shown = lambda sample: replace(sample, position=sample.position + np.array([0.0, 1e-3 * sample.cycle]))
+
+
+def outside(arm: FlightArm) -> None:
+    arm.shown = lambda sample: replace(sample, position=sample.position + np.array([1.9, 0.0]))
+
+
+@pytest.mark.parametrize(("defect", "joint", "what"), [(drifting, "elbow", "drift"), (outside, "shoulder", "position")])
+def test_an_arm_that_moves_or_stands_outside_is_not_touched(
+    defect: Callable[[FlightArm], None], joint: str, what: str
+) -> None:
+    flight = Flight()
+    defect(flight.arm)
+    check = only_failure(flight.ticket(), "at_rest")
+    assert check.reason.startswith(f"{joint}: {what}")
+    assert "support" in check.remedy
+    untouched(flight)
+
+
+def test_an_arm_that_was_moved_while_a_person_was_asked_is_not_touched() -> None:
+    flight = Flight()
+    moved: list[bool] = []
+
+    def confirm(question: str) -> str:
+        moved.append(True)
+        return "bench"
+
+    flight.confirm = confirm  # type: ignore[method-assign]
+    flight.arm.shown = lambda sample: (
+        replace(sample, position=sample.position + 2e-3 * sample.cycle) if moved else sample
+    )
+    only_failure(flight.ticket(), "at_rest")
+    untouched(flight)
+
+
+def test_a_noisy_encoder_is_not_closed_a_loop_on() -> None:
+    flight = Flight()
+    rng = np.random.default_rng(1)
+    flight.arm.shown = lambda sample: replace(
+        sample, position=sample.position + np.array([0.0, 2e-3]) * rng.standard_normal(2)
+    )
+    check = only_failure(flight.ticket(), "noise")
+    # The torque that the gains would make of it reaches the shoulder as well.
+    assert {one.joint for one in check.measures if not one.kept and not one.what.startswith("torque")} == {"elbow"}
+    assert "shielding" in check.remedy
+    untouched(flight)
+
+
+class _LateClock(VirtualClock):
+    """Virtual time that passes for real: it does not wait for anybody, and is late now and then."""
+
+    lock_step = False
+
+    def __init__(self, every: int, late_ns: int) -> None:
+        super().__init__()
+        self._every, self._late_ns, self._count = every, late_ns, 0
+
+    def sleep_until_ns(self, deadline_ns: int) -> None:
+        self._count += 1
+        super().sleep_until_ns(deadline_ns + (self._late_ns if self._count % self._every == 0 else 0))
+
+
+def on_clock(clock: VirtualClock) -> Flight:
+    flight = Flight()
+    flight.arm = FlightArm(from_config(flight.model.config, clock))
+    return flight
+
+
+def test_a_machine_that_keeps_the_rate_passes_with_numbers() -> None:
+    check = check_of(on_clock(_LateClock(50, 600_000)).ticket(), "rate")
+    assert check.verdict is Verdict.PASSED
+    values = {one.what: one.value for one in check.measures}
+    assert values["median period"] == pytest.approx(2.0)
+    assert values["worst lateness"] == pytest.approx(0.6, abs=0.01)
+    assert values["late cycles"] == pytest.approx(0.02, abs=0.01)
+
+
+@pytest.mark.parametrize(("every", "late_ns", "what"), [(8, 800_000, "late cycles"), (70, 60_000_000, "worst")])
+def test_a_machine_that_is_late_too_often_or_too_much_is_refused(every: int, late_ns: int, what: str) -> None:
+    flight = on_clock(_LateClock(every, late_ns))
+    check = only_failure(flight.ticket(), "rate")
+    assert what in check.reason
+    assert "real-time priority" in check.remedy
+    untouched(flight)
+
+
+def test_a_posture_that_cannot_be_held_is_not_tried() -> None:
+    flight = Flight()
+    heavy = flight.model.prior.copy()
+    heavy[list(flight.model.layout.names).index("m1")] = 9.0
+    flight.model = replace(flight.model, prior=heavy)
+    ticket = flight.ticket()
+    check = check_of(ticket, "gravity")
+    assert check.verdict is Verdict.FAILED
+    assert "posture that takes less torque" in check.remedy
+    untouched(flight)
+
+
+@pytest.mark.parametrize("load", [0.8, 3.0])
+def test_a_load_that_the_model_does_not_know_shows_in_the_torque_that_holds(load: float) -> None:
+    truth = TRUTH | {"m2": 1.0 + load, "lx2": -0.25, "Lyy2": 0.084 + 0.01, "Lzz2": 0.084 + 0.01}
+    flight = Flight(changes={"driver": {"kind": "simulated", "truth": truth, "encoder_resolution": 2e-5}})
+    ticket = flight.ticket()
+    check = only_failure(ticket, "gravity")
+    assert "load" in check.remedy
+    assert verdicts(ticket)["direction"] is Verdict.SKIPPED
+    assert verdicts(ticket)["watchdog"] is Verdict.SKIPPED
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+@pytest.mark.parametrize("kind", [FaultKind.POSITION_SIGN, FaultKind.TORQUE_SIGN])
+def test_a_wrong_sign_is_named_before_the_arm_has_gone_far(kind: FaultKind, joint: int) -> None:
+    flight = Flight(faults=(Fault(0, kind, joint, FOREVER),))
+    seen: list[Array] = []
+    flight.arm.shown = lambda sample: seen.append(sample.position) or sample
+    check = only_failure(flight.ticket(), "direction")
+    assert check.reason.startswith(("shoulder", "elbow")[joint] + ": seems to move against its torque")
+    assert "sign" in check.remedy
+    assert (np.abs(np.array(seen) - seen[0]) < 0.13).all()
+
+
+def geared(ratio: float, joint: int) -> Callable[[FlightArm], None]:
+    """A gear ratio configured wrongly by a factor: positions and torques of the joint are scaled."""
+
+    def apply(arm: FlightArm) -> None:
+        scale = np.ones(2)
+        scale[joint] = ratio
+        start = np.array([0.1, -0.1])
+        arm.shown = lambda sample: replace(sample, position=start + (sample.position - start) * scale)
+        arm.told = lambda torque: torque * scale
+
+    return apply
+
+
+@pytest.mark.parametrize("ratio", [0.45, 1.6])
+def test_a_wrong_gear_ratio_shows_in_the_answer_to_torque(ratio: float) -> None:
+    level = {"gravity": (0.0, 0.0, -9.81)}  # the axes upright: gravity cannot tell
+    flight = Flight(changes=level)
+    geared(ratio, 1)(flight.arm)
+    check = only_failure(flight.ticket(), "direction")
+    assert {one.joint for one in check.measures if not one.kept and one.what.startswith("answer")} == {"elbow"}
+    assert "gear ratio" in check.remedy
+
+
+def test_a_blocked_joint_does_not_follow() -> None:
+    truth = TRUTH | {"fc2": 30.0}
+    flight = Flight(changes={"driver": {"kind": "simulated", "truth": truth, "encoder_resolution": 2e-5}})
+    check = only_failure(flight.ticket(), "direction")
+    assert check.reason.startswith("elbow")
+    assert "brake" in check.remedy or "blocks" in check.remedy
+
+
+def test_an_encoder_that_freezes_while_the_joint_moves_is_noticed() -> None:
+    flight = Flight(faults=(Fault(1000, FaultKind.FROZEN_ENCODER, 0, FOREVER),))
+    assert only_failure(flight.ticket(), "direction").reason.find("shoulder") >= 0
+
+
+def test_a_drive_that_gives_up_in_the_middle_is_named() -> None:
+    flight = Flight(faults=(Fault(450, FaultKind.DRIVE_FAULT, 1, FOREVER),))
+    assert "elbow" in only_failure(flight.ticket(), "gravity").reason
+
+
+def test_a_bus_that_goes_is_a_failed_check() -> None:
+    flight = Flight(faults=(Fault(1000, FaultKind.BUS_GONE, None, FOREVER),))
+    assert "bus" in only_failure(flight.ticket(), "direction").reason
+
+
+def test_drives_without_a_watchdog_are_refused() -> None:
+    flight = Flight(
+        changes={"driver": {"kind": "simulated", "truth": TRUTH, "encoder_resolution": 2e-5, "watchdog": 1e6}}
+    )
+    # The driver promises 10 ms to preflight and has none.
+    config = flight.model.config
+    promised = config.model_copy(update={"driver": config.driver.model_copy(update={"watchdog": 0.01})})
+    flight.model = replace(flight.model, config=promised)
+    ticket = flight.ticket()
+    check = only_failure(ticket, "watchdog")
+    assert "1400h" in check.remedy
+    assert all(one.value is None for one in check.measures)
+
+
+def test_an_interruption_leaves_the_arm_without_torque() -> None:
+    flight = Flight()
+
+    def interrupt(sample: Sample) -> Sample:
+        if len(flight.arm.torques) == 350:
+            raise KeyboardInterrupt
+        return sample
+
+    flight.arm.shown = interrupt
+    with pytest.raises(KeyboardInterrupt):
+        flight.ticket()
+    assert [call for call in flight.arm.calls if call != "close"][-1] == "stop"

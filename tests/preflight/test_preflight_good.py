@@ -1,0 +1,103 @@
+"""A good arm passes every check, is moved a little, and is let go."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+import pytest
+from flight_bench import LIMIT, TRUTH, Flight, check_of, verdicts
+
+from drivers.clock import VirtualClock
+from ident_service.config.load import load_arm
+from ident_service.excitation.plan import excitation
+from ident_service.model.arm_model import arm_model
+from ident_service.motion.factory import make_arm
+from ident_service.motion.preflight import preflight
+from ident_service.motion.preflight_check import CODES, Verdict
+
+
+def test_a_good_arm_passes_all_that_virtual_time_can_tell() -> None:
+    flight = Flight()
+    told: list[str] = []
+    ticket = flight.ticket(tell=lambda check: told.append(check.code))
+    assert verdicts(ticket) == {code: Verdict.SKIPPED if code == "rate" else Verdict.PASSED for code in CODES}
+    assert "virtual" in check_of(ticket, "rate").reason
+    assert ticket.verdict is Verdict.PASSED
+    assert all(check.remedy == "" for check in ticket.checks)
+    assert told == list(CODES)
+
+
+def test_it_measures_what_is_true() -> None:
+    ticket = Flight().ticket()
+    answers = [one for one in check_of(ticket, "direction").measures if one.what.startswith("answer to torque, mea")]
+    # The truth is 5 % heavier at the shoulder.
+    assert [one.value for one in answers] == pytest.approx([0.93, 1.0], abs=0.06)
+    held = {one.joint: one.value for one in check_of(ticket, "gravity").measures if one.what == "torque that holds"}
+    # What holds is the model's torque, within friction: the truth's is 0.3 N m more at the shoulder.
+    assert abs((held["shoulder"] or 0.0) - 12.3) < 0.7
+
+
+def test_the_arm_moves_no_farther_than_told_and_within_its_band_of_torque() -> None:
+    flight = Flight()
+    seen: list[np.ndarray] = []
+    flight.arm.shown = lambda sample: seen.append(sample.position) or sample
+    flight.ticket()
+    powered = np.array(seen[: 121 + len(flight.arm.torques)])
+    assert (np.abs(powered - powered[0]) < 0.06).all()
+    torques = np.array(flight.arm.torques)
+    assert (np.abs(torques - torques[0]) < 0.3 * LIMIT + 1.0).all()
+
+
+def test_a_person_is_asked_by_the_arms_name_before_anything_is_energised() -> None:
+    flight = Flight()
+    flight.ticket()
+    (question,) = flight.questions
+    assert "bench" in question
+    assert "sinks" in question
+
+
+def test_without_the_name_the_watchdog_is_not_tried_and_the_arm_is_handed_back_to_its_support() -> None:
+    flight = Flight(typed="yes")
+    ticket = flight.ticket()
+    assert ticket.verdict is Verdict.NEEDS_PERSON
+    check = check_of(ticket, "watchdog")
+    assert check.verdict is Verdict.NEEDS_PERSON
+    assert "type its name" in check.remedy
+    assert verdicts(ticket)["direction"] is Verdict.PASSED
+
+
+def test_a_driver_that_does_not_tell_about_its_drives_skips_the_watchdog_unasked() -> None:
+    flight = Flight()
+    flight.arm.shown = lambda sample: replace(sample, status=())
+    check = check_of(flight.ticket(), "watchdog")
+    assert check.verdict is Verdict.SKIPPED
+    assert "by hand" in check.remedy
+    assert flight.questions == []
+
+
+def test_the_ticket_is_stamped_by_the_clock_it_is_given() -> None:
+    ticket = Flight(clock=VirtualClock(10**9, 1_700_000_000 * 10**9)).ticket(valid=timedelta(minutes=3))
+    assert ticket.created == datetime.fromtimestamp(1_700_000_001, UTC)
+    assert ticket.expires - ticket.created == timedelta(minutes=3)
+
+
+def test_the_watchdog_of_a_plant_in_its_own_process_is_seen_to_act() -> None:
+    driver = {"kind": "simulated", "truth": TRUTH, "encoder_resolution": 2e-5, "process": "separate"}
+    flight = Flight(changes={"driver": driver})
+    ticket = preflight(
+        make_arm(flight.model.config), flight.model, flight.motion, confirm=lambda question: "bench", look_seconds=0.2
+    )
+    assert ticket.verdict is Verdict.PASSED
+    took = [one.value or 0.0 for one in check_of(ticket, "watchdog").measures]
+    assert took == pytest.approx([0.008, 0.008], abs=0.003)
+
+
+def test_a_shipped_arm_with_geometry_and_noise_passes() -> None:
+    model = arm_model(load_arm("planar2"))
+    motion = excitation(model, "identification")
+    ticket = preflight(make_arm(model.config), model, motion, confirm=lambda question: "planar2", look_seconds=0.2)
+    assert ticket.verdict is Verdict.PASSED
+    assert any(one.what == "clearance" for one in check_of(ticket, "motion_proven").measures)
+    assert any("clearance" in one.what for one in check_of(ticket, "ways_clear").measures)

@@ -1,0 +1,85 @@
+"""The controls that a second terminal reaches, and who may have them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ident_service.errors import DriverError, UsageError
+from ident_service.motion.control_file import ControlFile
+
+
+class Time:
+    """A clock that a test moves."""
+
+    def __init__(self) -> None:
+        self.now = 5_000_000_000
+
+    def __call__(self) -> int:
+        return self.now
+
+
+def test_what_one_side_asks_the_other_reads(tmp_path: Path) -> None:
+    with ControlFile.take(tmp_path / "arm" / "control", None) as loop, ControlFile.reach(loop_path(tmp_path)) as person:
+        assert (loop.stop, loop.pause) == (False, False)
+        person.ask_pause(True)
+        assert loop.pause
+        person.ask_pause(False)
+        assert not loop.pause
+        person.ask_stop()
+        assert loop.stop
+        assert person.pid == loop.pid
+
+
+def loop_path(folder: Path) -> Path:
+    return folder / "arm" / "control"
+
+
+def test_a_lease_lapses_unless_it_is_renewed(tmp_path: Path) -> None:
+    time = Time()
+    with (
+        ControlFile.take(loop_path(tmp_path), 2.0, time) as loop,
+        ControlFile.reach(loop_path(tmp_path), time) as parent,
+    ):
+        time.now += 1_900_000_000
+        assert loop.lease_ok(0)
+        parent.renew()
+        time.now += 1_900_000_000
+        assert loop.lease_ok(0)
+        time.now += 200_000_000
+        assert not loop.lease_ok(0)
+
+
+def test_a_run_without_a_lease_has_none_to_lose(tmp_path: Path) -> None:
+    time = Time()
+    with ControlFile.take(loop_path(tmp_path), None, time) as loop:
+        time.now += 10**15
+        assert loop.lease_ok(0)
+
+
+def test_a_second_one_who_wants_to_move_the_arm_is_refused_by_name(tmp_path: Path) -> None:
+    with ControlFile.take(loop_path(tmp_path), None) as first:
+        with pytest.raises(DriverError, match=f"in use by process {first.pid}"):
+            ControlFile.take(loop_path(tmp_path), None)
+        assert not first.stop
+
+
+def test_nobody_is_reached_when_nobody_moves_the_arm(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="nobody moves the arm"):
+        ControlFile.reach(loop_path(tmp_path))
+    ControlFile.take(loop_path(tmp_path), None).close()
+    with pytest.raises(UsageError, match="left from a run that has ended"):
+        ControlFile.reach(loop_path(tmp_path))
+
+
+def test_a_killed_process_leaves_no_lock(tmp_path: Path) -> None:
+    code = (
+        "import sys, os, signal; from pathlib import Path; from ident_service.motion.control_file import ControlFile\n"
+        "ControlFile.take(Path(sys.argv[1]), None).ask_stop(); os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    subprocess.run([sys.executable, "-c", code, str(loop_path(tmp_path))], check=False)
+    with ControlFile.take(loop_path(tmp_path), None) as again:
+        assert not again.stop  # what was asked of the dead run is not asked of this one

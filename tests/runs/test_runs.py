@@ -1,0 +1,216 @@
+"""`ident run`, what a second terminal may ask of it, and what is left when it is killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ident_service.cli import main
+from ident_service.config.load import load_arm
+from ident_service.record.open import open_recording
+from sim_backend.plant_status import read_status
+
+Command = "subprocess.Popen[str]"
+
+
+def ident(*words: object) -> list[str]:
+    return [sys.executable, "-m", "ident_service", *map(str, words)]
+
+
+def children(pid: int) -> list[int]:
+    """All living descendants of a process."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            except (OSError, ValueError):
+                continue
+            if parent == pid:
+                found += [int(entry.name), *children(int(entry.name))]
+    return found
+
+
+def named(word: str, folder: Path) -> list[int]:
+    """Processes with a word in their command and the folder in their open files or command."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                if word.encode() in (entry / "cmdline").read_bytes():
+                    found.append(int(entry.name))
+            except OSError:
+                continue
+    return found
+
+
+def wait_for(what: Any, seconds: float = 30.0) -> Any:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if answer := what():
+            return answer
+        time.sleep(0.05)
+    raise AssertionError("it never happened")
+
+
+class Started:
+    """An `ident run` in the background."""
+
+    def __init__(self, arm: Path, folder: Path, state: Path) -> None:
+        self.folder = folder
+        self.process = subprocess.Popen(
+            ident("run", arm, "--out", folder, "--state", state),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def reaches(self, word: str) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            if line.strip() == word:
+                return
+        raise AssertionError(f"never {word}: {self.process.stderr.read() if self.process.stderr else ''}")
+
+    def end(self) -> tuple[int, str, str]:
+        out, err = self.process.communicate(timeout=60)
+        return self.process.returncode, out, err
+
+
+@pytest.fixture
+def started(real_arm: Path, tmp_path: Path) -> Iterator[Started]:
+    checked(real_arm, tmp_path / "state")
+    run = Started(real_arm, tmp_path / "run", tmp_path / "state")
+    yield run
+    if run.process.poll() is None:
+        run.process.kill()
+    run.process.communicate()
+
+
+def readable(folder: Path) -> int:
+    """Samples that the recording of a run gives, torn or whole."""
+    names = ("shoulder", "elbow")
+    path = folder / "run.mcap"
+    path = path if path.exists() else folder / "run.mcap.partial"
+    return sum(len(block.position) for block in open_recording(path, names).blocks())
+
+
+def checked(arm: Path, state: Path) -> list[str]:
+    """The words that a run of a checked arm needs."""
+    assert main(["check", str(arm), "--confirm", "planar2", "--state", str(state)]) == 0
+    return ["--state", str(state)]
+
+
+def test_a_run_in_virtual_time_is_the_run_that_was_asked_for(virtual_arm: Path, tmp_path: Path) -> None:
+    words = checked(virtual_arm, tmp_path / "state")
+    assert main(["run", str(virtual_arm), "--out", str(tmp_path / "run"), *words]) == 0
+    names = sorted(path.name for path in (tmp_path / "run").iterdir())
+    assert names == ["arm.json", "ended.json", "excitation.json", "manifest.json", "run.mcap", "ticket.json"]
+    ended = json.loads((tmp_path / "run" / "ended.json").read_text())
+    assert ended["state"] == "done"
+    assert readable(tmp_path / "run") == ended["lateness"]["count"]
+    assert 0 < ended["lateness"]["count"] <= ended["cycles"]
+
+
+def test_a_rehearsal_is_the_same_way_at_a_fifth_of_the_speed(virtual_arm: Path, tmp_path: Path) -> None:
+    words = ["--out", str(tmp_path / "run"), *checked(virtual_arm, tmp_path / "state")]
+    assert main(["rehearse", str(virtual_arm), *words]) == 0
+    limits = load_arm(virtual_arm).joints
+    recording = open_recording(tmp_path / "run" / "run.mcap", tuple(limits))
+    position = np.concatenate([block.position for block in recording.blocks()])
+    fastest = np.abs(np.diff(position, axis=0)).max(axis=0) * 1000.0
+    assert (fastest < 0.35 * np.array([joint.velocity for joint in limits.values()])).all()
+
+
+def test_a_folder_that_exists_is_not_written_over(virtual_arm: Path, tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    words = checked(virtual_arm, tmp_path / "state")
+    assert main(["run", str(virtual_arm), "--out", str(tmp_path / "run"), *words]) == 2
+
+
+def test_an_arm_that_was_not_checked_does_not_move(
+    virtual_arm: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--out", str(tmp_path / "run"), "--state", str(tmp_path / "state")]
+    assert main(["run", str(virtual_arm), *words]) == 3
+    assert "not checked yet" in capsys.readouterr().err
+    checked(virtual_arm, tmp_path / "state")
+    virtual_arm.write_text(virtual_arm.read_text() + "description: another\n")
+    assert main(["run", str(virtual_arm), *words]) == 3
+    assert "the arm's description has changed since" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_second_terminal_pauses_resumes_and_stops(started: Started, real_arm: Path, tmp_path: Path) -> None:
+    started.reaches("exciting")
+    for word, reached in (("pause", "paused"), ("resume", "exciting"), ("stop", "stopped")):
+        assert main([word, str(real_arm), "--state", str(tmp_path / "state")]) == 0
+        started.reaches(reached)
+    code, out, err = started.end()
+    assert code == 0, err
+    assert out.startswith("stopped after")
+    assert readable(started.folder) > 0
+
+
+@pytest.mark.slow
+def test_a_second_run_is_refused_while_the_first_one_moves(started: Started, real_arm: Path, tmp_path: Path) -> None:
+    started.reaches("exciting")
+    words = ["--out", str(tmp_path / "other"), "--state", str(tmp_path / "state")]
+    assert main(["run", str(real_arm), *words]) != 0
+    started.process.send_signal(signal.SIGINT)
+    assert started.end()[0] == 0
+
+
+@pytest.mark.slow
+def test_ctrl_c_stops_the_arm_under_control(started: Started) -> None:
+    started.reaches("exciting")
+    started.process.send_signal(signal.SIGINT)
+    code, out, err = started.end()
+    assert code == 0, err
+    assert "stopped after" in out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("victim", ["parent", "recorder_loop", "motion.process"])
+def test_whoever_is_killed_the_arm_comes_to_rest_and_nothing_is_left(
+    victim: str, started: Started, tmp_path: Path
+) -> None:
+    started.reaches("exciting")
+    family = wait_for(lambda: (found := children(started.process.pid)) and len(found) >= 2 and found)
+    plant = read_status(tmp_path / "plant.status")
+    assert not plant.ended
+    time.sleep(0.3)
+    doomed = (
+        started.process.pid
+        if victim == "parent"
+        else next(pid for pid in family if victim.encode() in Path(f"/proc/{pid}/cmdline").read_bytes())
+    )
+    os.kill(doomed, signal.SIGKILL)
+    if victim != "parent":
+        code, _, err = started.end()
+        assert code != 0
+        assert len(err.strip().splitlines()) >= 1
+    status = wait_for(lambda: (seen := read_status(tmp_path / "plant.status")).ended and seen, 90.0)
+    limits = load_arm(tmp_path / "real.yaml").joints
+    assert (np.abs(status.peak_velocity) < 1.3 * np.array([joint.velocity for joint in limits.values()])).all()
+    assert (np.abs(status.peak_torque) <= np.array([joint.torque for joint in limits.values()]) + 1e-9).all()
+    wait_for(lambda: not any(Path(f"/proc/{pid}").exists() and alive(pid) for pid in family), 60.0)
+    assert readable(started.folder) > 0
+
+
+def alive(pid: int) -> bool:
+    """Not gone, and not only waiting to be reaped."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
