@@ -76,14 +76,19 @@ def climbed(
         polish: True for a motion that is good already.
 
     Returns:
-        The best motion found; when `check` raised Interrupted, of the rounds so far.
+        The best motion found.
+
+    Raises:
+        Stopped: `check` raised Interrupted; with the best of what the rounds had come through until then.
     """
-    # A motion that is good already must not be lost to rounds that led nowhere, or were cut short.
+    # A motion that is good already must not be lost to rounds that led nowhere.
     before = [kept(problem, x, safe, start)] if polish else []
     state = problem.no_multipliers(1.0)
+    reached, latest = [x], [x]
 
     def objective(x: Array, sharpness: float) -> tuple[float, Array]:
         check()
+        latest[0] = x.copy()
         return problem.value_and_gradient(x, sharpness, state)
 
     try:
@@ -97,12 +102,14 @@ def climbed(
                 method="L-BFGS-B",
                 options={"maxiter": iterations, "maxcor": 20},
             ).x
+            reached.append(x)
             here = problem.state(x, sharpness)
             state = state.tightened(here.limits, 1.0)
             if sharpness >= _ROUNDS[2][0] and here.worst > _HOPELESS:
                 break  # caught on the wrong side of an obstacle; another start will do better
     except Interrupted:
-        raise Stopped(_best_of([*before, kept(problem, x, safe, start)])) from None
+        # Half a round may have left the limits far behind; where it came from may be worth more.
+        raise Stopped(_best_of([*before, *(kept(problem, one, safe, start) for one in (*reached, *latest))])) from None
     return _best_of([*before, kept(problem, x, safe, start)])
 
 
@@ -119,13 +126,18 @@ class Stopped(Interrupted):
 
 
 def kept(problem: Problem, x: Array, safe: Array, start: int) -> Candidate:
-    """The largest motion between standing still and x that keeps all limits at the samples.
+    """The most informative motion on the ways from x to standing still that keeps all limits at the samples.
 
-    Standing still means in the motion's own middle, or, where that breaks a limit, in the safe posture.
+    Standing still means in the motion's own middle, where that keeps the limits, or in the safe posture.
     """
     X = problem.coefficients(x)
     middle = problem.task.basis.still(X)
-    anchor = middle if keeps(problem, middle) else safe
+    anchors = [middle, safe] if keeps(problem, middle) else [safe]
+    return _best_of([_largest(problem, X, anchor, start) for anchor in anchors])
+
+
+def _largest(problem: Problem, X: Array, anchor: Array, start: int) -> Candidate:
+    """The largest motion between an anchor and X that keeps all limits."""
     share = 1.0
     if not keeps(problem, X):
         low, high = 0.0, 1.0
