@@ -13,7 +13,7 @@ test: lint types
 	$(BIN)/pytest -m "not campaign"
 
 unit: $(READY)
-	$(BIN)/pytest -m "not campaign and not slow"
+	$(BIN)/pytest -n 2 -m "not campaign and not slow"
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
-from ident_service.cli.words import Parser, Verbs, count, frequency, seconds, seed, share, weight
+from ident_service.cli.words import Parser, Verbs, count, frequency, seconds, seed, share, weight, workers
 from ident_service.errors import UsageError
 
 if TYPE_CHECKING:
     from ident_service.excitation.search import Progress
     from ident_service.service.design import Knowledge
 
+_UNFINISHED = "the search ended before its first start was finished; more time will find a better motion"
 _CRITERIA = ("d_optimal", "condition_number", "a_optimal")
 _FAMILY = ("motion", "base_frequency", "harmonics", "periods", "ramp", "postures")
 _MARGINS = ("criterion", "position_margin", "torque_margin")
@@ -34,7 +35,7 @@ def add(verbs: Verbs) -> None:
         action="append",
         dest="chosen",
         metavar="EXPRESSION",
-        help="for a_optimal: a base parameter as `ident base` prints it; may be given several times",
+        help="a base parameter as `ident base` prints it, to be taught best (a_optimal); may be repeated",
     )
     sub.add_argument("--motion", choices=["fourier", "postures"], help="default: the arm's")
     sub.add_argument("--base-frequency", type=frequency, metavar="HZ")
@@ -48,7 +49,7 @@ def add(verbs: Verbs) -> None:
     sub.add_argument("--seed", type=seed, default=0, help="of the random starts")
     sub.add_argument("--seconds", type=seconds, help="time for the search (default: 60, or none with --starts)")
     sub.add_argument("--starts", type=count, metavar="N", help="random starts; the result is then the same every time")
-    sub.add_argument("--workers", type=count, default=2, metavar="N", help="processes")
+    sub.add_argument("--workers", type=workers, default=2, metavar="N", help="processes")
     sub.add_argument("--resume", type=Path, metavar="FILE", help="search.json of an earlier design, to go on from")
     sub.add_argument("--out", type=Path, metavar="DIR", help="default: a new folder below the state folder")
 
@@ -76,6 +77,8 @@ def _knowledge(arguments: argparse.Namespace) -> Knowledge:
 
 
 def _design(arguments: argparse.Namespace) -> Answer:
+    import numpy as np
+
     from ident_service.config.load import load_arm
     from ident_service.excitation.search import Budget
     from ident_service.service.commission import new_run_folder
@@ -103,6 +106,10 @@ def _design(arguments: argparse.Namespace) -> Answer:
     with stopping:
         designed, seen = design_files(request, folder, _progress(arguments), stopping.requested)
     _progress_end(arguments)
+    unfinished = "" if designed.found.finished or request.resume else _UNFINISHED
+    if unfinished:
+        sys.stderr.write(f"ident: {unfinished}\n")
+    taught = bool(np.isfinite(seen.deviations).any())
     text = preview_text(seen) + f"\nfiles: {folder}\n" + "".join(f"  {name}\n" for name in FILES)
     document: dict[str, Any] = {
         "folder": str(folder),
@@ -110,7 +117,8 @@ def _design(arguments: argparse.Namespace) -> Answer:
         "criterion": designed.excitation.made["criterion"],
         "criterion_value": designed.excitation.made["criterion_value"],
     }
-    return (VERDICT_NO if seen.objections else DONE), text, document | preview_document(seen)
+    document["warnings"] = [unfinished] if unfinished else []
+    return (VERDICT_NO if seen.objections or not taught else DONE), text, document | preview_document(seen)
 
 
 def _progress(arguments: argparse.Namespace) -> Callable[[Progress], None]:
@@ -120,10 +128,8 @@ def _progress(arguments: argparse.Namespace) -> Callable[[Progress], None]:
 
     def show(progress: Progress) -> None:
         best = "none yet" if progress.best is None else f"{progress.best:.4f}"
-        words = (
-            f"{progress.phase}: {progress.finished} starts, best {best}, "
-            f"{progress.elapsed:.0f} s, about {progress.remaining:.0f} s left"
-        )
+        left = f", about {progress.remaining:.0f} s left" if progress.remaining == progress.remaining else ""
+        words = f"{progress.phase}: {progress.finished} starts, best {best}, {progress.elapsed:.0f} s{left}"
         if stream.isatty():
             stream.write(f"\r{words}\x1b[K")
             stream.flush()

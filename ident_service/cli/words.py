@@ -119,6 +119,13 @@ def count(text: str) -> int:
     return int(text)
 
 
+def workers(text: str) -> int:
+    """A number of processes that a machine may bear."""
+    if not text.isdigit() or not 1 <= int(text) <= 64:
+        raise argparse.ArgumentTypeError("a number of processes is from 1 to 64")
+    return int(text)
+
+
 def frequency(text: str) -> float:
     """A finite number of Hz above 0."""
     return _positive(text, "a frequency is a number of Hz above 0")

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from ident_service.config.quantities import Count, NonNegative, Positive, Section
+from ident_service.config.quantities import Count, NonNegative, Section
 
 Criterion = Literal["d_optimal", "condition_number", "a_optimal"]
 
@@ -37,13 +37,13 @@ class Design(Section):
     criterion: Criterion = "d_optimal"
     parameters: tuple[str, ...] = ()
     motion: Literal["fourier", "postures"] = "fourier"
-    base_frequency: Positive = 0.05
+    base_frequency: Annotated[float, Field(strict=True, ge=1e-4, le=100)] = 0.05
     harmonics: Annotated[Count, Field(le=50)] = 5
-    periods: Count = 3
-    ramp: NonNegative = 2.0
+    periods: Annotated[Count, Field(le=10_000)] = 3
+    ramp: Annotated[float, Field(strict=True, ge=0, le=600)] = 2.0
     postures: Annotated[int, Field(strict=True, ge=2, le=100)] = 6
-    way: Positive = 2.5
-    dwell: NonNegative = 0.5
+    way: Annotated[float, Field(strict=True, ge=0.1, le=600)] = 2.5
+    dwell: Annotated[float, Field(strict=True, ge=0, le=600)] = 0.5
     position_margin: NonNegative | tuple[NonNegative, ...] = 0.05
     torque_margin: Annotated[float, Field(ge=0, lt=1)] = 0.2
     friction_guess: tuple[NonNegative, NonNegative] = (0.02, 0.05)

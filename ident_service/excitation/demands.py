@@ -62,10 +62,18 @@ class Demands:
                     f"{name}: position {self.lowest[k]:.3f}..{self.highest[k]:.3f} "
                     f"leaves {limits.lower[k]:g}..{limits.upper[k]:g}"
                 )
-            for key in _KINDS:
+            for key in _KINDS[:-1]:
                 peak, limit = getattr(self, key), getattr(limits, key)
-                if peak is not None and not peak[k] <= limit[k]:
+                if not peak[k] <= limit[k]:
                     found.append(f"{name}: {key} {peak[k]:.3f} exceeds {limit[k]:g}")
+        return found + self.forces_beyond(names, limits, supply)
+
+    def forces_beyond(self, names: tuple[str, ...], limits: MotionLimits, supply: Supply | None = None) -> list[str]:
+        """Of the violations, those of torque and power."""
+        found = []
+        if self.torque is not None:
+            rows = zip(names, self.torque, limits.torque, strict=True)
+            found += [f"{name}: torque {peak:.3f} exceeds {limit:g}" for name, peak, limit in rows if not peak <= limit]
         if self.power is not None and supply is not None and not self.power <= supply.budget:
             found.append(f"supply: {self.power:.1f} W exceeds {supply.budget:g} W")
         return found

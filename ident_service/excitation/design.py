@@ -16,7 +16,8 @@ from ident_service.config.limits import MotionLimits, motion_limits
 from ident_service.errors import MotionRefused, UsageError
 from ident_service.excitation.basis import Basis, FourierBasis, PostureBasis
 from ident_service.excitation.criteria import condition_number, criterion
-from ident_service.excitation.excitation import Excitation
+from ident_service.excitation.demands import demands
+from ident_service.excitation.excitation import LONGEST, Excitation
 from ident_service.excitation.expectation import described_noise, information, seconds_of_information
 from ident_service.excitation.following import dry_friction, expected_friction
 from ident_service.excitation.path import FourierPath, PosturePath
@@ -86,11 +87,12 @@ def settled(
     full = motion_limits(model.config)
     limits = usable_limits(model.chain.names, full, design)
     _require_torque(model, limits)
-    if unknown := [name for name in design.parameters if name not in base.expressions]:
+    places = {expression.replace(" ", ""): place for place, expression in enumerate(base.expressions)}
+    if unknown := [name for name in design.parameters if name.replace(" ", "") not in places]:
         raise UsageError(
             f"{', '.join(unknown)}: not among the base parameters of {model.config.name}; `ident base` prints them"
         )
-    chosen = np.array([base.expressions.index(name) for name in design.parameters], dtype=np.intp)
+    chosen = np.array([places[name.replace(" ", "")] for name in design.parameters], dtype=np.intp)
     plain = design.criterion == "condition_number"
     own_noise = described_noise(model, full).deviation if noise is None else noise
     return Task(
@@ -174,11 +176,13 @@ def design_motion(
         UsageError: parameters that are none.
     """
     asked = family(design, model)
+    require_bearable(asked[0] if basis is None else basis)
     basis, base = asked[0] if basis is None else basis, asked[1] if base is None else base
     task = settled(model, design, basis, base, noise, added)
     collision = CollisionModel(model)
     _require_free_home(model, task.limits, collision)
     safe = safe_posture(model, task.limits, seed)
+    _require_holdable_home(model, task.limits)
     found = search(task, safe, seed, budget or Budget(), per_period(basis), tell, cancelled, earlier)
 
     def proven(coefficients: Array) -> Proof | None:
@@ -210,6 +214,19 @@ def design_motion(
     return Designed(excitation, proof, kappa, found)
 
 
+def require_bearable(basis: Basis) -> None:
+    """Refuse a family of motions that no file may hold.
+
+    Raises:
+        UsageError: longer than a day.
+    """
+    duration = basis.path(np.zeros((1, basis.size))).duration
+    if duration > LONGEST:
+        raise UsageError(
+            f"a motion of {duration:g} s; the longest is {LONGEST:g} s: fewer periods or a higher frequency"
+        )
+
+
 def per_period(basis: Basis) -> int:
     """How many samples a search looks at."""
     if isinstance(basis, FourierBasis):
@@ -223,6 +240,15 @@ def criterion_of(task: Task, path: FourierPath | PosturePath, base: BaseParamete
     if task.added is not None:
         G = G + task.added
     return criterion(task.criterion, G, 64.0, task.chosen, task.scale).value
+
+
+def _require_holdable_home(model: ArmModel, limits: MotionLimits) -> None:
+    standing = PosturePath(np.array([limits.home, limits.home]), np.ones(1), 0.0)
+    if weak := demands(standing, model).forces_beyond(model.chain.names, limits, model.config.supply):
+        raise MotionRefused(
+            f"{model.config.name}: the arm cannot be held at home, where motions begin, within what the margins leave: "
+            f"{'; '.join(weak)}"
+        )
 
 
 def _require_free_home(model: ArmModel, limits: MotionLimits, collision: CollisionModel) -> None:

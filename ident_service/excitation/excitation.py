@@ -18,7 +18,9 @@ from ident_service.model.chain import Array
 
 FORMAT, VERSION = "ident-excitation", 1
 _MOST_BYTES = 4 * 2**20
-_MOST_DURATION = 24 * 3600.0
+LONGEST = 24 * 3600.0  # s
+_LARGEST = 1e6  # of any number in a motion's file
+_SLOWEST, _FASTEST = 1e-5, 1e3  # Hz
 _MOST_PERIODS = 10**9
 
 
@@ -111,8 +113,8 @@ def excitation_from_json(text: str) -> Excitation:
                 _array(content, "b", 2),
                 _array(content, "q0", 1),
             )
-            if not series.base_frequency > 0.0:
-                raise UsageError("base_frequency must be above zero")
+            if not _SLOWEST <= series.base_frequency <= _FASTEST:
+                raise UsageError(f"base_frequency must be above zero: between {_SLOWEST:g} and {_FASTEST:g} Hz")
             periods = content["periods"]
             if not isinstance(periods, int) or isinstance(periods, bool) or periods > _MOST_PERIODS:
                 raise UsageError(f"periods must be a whole number, and no more than {_MOST_PERIODS}")
@@ -134,8 +136,8 @@ def excitation_from_json(text: str) -> Excitation:
         json.dumps(made, allow_nan=False)
     except ValueError:
         raise UsageError("made holds what is no finite number") from None
-    if not path.duration <= _MOST_DURATION:
-        raise UsageError(f"a motion of {path.duration:g} s; the longest is {_MOST_DURATION:g} s")
+    if not path.duration <= LONGEST:
+        raise UsageError(f"a motion of {path.duration:g} s; the longest is {LONGEST:g} s")
     return Excitation(name, path, sha256, made)
 
 
@@ -157,4 +159,6 @@ def _array(content: dict[str, Any], key: str, dimensions: int) -> Array:
         raise UsageError(f"{key} must be {'rows of numbers' if dimensions == 2 else 'numbers'}") from None
     if array.ndim != dimensions or not array.size or not np.isfinite(array).all():
         raise UsageError(f"{key} must be {'rows' if dimensions == 2 else 'a list'} of finite numbers, none left out")
+    if np.abs(array).max() > _LARGEST:
+        raise UsageError(f"{key} holds a number beyond {_LARGEST:g}, which no arm can mean")
     return array

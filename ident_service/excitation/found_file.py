@@ -89,6 +89,8 @@ def read_found(file: Path, task: Task, seed: int) -> Found:
         if isinstance(error, UsageError):
             raise
         raise UsageError(f"{file}: not a search: {error}") from None
+    if any(not (np.abs(one.coefficients) < 1e6).all() or not np.isfinite(one.value) for one in candidates):
+        raise UsageError(f"{file}: not a search: a number that no arm can mean")
     if finished < 0 or any(one.coefficients.shape != shape for one in candidates):
         raise UsageError(f"{file}: not a search for motions of {shape[0]} joints with {shape[1]} coefficients")
     return Found(seed, finished, seconds, candidates)

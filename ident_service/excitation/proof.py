@@ -11,11 +11,12 @@ from ident_service.config.limits import MotionLimits
 from ident_service.excitation.basis import Basis
 from ident_service.excitation.clearance import Clearance, certified_clearance
 from ident_service.excitation.demands import Demands, demands
-from ident_service.excitation.path import FourierPath, PosturePath
+from ident_service.excitation.path import STEP_PEAKS, FourierPath, PosturePath
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel
 
+_CALM, _SHORTEST = 0.5, 0.5  # share of the limits on the ways to and from a motion; s
 _SHRINKS = tuple(1.0 - 0.002 * 1.35**k for k in range(20))  # 0.998 ... 0.4
 
 
@@ -27,11 +28,13 @@ class Proof:
         demands: on the joints and the supply.
         clearance: the smallest distance, None where the arm has no geometry.
         approach: the smallest distance on the straight way from home to where the motion begins and back, likewise.
+        ways: what calm ways from home and back ask, home itself included.
     """
 
     demands: Demands
     clearance: Clearance | None
     approach: Clearance | None
+    ways: Demands
 
 
 def proof_of(
@@ -46,20 +49,31 @@ def proof_of(
         collision: geometry of the arm.
     """
     least = model.config.workspace.clearance
+    ways = _ways(path, limits)
+    asked, on_ways = demands(path, model), demands(ways, model)
     if not collision.pairs:
-        return Proof(demands(path, model), None, None)
-    ends = [path.at(0.0)[0], path.at(path.duration)[0]]
-    points = np.array([limits.home, ends[0], limits.home, ends[1]])
+        return Proof(asked, None, None, on_ways)
     return Proof(
-        demands(path, model),
-        certified_clearance(collision, path, least),
-        certified_clearance(collision, PosturePath(points, np.full(3, 2.0), 0.0), least),
+        asked, certified_clearance(collision, path, least), certified_clearance(collision, ways, least), on_ways
     )
+
+
+def _ways(path: FourierPath | PosturePath, limits: MotionLimits) -> PosturePath:
+    """Straight ways from home to where a motion begins, back, and to where it ends, at half of the limits."""
+    points = np.array([limits.home, path.at(0.0)[0], limits.home, path.at(path.duration)[0]])
+    far = np.abs(np.diff(points, axis=0))
+    needed = [
+        (STEP_PEAKS[order] * far / (_CALM * limit)) ** (1.0 / order)
+        for order, limit in ((1, limits.velocity), (2, limits.acceleration), (3, limits.jerk))
+    ]
+    return PosturePath(points, np.maximum(np.max(needed, axis=(0, 2)), _SHORTEST), 0.0)
 
 
 def objections(proof: Proof, model: ArmModel, limits: MotionLimits) -> list[str]:
     """Every limit that is not proven to be kept, in words; empty when all are."""
     found = proof.demands.violations(model.chain.names, limits, model.config.supply)
+    forces = proof.ways.forces_beyond(model.chain.names, limits, model.config.supply)
+    found += [f"at home, or on the way from it or back: {one}" for one in forces]
     least = model.config.workspace.clearance
     for what, clearance in (("the motion", proof.clearance), ("the way from home or back", proof.approach)):
         if clearance is not None and clearance.lower_bound < least:

@@ -10,14 +10,14 @@ import multiprocessing
 import signal
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.synchronize import Event
 
 import numpy as np
 
-from ident_service.errors import UsageError
+from ident_service.errors import SolverError, UsageError
 from ident_service.excitation.climb import Candidate, Interrupted, Stopped, climbed, random_variables
 from ident_service.excitation.problem import Problem
 from ident_service.excitation.task import Task
@@ -114,6 +114,9 @@ def search(
 
     Returns:
         At least one candidate: standing still in the safe posture, if nothing else.
+
+    Raises:
+        SolverError: a worker process died before anything was found.
     """
     begun = time.monotonic()
     run = _Run(task, safe, seed, budget, begun, tell, cancelled, earlier)
@@ -145,6 +148,7 @@ class _Run:
     ) -> None:
         self._budget, self._begun, self._tell, self._cancelled = budget, begun, tell, cancelled
         self._seed = seed
+        self._broken = False
         self._before = 0.0 if earlier is None else earlier.seconds
         self._first = self._finished = 0 if earlier is None else earlier.finished
         self._best: list[Candidate] = [] if earlier is None else list(earlier.candidates)
@@ -163,7 +167,7 @@ class _Run:
             while len(running) < self._budget.workers and not self._over(until) and (last is None or number < last):
                 running.add(crew.submit(number, None, until))
                 number += 1
-            if not running:
+            if not running or self._broken:
                 return
             for candidate in self._finished_of(crew, running, "starts"):
                 self._finished += 1
@@ -173,16 +177,16 @@ class _Run:
         until = None if self._budget.seconds is None else self._begun + self._budget.seconds
         running: set[Future[Candidate]] = set()
         waiting = list(self._best[:_POLISHED])
-        while waiting or running:
+        while (waiting or running) and not self._broken:
             while waiting and len(running) < self._budget.workers and not self._over(until):
                 running.add(crew.submit(waiting[0].start, waiting.pop(0), until))
-            if not running:
+            if not running or self._broken:
                 return
             for candidate in self._finished_of(crew, running, "polish"):
                 self._take(candidate)
 
     def _over(self, until: float | None) -> bool:
-        return self._cancelled() or (until is not None and time.monotonic() >= until)
+        return self._broken or self._cancelled() or (until is not None and time.monotonic() >= until)
 
     def _finished_of(self, crew: _Crew, running: set[Future[Candidate]], phase: str) -> list[Candidate]:
         if self._cancelled():
@@ -192,7 +196,14 @@ class _Run:
         elapsed = time.monotonic() - self._begun
         best = self._best[0].value if self._best else None
         self._tell(Progress(phase, self._finished, best, elapsed, self._remaining(elapsed)))
-        return [future.result() for future in sorted(done, key=id)]
+        try:
+            return [future.result() for future in sorted(done, key=id)]
+        except BrokenExecutor:
+            # What was found before a worker died is not lost; without anything there is nothing to go on with.
+            if not self._best:
+                raise SolverError("search", "a worker process died; is there memory enough?") from None
+            self._broken = True
+            return []
 
     def _remaining(self, elapsed: float) -> float:
         bounds = []

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from ident_service.config.workspace import BASE
-from ident_service.errors import ModelError
+from ident_service.errors import ModelError, MotionRefused
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.reach import reach
@@ -36,7 +36,8 @@ class CollisionModel:
         """Collect the bodies and see to it that they are not in each other's way always.
 
         Raises:
-            ModelError: geometry that does not fit the arm, or a pair that is never free.
+            ModelError: geometry that does not fit the arm.
+            MotionRefused: a pair that is never free, so that no motion could be safe.
         """
         around = scene(model)
         self.pairs = around.pairs
@@ -93,8 +94,13 @@ class CollisionModel:
         links, surroundings = others & {BASE, *around.chain.names}, others - {BASE, *around.chain.names}
         advice = "shorten the capsules"
         advice += ", or list the pair under workspace.may_touch" if links else ""
-        advice += ", or move the obstacle" if surroundings else ""
-        raise ModelError(
+        advice += ", or move the obstacle" if any(not owner.startswith("inside") for owner in surroundings) else ""
+        advice += (
+            ", or mend workspace.inside, which leaves them no room"
+            if any(owner.startswith("inside") for owner in surroundings)
+            else ""
+        )
+        raise MotionRefused(
             f"{name}: in collision in every one of {_POSTURES} random postures: "
             f"{', '.join(self.pairs[pair] for pair in stuck)}; {advice}"
         )

@@ -17,7 +17,7 @@ import numpy as np
 
 from ident_service.config import workspace as given
 from ident_service.config.workspace import BASE
-from ident_service.errors import ModelError
+from ident_service.errors import ModelError, MotionRefused
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array, Chain, rotation_x, rotation_z
 
@@ -100,6 +100,7 @@ def scene(model: ArmModel) -> Scene:
 
     Raises:
         ModelError: a link that does not exist, or a mesh where capsules are needed.
+        MotionRefused: surroundings, but no body that could touch them.
     """
     chain, config = model.chain, model.config
     _check_names(model)
@@ -111,6 +112,11 @@ def scene(model: ArmModel) -> Scene:
         links += urdf_solids(config.kinematics.urdf, chain, frozenset(config.geometry))
     around = [*_obstacles(config.workspace), *_inside(config.workspace)]
     bodies = (*links, *around)
+    if around and not links:
+        raise MotionRefused(
+            f"{config.name}: workspace names what must not be touched, but no link has a body; give capsules under "
+            "geometry, or collision geometry in the URDF"
+        )
     indices: dict[str, list[int]] = {}
     for index, body in enumerate(bodies):
         indices.setdefault(body.owner, []).append(index)

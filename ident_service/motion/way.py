@@ -28,7 +28,7 @@ class RuckigReference:
         self._trajectory = ruckig.Trajectory(parameters.degrees_of_freedom)
         try:
             result = ruckig.Ruckig(parameters.degrees_of_freedom).calculate(parameters, self._trajectory)
-        except ruckig.RuckigError as error:
+        except (ruckig.RuckigError, ValueError) as error:  # ValueError: a result that its own enumeration lacks
             raise MotionRefused(f"no jerk-limited way exists within the limits: {str(error).strip()}") from error
         if result not in (ruckig.Result.Working, ruckig.Result.Finished):
             raise MotionRefused(f"no jerk-limited way exists within the limits: {result}")

@@ -32,6 +32,21 @@ def write_atomically(path: Path, text: str) -> None:
         partial.unlink(missing_ok=True)
 
 
+def require_place(folder: Path) -> None:
+    """Refuse a folder that could not be written, before work is done for it.
+
+    Raises:
+        UsageError: it is a file, or lies where nothing can be written.
+    """
+    place = folder
+    while not place.exists() and place != place.parent:
+        place = place.parent
+    if not place.is_dir():
+        raise UsageError(f"{place}: is a file, not a folder")
+    if not os.access(place, os.W_OK | os.X_OK) or str(place.resolve()).startswith("/proc"):
+        raise UsageError(f"{folder}: cannot be written: no permission in {place}")
+
+
 @contextmanager
 def appearing_folder(folder: Path) -> Iterator[Path]:
     """A place to build a folder's content in; it appears under its name when the block ends without an error.

@@ -29,7 +29,7 @@ from ident_service.model.chain import Array
 from ident_service.model.information import Information
 from ident_service.motion.surroundings import touching_stop
 from ident_service.record.open import open_recording
-from ident_service.results.files import appearing_folder, write_atomically
+from ident_service.results.files import appearing_folder, require_place, write_atomically
 from ident_service.results.parameter_file import read_parameters
 from ident_service.service.motion_drawings import DRAWINGS, drawings
 from ident_service.service.preview import Preview, preview, preview_document, recorded_noise
@@ -94,6 +94,9 @@ def design_files(
         MotionRefused: limits that contradict each other, home in collision, no posture that keeps them.
         RecordingError, ParameterError: a file of the knowledge cannot be used.
     """
+    require_place(folder)
+    if (folder / MOTION).exists():
+        raise UsageError(f"{folder / MOTION}: exists already; give another folder")
     model = known_model(request.arm, request.knowledge)
     design = _changed(model.config.design, request.changes)
     noise = known_noise(model, request.knowledge)

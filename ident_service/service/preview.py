@@ -184,6 +184,7 @@ def preview_document(seen: Preview) -> dict[str, Any]:
                 **{kind: None if (peak := getattr(asked, kind)) is None else float(peak[k]) for kind in KINDS},
                 "limits": {
                     "position": [float(seen.limits.lower[k]), float(seen.limits.upper[k])],
+                    "following_error": float(seen.limits.following_error[k]),
                     **{kind: float(getattr(seen.limits, kind)[k]) for kind in KINDS},
                 },
             }

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ident_service.config.limits import motion_limits
+from ident_service.errors import MotionRefused
 from ident_service.excitation.design import criterion_of, design_motion, family, settled
 from ident_service.excitation.excitation import excitation_from_json
 from ident_service.excitation.search import Budget
@@ -127,9 +128,11 @@ def test_an_arm_that_can_only_hang_moves_about_hanging(torque: float) -> None:
     assert_good(model, torque_margin=0.0)
 
 
-def test_an_arm_that_can_only_hang_is_moved_there_from_a_home_elsewhere() -> None:
+def test_an_arm_that_cannot_be_held_at_home_is_not_sent_anywhere() -> None:
+    # Motions begin at home, stretched out level, where it is far too weak.
     model = small(joints={"shoulder": {"torque": 3.0, "position": [-2.4, 1.8]}, "elbow": {"torque": 3.0}})
-    assert_good(model, torque_margin=0.0)
+    with pytest.raises(MotionRefused, match=r"cannot be held at home.*shoulder: torque"):
+        assert_good(model, torque_margin=0.0)
 
 
 def test_a_narrow_box_leaves_room_for_a_small_motion() -> None:
@@ -144,7 +147,10 @@ def test_a_supply_that_hardly_feeds_the_drives_slows_the_motion_down() -> None:
 
 
 def test_a_supply_whose_losses_matter_holds_the_arm_where_it_needs_no_torque() -> None:
-    model = small(joints={"shoulder": {"position": [-2.4, 1.8]}}, supply={"power": 3.0, "standby": 2.0, "loss": 0.5})
+    model = small(
+        joints={"shoulder": {"position": [-2.4, 1.8], "home": -1.5707963}},
+        supply={"power": 3.0, "standby": 2.0, "loss": 0.5},
+    )
     assert_good(model)
 
 

@@ -11,6 +11,7 @@ from design_bench import FOURIER, POSTURES, quick, random_task, small
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from ident_service.config.workspace import Workspace
 from ident_service.excitation.basis import Basis
 from ident_service.excitation.climb import keeps
 from ident_service.excitation.design import family, settled
@@ -68,7 +69,7 @@ def test_the_gradient_of_each_kind_of_limit_alone(name: str, seed: int) -> None:
     if name != "power":
         config = config.model_copy(update={"supply": None})
     if name != "clearance":
-        config = config.model_copy(update={"geometry": {}})
+        config = config.model_copy(update={"geometry": {}, "workspace": Workspace()})
     narrow = Problem(task, 30)
     problem = Problem(replace(task, limits=limits, model=replace(task.model, config=config)), 30)
     rng = np.random.default_rng(seed)

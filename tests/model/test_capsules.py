@@ -9,7 +9,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from ident_service.config.schema import ArmConfig
-from ident_service.errors import ModelError
+from ident_service.config.workspace import Workspace
+from ident_service.errors import ModelError, MotionRefused
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.capsules import CapsuleModel
 from ident_service.model.collision import CollisionModel
@@ -26,7 +27,7 @@ SHAPES = (
 def collision_model(model: ArmModel) -> CollisionModel:
     try:
         return CollisionModel(model)
-    except ModelError:
+    except (ModelError, MotionRefused):
         assume(False)
         raise
 
@@ -122,7 +123,8 @@ def test_ends_that_are_equally_near_share_the_gradient() -> None:
 
 
 def test_an_arm_without_geometry_has_no_distances(wam7: ArmModel) -> None:
-    fast = CapsuleModel(arm_model(wam7.config.model_copy(update={"geometry": {}})))
+    bare = arm_model(wam7.config.model_copy(update={"geometry": {}, "workspace": Workspace()}))
+    fast = CapsuleModel(bare)
     assert fast.pairs == ()
     assert fast.distances(np.zeros((3, 7))).shape == (0, 3)
     np.testing.assert_array_equal(fast.pull(np.zeros((0, 3))), np.zeros((3, 7)))

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from ident_service.config.load import load_arm
 from ident_service.config.schema import ArmConfig
-from ident_service.errors import ModelError
+from ident_service.errors import ModelError, MotionRefused
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.collision import CollisionModel
 
@@ -124,16 +124,18 @@ def test_overlap_is_negative() -> None:
 def test_a_pair_that_is_never_free_is_named() -> None:
     geometry = {"base": [BALL], "j2": [{"from": [-2, 0, 0], "to": [2, 0, 0], "radius": 0.9}]}
     with pytest.raises(
-        ModelError, match=r"j2 - base; shorten the capsules, or list the pair under workspace.may_touch"
+        MotionRefused, match=r"j2 - base; shorten the capsules, or list the pair under workspace.may_touch"
     ):
         CollisionModel(serial(geometry | {"base": [BALL | {"radius": 1.2}]}, joints=2))
     pool = {"obstacles": {"pool": {"half_space": {"normal": [0, 0, 1], "offset": 0.5}}}}
-    with pytest.raises(ModelError, match="j1 - obstacle pool; shorten the capsules, or move the obstacle"):
+    with pytest.raises(MotionRefused, match="j1 - obstacle pool; shorten the capsules, or move the obstacle"):
         CollisionModel(serial({"j1": [BALL]}, pool))
 
 
 def test_an_arm_without_geometry_has_no_pairs() -> None:
-    model = CollisionModel(serial({}, {"obstacles": {"table": {"half_space": {"normal": [0, 0, 1], "offset": 0}}}}))
+    with pytest.raises(MotionRefused, match="no link has a body"):
+        CollisionModel(serial({}, {"obstacles": {"table": {"half_space": {"normal": [0, 0, 1], "offset": 0}}}}))
+    model = CollisionModel(serial({}))
     assert model.pairs == ()
     assert model.reach == ()
     assert model.distances(np.zeros((3, 4))).shape == (3, 0)
@@ -221,7 +223,7 @@ def free_model(seed: int, joints: int) -> tuple[ArmModel, CollisionModel]:
     model = arm_with_bodies(seed, joints)
     try:
         return model, CollisionModel(model)
-    except ModelError:
+    except (ModelError, MotionRefused):
         assume(False)
         raise
 
