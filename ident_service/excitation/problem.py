@@ -164,9 +164,10 @@ class Problem:
         H = self._regressor.run(q, dq, ddq, direction)
         G = np.zeros((H.shape[1], H.shape[1]))
         counted = self._weights > 0.0
-        for rows, noise in zip(H, task.noise, strict=True):
-            seen = rows[:, counted] * np.sqrt(self._weights[counted])
-            G += seen @ seen.T / noise**2
+        roots = np.sqrt(self._weights[counted])
+        for rows, felt, noise in zip(H, self._regressor.supports, task.noise, strict=True):
+            seen = rows[felt][:, counted] * roots if not counted.all() else rows[felt] * roots
+            G[np.ix_(felt, felt)] += seen @ seen.T / noise**2
         if task.added is not None:
             G += task.added
         value = criterion(task.criterion, G, sharpness, task.chosen, task.scale)
@@ -215,18 +216,19 @@ class Problem:
             on_speed = pushes["forecast speed"] / (TOLERATED * limits.velocity)
             by_q, by_dq = self._following.pull(pushes["following error"] / self._allowed - self._rate_of.T @ on_speed)
             on_q, on_dq = on_q + by_q, on_dq + by_dq + on_speed
-        seeds = np.empty_like(H)
-        for k, (rows, noise) in enumerate(zip(H, task.noise, strict=True)):
-            seeds[k] = (2.0 / noise**2) * (value.gradient @ rows) * self._weights
+        seeds = np.zeros_like(H)
+        for k, (rows, felt, noise) in enumerate(zip(H, self._regressor.supports, task.noise, strict=True)):
+            seeds[k, felt] = (2.0 / noise**2 * value.gradient[np.ix_(felt, felt)]) @ rows[felt] * self._weights
         if torque is not None:
             on_torque = pushes["torque"] / self._torque_limit
             if self._supply is not None:
                 on_torque = on_torque + forces["power"] * power_slopes[0]
                 on_dq = on_dq + forces["power"] * power_slopes[1]
-            along = on_torque.T[:, None, :] * self._beta[None, :, None]
             if T is H:
-                seeds += along
+                for k, felt in enumerate(self._regressor.supports):
+                    seeds[k, felt] += np.outer(self._beta[felt], on_torque[:, k])
             else:
+                along = on_torque.T[:, None, :] * self._beta[None, :, None]
                 by_q, by_dq, by_ddq, _ = self._torque_regressor.pull(along)
                 on_q, on_dq, on_ddq = on_q + by_q, on_dq + by_dq, on_ddq + by_ddq
         by_q, by_dq, by_ddq, by_direction = self._regressor.pull(seeds)

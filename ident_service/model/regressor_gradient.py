@@ -25,6 +25,7 @@ class RegressorGradient:
     Attributes:
         joints: number of joints.
         columns: number of chosen columns.
+        supports: per joint, the columns that are not always zero, increasing.
     """
 
     def __init__(self, chain: Chain, layout: Layout, columns: Sequence[int] | NDArray[np.intp]) -> None:
@@ -36,6 +37,8 @@ class RegressorGradient:
         places = np.array(list(kept), dtype=np.intp).reshape(-1, 2)
         self._joint, self._column = places[:, 0], places[:, 1]
         self.joints, self.columns = chain.joints, len(columns)
+        # Which columns each joint feels at all; the rest of its rows is zero.
+        self.supports = [np.unique(self._column[self._joint == joint]) for joint in range(chain.joints)]
         self._H = np.zeros((0, 0, 0))
 
     def run(self, position: Array, velocity: Array, acceleration: Array, direction: Array) -> Array:

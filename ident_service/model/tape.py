@@ -109,7 +109,7 @@ class Program:
         last_use = {index: at for at in needed for index in operands_of(tape, at)}
         free: list[int] = []
         self._slots = 0
-        self._plan: list[tuple[np.ufunc, tuple[str, int] | float, tuple[str, int] | float | None, tuple[str, int]]] = []
+        plan: list[tuple[np.ufunc, tuple[str, int] | float, tuple[str, int] | float | None, tuple[str, int]]] = []
         for at in needed:
             operation, a, b = tape.steps[at]
             if operation == "input":
@@ -126,7 +126,20 @@ class Program:
             first = operands[0]
             if first is None:
                 raise AssertionError("every step has an operand")
-            self._plan.append((function, first, operands[1], home[at]))
+            plan.append((function, first, operands[1], home[at]))
+        # While running, all values stand in one list: inputs, outputs, slots, constants; a step knows its places in it.
+        begins = {"input": 0, "output": len(inputs), "slot": len(inputs) + len(outputs)}
+        self._numbers: list[float] = []
+
+        def place(value: tuple[str, int] | float | None) -> int:
+            if value is None:
+                return -1
+            if isinstance(value, float):
+                self._numbers.append(value)
+                return begins["slot"] + self._slots + len(self._numbers) - 1
+            return begins[value[0]] + value[1]
+
+        self._plan = [(function, place(a), place(b), place(target)) for function, a, b, target in plan]
 
     @property
     def steps(self) -> int:
@@ -142,13 +155,12 @@ class Program:
         """
         workspace = np.empty((self._slots, *inputs[0].shape))
         places = {"input": inputs, "output": output, "slot": list(workspace)}
+        values = [*inputs, *output, *workspace, *self._numbers]
         for function, a, b, target in self._plan:
-            first = a if isinstance(a, float) else places[a[0]][a[1]]
-            result = places[target[0]][target[1]]
-            if b is None:
-                function(first, result)
+            if b < 0:
+                function(values[a], values[target])
             else:
-                function(first, b if isinstance(b, float) else places[b[0]][b[1]], result)
+                function(values[a], values[b], values[target])
         for row, (kind, index) in self._copies:
             output[row][...] = places[kind][index]
         for row, value in self._constants:
