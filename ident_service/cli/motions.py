@@ -117,8 +117,9 @@ def _design(arguments: argparse.Namespace) -> Answer:
         "criterion": designed.excitation.made["criterion"],
         "criterion_value": designed.excitation.made["criterion_value"],
     }
-    document["warnings"] = [unfinished] if unfinished else []
-    return (VERDICT_NO if seen.objections or not taught else DONE), text, document | preview_document(seen)
+    document |= preview_document(seen)
+    document["warnings"] = [*([unfinished] if unfinished else []), *seen.warnings]
+    return (VERDICT_NO if seen.objections or not taught else DONE), text, document
 
 
 def _progress(arguments: argparse.Namespace) -> Callable[[Progress], None]:

@@ -24,6 +24,7 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters, base_parameters
 from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel
+from ident_service.model.solids import scene
 from ident_service.motion.reference import Setpoint, rest
 from ident_service.motion.stop import stop_extent
 from ident_service.motion.surroundings import Nearest, stop_clearance
@@ -52,6 +53,7 @@ class Preview:
         noise: of the torques, as far as known.
         deviations: to be expected, shape (base,).
         condition_number: of the stacked regressor.
+        warnings: what nobody can prove or forbid, in words.
     """
 
     model: ArmModel
@@ -67,6 +69,7 @@ class Preview:
     noise: NoiseModel
     deviations: Array
     condition_number: float
+    warnings: tuple[str, ...]
 
 
 def preview(
@@ -115,6 +118,7 @@ def preview(
             found.append(str(error))
     base = base_parameters(model.chain, model.layout)
     noise = described_noise(model, limits) if noise is None else noise
+    following = _following(model, excitation, limits)
     return Preview(
         model=model,
         excitation=excitation,
@@ -123,13 +127,27 @@ def preview(
         objections=tuple(found),
         stops=(lowest, highest),
         stop_clearance=nearest,
-        following=_following(model, excitation, limits),
+        following=following,
         approach=(durations[0], durations[1]),
         base=base,
         noise=noise,
         deviations=expected_deviations(path, model, base, noise, added),
         condition_number=condition_number(information(path, model, base, np.ones(model.chain.joints))),
+        warnings=tuple(_warnings(model, limits, following)),
     )
+
+
+def _warnings(model: ArmModel, limits: MotionLimits, following: Array) -> list[str]:
+    names, found = model.chain.names, []
+    if late := [name for k, name in enumerate(names) if following[k] > limits.following_error[k]]:
+        found.append(
+            f"{', '.join(late)} may fall behind by more than the following error allows, if friction is as guessed "
+            "(design.friction_guess); the guard would stop the motion"
+        )
+    owners = {body.owner for body in scene(model).bodies}
+    if bare := [name for name in names if name not in owners]:
+        found.append(f"no body is known of {', '.join(bare)}: nothing keeps it clear of anything; see geometry")
+    return found
 
 
 def _following(model: ArmModel, excitation: Excitation, limits: MotionLimits) -> Array:
@@ -212,4 +230,5 @@ def preview_document(seen: Preview) -> dict[str, Any]:
             "expected_standard_deviations": [float(value) if np.isfinite(value) else None for value in seen.deviations],
         },
         "objections": list(seen.objections),
+        "warnings": list(seen.warnings),
     }

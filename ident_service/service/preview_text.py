@@ -55,13 +55,7 @@ def preview_text(seen: Preview) -> str:
     if seen.stop_clearance.pair is not None:
         near = seen.stop_clearance
         lines.append(f"stops out of the motion: {near.distance:.4f} m at {near.pair}, when begun at {near.time:.2f} s")
-    if late := [name for k, name in enumerate(names) if seen.following[k] > limits.following_error[k]]:
-        lines.append(
-            f"WARNING: {', '.join(late)} may fall behind by more than the following error allows, if friction is as "
-            "guessed; the guard would stop the motion"
-        )
-    if seen.proof.clearance is None:
-        lines.append("clearance: not checked, the description has no geometry")
+    lines += [f"WARNING: {line}" for line in seen.warnings]
     lines += ["", *_teaching(seen), ""]
     if seen.objections:
         lines += ["NOT ALLOWED:", *(f"  {line}" for line in seen.objections), ""]
