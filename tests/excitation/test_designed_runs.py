@@ -24,7 +24,8 @@ def assert_runs(arm: ArmConfig, motion: Excitation, folder: Path) -> None:
     """The prior knows neither the arm's friction nor its true inertia; the margins are for that."""
     report = record_motion(make_arm(arm), arm_model(arm), motion, folder / "run.mcap")
     assert report.state is State.DONE
-    assert report.warnings == {}
+    # What the torque's rate is limited by, where one way joins the next, is no torque beyond its limit.
+    assert report.warnings.keys() <= {"torque_rate"}
     limits = motion_limits(arm)
     assert (np.asarray(report.peak_torque) <= limits.torque).all()
     # Most of what the margins leave is used by some joint, or the test would show nothing.
@@ -43,5 +44,5 @@ def test_a_small_arm_runs_its_designed_motion(name: str, tmp_path: Path) -> None
 def test_the_wam_runs_its_designed_motion(tmp_path: Path) -> None:
     arm = load_arm("wam7_sim")
     design = arm.design.model_copy(update={"harmonics": 3, "base_frequency": 0.1, "periods": 1})
-    motion = design_motion(arm_model(arm), design, budget=Budget(seconds=20.0, starts=None, workers=1)).excitation
+    motion = design_motion(arm_model(arm), design, budget=Budget(seconds=None, starts=2, workers=1)).excitation
     assert_runs(arm, motion, tmp_path)
