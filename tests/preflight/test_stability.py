@@ -54,6 +54,8 @@ def simulated_growth(one: Loop, ratio: float, cycles: int) -> float:
         sizes[k] = abs(q) + abs(dq) * h
         if not sizes[k] < 1e100:
             return np.inf
+        if sizes[k] < 1e-250:
+            return 0.0  # settled; below, numbers stop getting smaller
     tenth = cycles // 10
     return float(sizes[-tenth:].max() / sizes[-2 * tenth : -tenth].max())
 

@@ -1,4 +1,7 @@
-"""`ident run`, what a second terminal may ask of it, and what is left when it is killed."""
+"""`ident run`, what a second terminal may ask of it, and what is left when it is killed.
+
+Runs of processes against the machine's clock belong to the campaign: a stall of the machine is a fault of the arm.
+"""
 
 from __future__ import annotations
 
@@ -111,6 +114,7 @@ def checked(arm: Path, state: Path) -> list[str]:
     return ["--state", str(state)]
 
 
+@pytest.mark.campaign
 def test_a_run_in_virtual_time_is_the_run_that_was_asked_for(virtual_arm: Path, tmp_path: Path) -> None:
     words = checked(virtual_arm, tmp_path / "state")
     assert main(["run", str(virtual_arm), "--out", str(tmp_path / "run"), *words]) == 0
@@ -122,6 +126,7 @@ def test_a_run_in_virtual_time_is_the_run_that_was_asked_for(virtual_arm: Path, 
     assert 0 < ended["lateness"]["count"] <= ended["cycles"]
 
 
+@pytest.mark.campaign
 def test_a_rehearsal_is_the_same_way_at_a_fifth_of_the_speed(virtual_arm: Path, tmp_path: Path) -> None:
     words = ["--out", str(tmp_path / "run"), *checked(virtual_arm, tmp_path / "state")]
     assert main(["rehearse", str(virtual_arm), *words]) == 0
@@ -150,7 +155,7 @@ def test_an_arm_that_was_not_checked_does_not_move(
     assert "the arm's description has changed since" in capsys.readouterr().err
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_second_terminal_pauses_resumes_and_stops(started: Started, real_arm: Path, tmp_path: Path) -> None:
     started.reaches("exciting")
     for word, reached in (("pause", "paused"), ("resume", "exciting"), ("stop", "stopped")):
@@ -162,16 +167,17 @@ def test_a_second_terminal_pauses_resumes_and_stops(started: Started, real_arm: 
     assert readable(started.folder) > 0
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_second_run_is_refused_while_the_first_one_moves(started: Started, real_arm: Path, tmp_path: Path) -> None:
     started.reaches("exciting")
     words = ["--out", str(tmp_path / "other"), "--state", str(tmp_path / "state")]
     assert main(["run", str(real_arm), *words]) != 0
+    # The first one has not noticed, and goes on until it is stopped.
     started.process.send_signal(signal.SIGINT)
-    assert started.end()[0] == 0
+    assert "stopped" in started.end()[1]
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_ctrl_c_stops_the_arm_under_control(started: Started) -> None:
     started.reaches("exciting")
     started.process.send_signal(signal.SIGINT)
@@ -180,7 +186,7 @@ def test_ctrl_c_stops_the_arm_under_control(started: Started) -> None:
     assert "stopped after" in out
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.parametrize("victim", ["parent", "recorder_loop", "motion.process"])
 def test_whoever_is_killed_the_arm_comes_to_rest_and_nothing_is_left(
     victim: str, started: Started, tmp_path: Path
