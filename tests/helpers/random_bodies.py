@@ -43,6 +43,7 @@ def arm_with_bodies(
         for name in ("base", *chain.names)
         if rng.random() < 0.9
     }
+    geometry = geometry or {"base": (_capsule(rng),)}  # surroundings without any body are refused
     solids: dict[str, Any] = {
         "box": {"center": _far(rng), "size": rng.uniform(0.05, 0.5, 3).tolist(), "rpy": rng.uniform(-3, 3, 3).tolist()},
         "half_space": {"normal": rng.normal(size=3).tolist(), "offset": -float(rng.uniform(0.2, 1.0))},
