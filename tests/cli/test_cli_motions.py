@@ -254,7 +254,9 @@ def test_ctrl_c_ends_a_search_with_what_it_has(tmp_path: Path) -> None:
         str(tmp_path / "m"),
     ]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        time.sleep(4.0)
+        assert process.stdout is not None
+        assert next(line for line in process.stdout if line.startswith("starts:"))
+        time.sleep(3.0)
         os.kill(process.pid, signal.SIGINT)
         out, err = process.communicate(timeout=60)
     assert process.returncode == 0, err
