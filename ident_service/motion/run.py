@@ -213,11 +213,13 @@ class _Run:
     def _halt(self, error: BaseException, loop: Loop) -> None:
         """Take the torque away, whatever happened, and only then tell of it."""
         code = error.code if isinstance(error, ArmFault) else "driver" if isinstance(error, DriverError) else "program"
-        rule, cause = FAULTS[code], str(error) or type(error).__name__
+        # A code that the table lacks must not keep the torque on.
+        rule = FAULTS.get(code, FAULTS["program"])
         try:
             self.arm.stop(rule.reaction.stop_kind)
         except Exception as second:  # noqa: BLE001 - a driver that breaks its promise must not hide why it was stopped
             error.add_note(f"and taking the torque away failed: {second}")
+        cause = str(error) or type(error).__name__
         now_ns = self.arm.clock.now_ns()
         self.latch.set(code, cause.removeprefix(f"{code}: "), now_ns)
         if State.FAULTED in LAWFUL[self.states.state]:

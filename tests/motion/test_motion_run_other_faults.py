@@ -204,3 +204,20 @@ def test_a_run_whose_torque_cannot_be_taken_is_not_done(make: Callable[..., Benc
     bench.arm.stop_error = DriverError("bus is gone")
     with pytest.raises(DriverError, match="bus is gone"):
         bench.run()
+
+
+def test_a_fault_that_the_table_does_not_know_takes_the_torque_away_all_the_same() -> None:
+    from types import SimpleNamespace
+
+    from ident_service.errors import ArmFault
+    from ident_service.motion.latch import Latch
+    from ident_service.motion.run import _Run
+    from ident_service.motion.states import State
+
+    stopped: list[StopKind] = []
+    latch = Latch()
+    arm = SimpleNamespace(stop=stopped.append, clock=SimpleNamespace(now_ns=lambda: 0))
+    run_ = SimpleNamespace(arm=arm, latch=latch, states=SimpleNamespace(state=State.FAULTED))
+    _Run._halt(run_, ArmFault("from_a_foreign_driver", "who knows"), SimpleNamespace())  # type: ignore[arg-type]
+    assert len(stopped) == 1
+    assert [fault.code for fault in latch.faults] == ["from_a_foreign_driver"]
