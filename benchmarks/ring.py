@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.harness import Row, table, write
+from ident_service.record.cycle import Cycle
 from ident_service.record.mcap_file import McapRecording
 from ident_service.record.recorder_process import RecorderProcess
 from ident_service.record.ring import RingReader, RingWriter, create_ring
-from ident_service.record.ring_slot import CycleRecord
 
 _JOINTS = 7
 _SECONDS = float(os.environ.get("IDENT_BENCH_RING_SECONDS", "20"))
@@ -29,11 +29,11 @@ def measure() -> list[Row]:
         return [*_ring(), *_full_speed(Path(folder) / "fast.mcap"), *_stream(Path(folder) / "stream.mcap")]
 
 
-def _samples(count: int) -> list[CycleRecord]:
+def _samples(count: int) -> list[Cycle]:
     q = np.arange(_JOINTS, dtype=np.float64)
     valid, age = np.ones(_JOINTS, np.bool_), np.zeros(_JOINTS, np.int64)
     return [
-        CycleRecord(k * _PERIOD_NS, np.sin(q + k * 1e-3), None, np.cos(q + k * 1e-3), q, q, k, 0, 0, valid, age, 0)
+        Cycle(k * _PERIOD_NS, np.sin(q + k * 1e-3), None, np.cos(q + k * 1e-3), q, q, k, 0, 0, valid, age, 0)
         for k in range(count)
     ]
 
@@ -47,7 +47,7 @@ def _ring() -> list[Row]:
         for _ in range(20):
             for sample in samples:
                 begin = time.perf_counter_ns()
-                writer.put(*sample)
+                writer.put(sample)
                 put_ns.append(time.perf_counter_ns() - begin)
             begin = time.perf_counter_ns()
             while reader.read() is not None:
@@ -69,7 +69,7 @@ def _full_speed(path: Path) -> list[Row]:
     with _recorder(path, lock_step=True) as recorder:
         begin = time.perf_counter()
         for sample in samples:
-            recorder.put(*sample)
+            recorder.put(sample)
     seconds = time.perf_counter() - begin
     return [Row("recorder: samples a second into the file, lock step", len(samples) / seconds, "1/s")]
 
@@ -83,7 +83,7 @@ def _stream(path: Path) -> list[Row]:
         for k, sample in enumerate(samples):
             time.sleep(max(0, begin + k * _PERIOD_NS - time.monotonic_ns()) * 1e-9)
             start = time.perf_counter_ns()
-            behind += not recorder.put(*sample)
+            behind += not recorder.put(sample)
             put_ns[k] = time.perf_counter_ns() - start
         closing = time.perf_counter()
     seconds = time.perf_counter() - closing

@@ -28,6 +28,7 @@ from ident_service.motion.latch import Latch
 from ident_service.motion.reference import Setpoint, rest
 from ident_service.motion.sink import Sink
 from ident_service.motion.states import State, States
+from ident_service.record.cycle import Cycle
 
 KEPT_SAMPLES: Final = 100
 REST_SPEED: Final = 0.05  # of the velocity limit, below which a joint counts as at rest
@@ -221,18 +222,20 @@ class Loop:
     def _record(self, sample: Sample, reference: Setpoint, compute_ns: int) -> Fault | None:
         try:
             kept = self.sink.put(
-                sample.stamp_ns,
-                sample.position,
-                sample.velocity,
-                sample.torque,
-                reference.position,
-                reference.velocity,
-                sample.cycle,
-                self.deadlines.lateness_ns,
-                compute_ns,
-                sample.valid,
-                sample.age,
-                sample.lost,
+                Cycle(
+                    sample.stamp_ns,
+                    sample.position,
+                    sample.velocity,
+                    sample.torque,
+                    reference.position,
+                    reference.velocity,
+                    sample.cycle,
+                    self.deadlines.lateness_ns,
+                    compute_ns,
+                    sample.valid,
+                    sample.age,
+                    sample.lost,
+                )
             )
         except Exception as error:  # noqa: BLE001 - whatever a recorder died of, the arm must not fall for it
             why = f"the recorder failed ({error})"

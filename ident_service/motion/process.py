@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 
-from drivers.arm import Counts, Flags, Vector
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import ArmFault, IdentError, MotionRefused
 from ident_service.excitation.excitation import excitation_from_json
@@ -33,6 +32,7 @@ from ident_service.motion.preflight_ticket import subject_of, ticket_from_json
 from ident_service.motion.realtime import ask
 from ident_service.motion.run import RunReport, run
 from ident_service.motion.states import State
+from ident_service.record.cycle import Cycle
 from ident_service.record.ring_sink import RingSink, SinkEnds
 
 _STATES = frozenset(state.value for state in State)
@@ -55,26 +55,11 @@ class TimedSink:
         """Why nothing is recorded any more, or empty."""
         return self._sink.error
 
-    def put(
-        self,
-        stamp_ns: int,
-        position: Vector,
-        velocity: Vector | None,
-        torque: Vector,
-        reference_position: Vector,
-        reference_velocity: Vector,
-        cycle: int,
-        lateness_ns: int,
-        compute_ns: int,
-        valid: Flags,
-        age: Counts,
-        lost: int,
-    ) -> bool:
+    def put(self, cycle: Cycle) -> bool:
         """Record one cycle."""
-        self.lateness.add(lateness_ns)
-        self.compute.add(compute_ns)
-        motion = (position, velocity, torque, reference_position, reference_velocity)
-        return self._sink.put(stamp_ns, *motion, cycle, lateness_ns, compute_ns, valid, age, lost)
+        self.lateness.add(cycle.lateness_ns)
+        self.compute.add(cycle.compute_ns)
+        return self._sink.put(cycle)
 
     def event(self, stamp_ns: int, level: int, message: str) -> bool:
         """Record one line of the story; a state is told to the parent too."""

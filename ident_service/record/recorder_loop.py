@@ -36,9 +36,10 @@ from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 from ident_service.errors import IdentError, RecordingError
+from ident_service.record.cycle import Cycle
 from ident_service.record.ring import RingReader
 from ident_service.record.ring_memory import Closed
-from ident_service.record.ring_slot import CycleRecord, Record
+from ident_service.record.ring_slot import Record
 from ident_service.record.writer import RecordingWriter
 
 IGNORED: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -149,8 +150,8 @@ class Drain:
             self._lost = self._reader.lost
             text = f"{missing} records before this were lost: the recorder was overrun"
             self._writer.event(record.stamp_ns, _ERROR_LEVEL, text)
-        if isinstance(record, CycleRecord):
-            self._writer.sample(*record)
+        if isinstance(record, Cycle):
+            self._writer.sample(record)
             self._samples += 1
         else:
             self._writer.event(*record)

@@ -25,14 +25,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ident_service.errors import RecordingError
+from ident_service.record.cycle import Cycle
 from ident_service.record.recorder_loop import IGNORED, RecorderReport
 from ident_service.record.ring import SLOTS, create_ring
 from ident_service.record.ring_sink import SHARE, RingSink, SinkEnds
-from ident_service.record.ring_slot import Vector
 from ident_service.record.writer import RecordingWriter
 
 _START_S: Final = 60.0
@@ -41,7 +38,7 @@ _FAREWELL_S: Final = 10.0
 
 
 class RecorderProcess:
-    """A context manager, used as `Recorder` is: entering starts the process and opens the file, leaving finishes both.
+    """A context manager: entering starts the process and opens the file, leaving finishes both.
 
     Attributes:
         report: how the recording ended, None until it has, or where the process died.
@@ -157,36 +154,9 @@ class RecorderProcess:
         """Of the recorder's process, 0 when there is none."""
         return 0 if self._process is None else self._process.pid
 
-    def put(
-        self,
-        stamp_ns: int,
-        position: Vector,
-        velocity: Vector | None,
-        torque: Vector,
-        reference_position: Vector,
-        reference_velocity: Vector,
-        cycle: int,
-        lateness_ns: int,
-        compute_ns: int,
-        valid: NDArray[np.bool_],
-        age: NDArray[np.int64],
-        lost: int,
-    ) -> bool:
+    def put(self, cycle: Cycle) -> bool:
         """Record one cycle; see `RingSink.put`."""
-        return self._open_sink().put(
-            stamp_ns,
-            position,
-            velocity,
-            torque,
-            reference_position,
-            reference_velocity,
-            cycle,
-            lateness_ns,
-            compute_ns,
-            valid,
-            age,
-            lost,
-        )
+        return self._open_sink().put(cycle)
 
     def event(self, stamp_ns: int, level: int, message: str) -> bool:
         """Record one event; see `RingSink.event`."""

@@ -29,13 +29,13 @@ from types import TracebackType
 from typing import Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ident_service.errors import UsageError
 from ident_service.record import ring_memory as at
 from ident_service.record import ring_slot as slot
+from ident_service.record.cycle import Cycle
 from ident_service.record.ring_memory import Closed, RingMemory, State
-from ident_service.record.ring_slot import Record, Vector
+from ident_service.record.ring_slot import Record
 
 SLOTS: Final = 8192  # eight seconds at 1 kHz; 4 MiB for up to eight joints
 
@@ -85,27 +85,15 @@ class RingWriter:
         self._cycle_body = whole[slot.BODY : slot.BODY + self._cycle_bytes]
         self._cycle = whole[: slot.BODY + self._cycle_bytes]
 
-    def put(
-        self,
-        stamp_ns: int,
-        position: Vector,
-        velocity: Vector | None,
-        torque: Vector,
-        reference_position: Vector,
-        reference_velocity: Vector,
-        cycle: int,
-        lateness_ns: int,
-        compute_ns: int,
-        valid: NDArray[np.bool_],
-        age: NDArray[np.int64],
-        lost: int,
-    ) -> None:
-        """Write one cycle; the arguments are those of `RecordingWriter.sample`, and arrays are copied.
+    def put(self, cycle: Cycle) -> None:
+        """Write one cycle; its arrays are copied.
 
         Raises:
             ValueError: an array of another shape.
             struct.error: an integer beyond 64 bits.
         """
+        stamp_ns, position, velocity, torque, reference_position, reference_velocity = cycle[:6]
+        number, lateness_ns, compute_ns, valid, age, lost = cycle[6:]
         if not (
             self._shape == position.shape == torque.shape == reference_position.shape == reference_velocity.shape
             and self._shape == valid.shape == age.shape
@@ -125,7 +113,7 @@ class RingWriter:
         stage = self._stage
         kind = slot.CYCLE if velocity is None else slot.CYCLE_WITH_VELOCITY
         slot.HEAD.pack_into(stage, slot.BODY, self.written, kind, 0, stamp_ns)
-        slot.TIMING.pack_into(stage, slot.AT_TIMING, cycle, lateness_ns, compute_ns, lost)
+        slot.TIMING.pack_into(stage, slot.AT_TIMING, number, lateness_ns, compute_ns, lost)
         slot.CHECK.pack_into(stage, 0, zlib.crc32(self._cycle_body), self._cycle_bytes)
         self._publish(self._cycle)
 

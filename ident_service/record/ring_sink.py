@@ -22,14 +22,11 @@ from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ident_service.errors import RecordingError
 from ident_service.record import ring_memory as at
+from ident_service.record.cycle import Cycle
 from ident_service.record.ring import RingWriter
 from ident_service.record.ring_memory import State
-from ident_service.record.ring_slot import Vector
 
 SHARE: Final = 0.5
 SILENCE_NS: Final = 2_000_000_000
@@ -112,22 +109,8 @@ class RingSink:
             return self.writer.memory.text()
         return self._gone
 
-    def put(
-        self,
-        stamp_ns: int,
-        position: Vector,
-        velocity: Vector | None,
-        torque: Vector,
-        reference_position: Vector,
-        reference_velocity: Vector,
-        cycle: int,
-        lateness_ns: int,
-        compute_ns: int,
-        valid: NDArray[np.bool_],
-        age: NDArray[np.int64],
-        lost: int,
-    ) -> bool:
-        """Record one cycle; the arguments are those of `RecordingWriter.sample`, and arrays are copied.
+    def put(self, cycle: Cycle) -> bool:
+        """Record one cycle; its arrays are copied.
 
         In lock step this may wait for the recorder; otherwise it never does.
 
@@ -138,20 +121,7 @@ class RingSink:
             RecordingError: a value that does not fit the ring; in lock step also a recorder that failed or died.
         """
         try:
-            self.writer.put(
-                stamp_ns,
-                position,
-                velocity,
-                torque,
-                reference_position,
-                reference_velocity,
-                cycle,
-                lateness_ns,
-                compute_ns,
-                valid,
-                age,
-                lost,
-            )
+            self.writer.put(cycle)
         except (ValueError, struct.error) as error:
             raise RecordingError(self._path, f"recording failed: {error}") from error
         return self._wait() if self._lock_step else self._kept()

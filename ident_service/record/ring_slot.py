@@ -28,9 +28,8 @@ import zlib
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Vector = NDArray[np.float64]
+from ident_service.record.cycle import Cycle
 
 CYCLE_WITH_VELOCITY: Final = 1
 CYCLE: Final = 2
@@ -49,23 +48,6 @@ _LEAST_BYTES: Final = 512  # room for a sentence even where an arm has one joint
 _CUT: Final = b" [cut]"
 
 
-class CycleRecord(NamedTuple):
-    """One cycle, in the order of `RecordingWriter.sample`'s arguments, which says what they are; arrays read-only."""
-
-    stamp_ns: int
-    position: Vector
-    velocity: Vector | None
-    torque: Vector
-    reference_position: Vector
-    reference_velocity: Vector
-    cycle: int
-    lateness_ns: int
-    compute_ns: int
-    valid: NDArray[np.bool_]
-    age: NDArray[np.int64]
-    lost: int
-
-
 class EventRecord(NamedTuple):
     """One event, in the order of `RecordingWriter.event`'s arguments."""
 
@@ -74,7 +56,7 @@ class EventRecord(NamedTuple):
     message: str
 
 
-Record = CycleRecord | EventRecord
+Record = Cycle | EventRecord
 
 
 def cycle_bytes(joints: int) -> int:
@@ -112,7 +94,7 @@ def decode(content: bytes, number: int, joints: int) -> Record | None:
     age = np.frombuffer(content, np.int64, joints, AT_VECTORS + 40 * joints)
     valid = np.frombuffer(content, np.bool_, joints, AT_VECTORS + 48 * joints)
     velocity = vectors[1] if kind == CYCLE_WITH_VELOCITY else None
-    return CycleRecord(
+    return Cycle(
         *(stamp_ns, vectors[0], velocity, vectors[2], vectors[3], vectors[4]),
         *(cycle, lateness_ns, compute_ns, valid, age, lost),
     )

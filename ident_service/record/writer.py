@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from ident_service import __version__
 from ident_service.errors import RecordingError, UsageError
 from ident_service.record.cdr import CycleEncoder, JointStateEncoder, encode_log, encode_string
+from ident_service.record.cycle import Cycle
 from ident_service.record.messages import DEFINITIONS, TOPICS
 
 METADATA_NAME: Final = "ident"
@@ -147,47 +148,23 @@ class RecordingWriter:
                 raise
             error.add_note(f"the recording could not be finished either: {second}")
 
-    def sample(
-        self,
-        stamp_ns: int,
-        position: Vector,
-        velocity: Vector | None,
-        torque: Vector,
-        reference_position: Vector,
-        reference_velocity: Vector,
-        cycle: int,
-        lateness_ns: int,
-        compute_ns: int,
-        valid: NDArray[np.bool_],
-        age: NDArray[np.int64],
-        lost: int,
-    ) -> None:
+    def sample(self, cycle: Cycle) -> None:
         """Write one cycle to `/joint_states`, `/joint_commands` and `/cycle`.
-
-        Args:
-            stamp_ns: monotonic time of the positions [ns].
-            position: measured [rad or m], shape (joints,).
-            velocity: measured by the drive [rad/s or m/s], shape (joints,), or None where it gives none.
-            torque: acts from this stamp until the next one [N m or N], shape (joints,).
-            reference_position: asked for [rad or m], shape (joints,).
-            reference_velocity: asked for [rad/s or m/s], shape (joints,).
-            cycle: number of the cycle.
-            lateness_ns: how late the cycle began [ns].
-            compute_ns: how long it computed [ns].
-            valid: which axes answered, shape (joints,).
-            age: cycles since each answered, shape (joints,).
-            lost: frames lost so far.
 
         Raises:
             RecordingError: the file cannot be written.
             ValueError: an array of another shape.
         """
-        utc_ns = stamp_ns + self._utc_offset_ns
-        state = self._states.encode(utc_ns, position, velocity, torque)
-        command = self._states.encode(utc_ns, reference_position, reference_velocity, None)
-        timing = self._cycles.encode(utc_ns, cycle, lateness_ns, compute_ns, valid, age, lost)
+        utc_ns = cycle.stamp_ns + self._utc_offset_ns
+        state = self._states.encode(utc_ns, cycle.position, cycle.velocity, cycle.torque)
+        command = self._states.encode(utc_ns, cycle.reference_position, cycle.reference_velocity, None)
+        timing = self._cycles.encode(
+            utc_ns, cycle.cycle, cycle.lateness_ns, cycle.compute_ns, cycle.valid, cycle.age, cycle.lost
+        )
         self._add(
-            stamp_ns, (("/joint_states", state), ("/joint_commands", command), ("/cycle", timing)), sequence=cycle
+            cycle.stamp_ns,
+            (("/joint_states", state), ("/joint_commands", command), ("/cycle", timing)),
+            sequence=cycle.cycle,
         )
 
     def event(self, stamp_ns: int, level: int, message: str) -> None:

@@ -24,8 +24,7 @@ from ident_service.motion.factory import make_arm
 from ident_service.motion.run import RunReport, run
 from ident_service.motion.states import State
 from ident_service.record.open import open_recording
-from ident_service.record.recorder import Recorder
-from ident_service.record.writer import RecordingWriter
+from ident_service.record.recorder_process import RecorderProcess
 from ident_service.results.files import appearing_folder, write_atomically
 from ident_service.results.run_folder import write_manifest, write_results
 from ident_service.service.score import Score, score, true_parameters
@@ -78,8 +77,16 @@ def record_motion(
     }
     metadata = {"arm": model.config.name, "arm_sha256": model.config.sha256, "motion": motion.name}
     description = urdf_text(model, model.prior)
-    writer = RecordingWriter(path, model.chain.names, description, arm.clock.utc_offset_ns, attachments, metadata)
-    with arm, Recorder(writer, lock_step=arm.clock.lock_step) as recorder:
+    recorder = RecorderProcess(
+        path,
+        model.chain.names,
+        description,
+        arm.clock.utc_offset_ns,
+        attachments,
+        metadata,
+        lock_step=arm.clock.lock_step,
+    )
+    with arm, recorder:
         return run(arm, model, motion, recorder, StopWhen(stop_requested))
 
 

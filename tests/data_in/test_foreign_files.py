@@ -14,6 +14,7 @@ from made_recordings import MadeRecording, moving, whole, write_bag
 
 from ident_service.config.recording import RecordingFormat, Transmission
 from ident_service.errors import RecordingError, UsageError
+from ident_service.record.cycle import Cycle
 from ident_service.record.open import open_recording
 from ident_service.record.recording import Block
 from ident_service.record.transmission import JointSideRecording
@@ -85,7 +86,7 @@ def test_own_recordings_need_no_format(tmp_path: Path) -> None:
     path, q = tmp_path / "run.mcap", np.array([1.0, 2.0])
     with RecordingWriter(path, ["one", "two"], "<robot/>", 0) as writer:
         for k in range(3):
-            writer.sample(k + 1, q, None, q + 2.0, q, q, k, 0, 0, np.ones(2, bool), np.zeros(2, int), 0)
+            writer.sample(Cycle(k + 1, q, None, q + 2.0, q, q, k, 0, 0, np.ones(2, bool), np.zeros(2, int), 0))
     form = RecordingFormat(topic="/arm", joint_names={"one": "axis_1"}, side="motor")
     recording = open_recording(path, ["two", "one"], fmt=form, transmission=COUPLED)
     assert recording.joint_names == ("two", "one")

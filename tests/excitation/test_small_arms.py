@@ -16,16 +16,15 @@ from ident_service.motion.factory import make_arm
 from ident_service.motion.run import RunReport, run
 from ident_service.motion.states import State
 from ident_service.record.open import open_recording
-from ident_service.record.recorder import Recorder
-from ident_service.record.writer import RecordingWriter
+from ident_service.record.recorder_process import RecorderProcess
 
 
 def recorded(model: ArmModel, purpose: str, path: Path) -> RunReport:
     """Run one motion of an arm and keep it."""
     arm = make_arm(model.config)
     motion = excitation(model, purpose)  # type: ignore[arg-type]
-    writer = RecordingWriter(path, model.chain.names, '<robot name="x"/>', 0)
-    with arm, Recorder(writer, lock_step=arm.clock.lock_step) as sink:
+    recorder = RecorderProcess(path, model.chain.names, '<robot name="x"/>', 0, lock_step=arm.clock.lock_step)
+    with arm, recorder as sink:
         return run(arm, model, motion, sink)
 
 

@@ -24,7 +24,7 @@ from ident_service.motion.faults import FAULTS
 from ident_service.motion.latch import Latch
 from ident_service.motion.run import run
 from ident_service.motion.states import State
-from ident_service.record.recorder import Recorder
+from ident_service.record.cycle import Cycle
 from ident_service.record.writer import RecordingWriter
 from sim_backend.arm import SimulatedArm, Truth, from_config
 from sim_backend.faults import Fault, FaultKind
@@ -157,16 +157,16 @@ class Outcome:
 class _Both:
     """A sink that keeps a story beside a recording."""
 
-    def __init__(self, story: Story, recorder: Recorder) -> None:
-        self._story, self._recorder = story, recorder
+    def __init__(self, story: Story, writer: RecordingWriter) -> None:
+        self._story, self._writer = story, writer
 
-    def put(self, *arguments: Any) -> bool:
-        self._story.put(*arguments)
-        return self._recorder.put(*arguments)
+    def put(self, cycle: Cycle) -> bool:
+        self._writer.sample(cycle)
+        return self._story.put(cycle)
 
-    def event(self, *arguments: Any) -> bool:
-        self._story.event(*arguments)
-        return self._recorder.event(*arguments)
+    def event(self, stamp_ns: int, level: int, message: str) -> bool:
+        self._writer.event(stamp_ns, level, message)
+        return self._story.event(stamp_ns, level, message)
 
 
 def play(which: Subject, state: State, faults: tuple[Fault, ...], path: Path | None) -> Outcome:
@@ -183,9 +183,8 @@ def play(which: Subject, state: State, faults: tuple[Fault, ...], path: Path | N
                 run(arm, which.model, which.motion, story, script, **options)
         else:
             text = urdf_text(which.model, which.model.prior)
-            writer = RecordingWriter(path, which.model.chain.names, text, 0, {}, {})
-            with arm, Recorder(writer, lock_step=True) as recorder:
-                run(arm, which.model, which.motion, _Both(story, recorder), script, **options)
+            with arm, RecordingWriter(path, which.model.chain.names, text, 0) as writer:
+                run(arm, which.model, which.motion, _Both(story, writer), script, **options)
     except ArmFault as error:
         fault = error
     return Outcome(story, arm, truth, latch, fault)

@@ -14,6 +14,7 @@ from ident_service.config.schema import ArmConfig
 from ident_service.excitation.excitation import Excitation
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.record.cycle import Cycle
 from sim_backend.arm import SimulatedArm, Truth, from_config
 from sim_backend.faults import Fault
 
@@ -116,23 +117,8 @@ class Story:
     misbehave: Callable[[int], bool] = lambda count: True
     at_event: Callable[[str], None] = lambda message: None
 
-    def put(
-        self,
-        stamp_ns: int,
-        position: Array,
-        velocity: Array | None,
-        torque: Array,
-        reference_position: Array,
-        reference_velocity: Array,
-        cycle: int,
-        lateness_ns: int,
-        compute_ns: int,
-        valid: Array,
-        age: Array,
-        lost: int,
-    ) -> bool:
-        kept = {name: value for name, value in locals().items() if name != "self"}
-        self.samples.append(kept)
+    def put(self, cycle: Cycle) -> bool:
+        self.samples.append(cycle._asdict())
         return self.misbehave(len(self.samples))
 
     def event(self, stamp_ns: int, level: int, message: str) -> bool:

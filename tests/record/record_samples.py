@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ident_service.record.cycle import Cycle
 from ident_service.record.recording import Block, Recording
 from ident_service.record.writer import RecordingWriter
 
@@ -26,18 +27,20 @@ def write_samples(writer: RecordingWriter, count: int, *, velocity: bool = False
     for k in range(first, first + count):
         q = position(k, joints)
         writer.sample(
-            START_NS + k * STEP_NS,
-            q,
-            q + 10.0 if velocity else None,
-            q + 20.0,
-            q + 30.0,
-            q + 40.0,
-            k,
-            100 + k,
-            200 + k,
-            np.arange(joints) != 1,
-            np.arange(joints) + k,
-            k // 2,
+            Cycle(
+                START_NS + k * STEP_NS,
+                q,
+                q + 10.0 if velocity else None,
+                q + 20.0,
+                q + 30.0,
+                q + 40.0,
+                k,
+                100 + k,
+                200 + k,
+                np.arange(joints) != 1,
+                np.arange(joints) + k,
+                k // 2,
+            )
         )
 
 

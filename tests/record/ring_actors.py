@@ -18,10 +18,11 @@ from pathlib import Path
 
 import numpy as np
 
+from ident_service.record.cycle import Cycle
 from ident_service.record.recorder_process import RecorderProcess
 from ident_service.record.ring import RingReader, RingWriter
 from ident_service.record.ring_sink import RingSink, SinkEnds
-from ident_service.record.ring_slot import CycleRecord, EventRecord, Record
+from ident_service.record.ring_slot import EventRecord, Record
 
 JOINTS = ("shoulder", "elbow", "wrist_roll")
 STEP_NS = 1_000_000
@@ -34,7 +35,7 @@ def record(n: int, joints: int = 3) -> Record:
     q = np.arange(joints) * 0.1 + n
     velocity = None if n % 3 == 0 else q * 2.0
     valid = (np.arange(joints) + n) % 2 == 0
-    return CycleRecord(
+    return Cycle(
         n * STEP_NS, q, velocity, -q, q * 3.0, q * 4.0, n, n % 11, n % 13, valid, np.arange(joints) + n, n // 2
     )
 
@@ -42,7 +43,7 @@ def record(n: int, joints: int = 3) -> Record:
 def store(writer: RingWriter | RingSink | RecorderProcess, n: int, joints: int = 3) -> object:
     """Put record `n`."""
     made = record(n, joints)
-    return writer.put(*made) if isinstance(made, CycleRecord) else writer.event(*made)
+    return writer.put(made) if isinstance(made, Cycle) else writer.event(*made)
 
 
 def same(one: Record, other: Record) -> bool:

@@ -25,6 +25,7 @@ from record_samples import (
 
 from ident_service.errors import RecordingError, UsageError
 from ident_service.record.cdr import JointStateEncoder
+from ident_service.record.cycle import Cycle
 from ident_service.record.mcap_file import McapRecording
 from ident_service.record.messages import DEFINITIONS, JOINT_STATE
 from ident_service.record.open import open_recording
@@ -195,7 +196,7 @@ def test_bad_samples_are_named(tmp_path: Path) -> None:
             for k in range(10):
                 q = np.array([0.0, value if k == 5 else 0.0])
                 stamp = START_NS + (k if k != 5 else 4) * STEP_NS + (step if k == 5 else 0)
-                writer.sample(stamp, q, None, q, q, q, k, 0, 0, np.ones(2, bool), np.zeros(2, int), 0)
+                writer.sample(Cycle(stamp, q, None, q, q, q, k, 0, 0, np.ones(2, bool), np.zeros(2, int), 0))
         expected = "position of joint b is nan" if name == "nan" else "the stamp does not increase"
         for samples in (1, 3, 4096):
             with pytest.raises(RecordingError, match=rf"sample 5, 0\.00\d+ s after the first: {expected}"):

@@ -20,12 +20,11 @@ from ring_actors import JOINTS, STEP_NS, command, holders, inode, record, store
 
 from ident_service.errors import RecordingError, UsageError
 from ident_service.record import ring_memory
+from ident_service.record.cycle import Cycle
 from ident_service.record.mcap_file import McapRecording
-from ident_service.record.recorder import Recorder
 from ident_service.record.recorder_process import RecorderProcess
 from ident_service.record.ring import RingReader
 from ident_service.record.ring_sink import RingSink
-from ident_service.record.ring_slot import CycleRecord
 from ident_service.record.writer import RecordingWriter
 
 URDF = "<robot/>"
@@ -83,8 +82,8 @@ def caught_up(recorder: RecorderProcess) -> None:
             time.sleep(0.001)
 
 
-def cycles(count: int) -> list[CycleRecord]:
-    return [made for made in map(record, range(count)) if isinstance(made, CycleRecord)]
+def cycles(count: int) -> list[Cycle]:
+    return [made for made in map(record, range(count)) if isinstance(made, Cycle)]
 
 
 def check_prefix(path: Path, recorder_torn: bool) -> int:
@@ -126,12 +125,14 @@ def ending(pid: int) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("lock_step", [False, True])
-def test_the_file_is_the_same_to_the_byte_as_from_the_recorder_in_process(tmp_path: Path, lock_step: bool) -> None:
-    writer = RecordingWriter(tmp_path / "in", *WHAT)
-    with Recorder(writer, lock_step=True) as inside:
+def test_the_file_is_the_same_to_the_byte_as_from_a_writer_in_process(tmp_path: Path, lock_step: bool) -> None:
+    with RecordingWriter(tmp_path / "in", *WHAT) as inside:
         for n in range(3000):
             made = record(n)
-            assert inside.put(*made) if isinstance(made, CycleRecord) else inside.event(*made)
+            if isinstance(made, Cycle):
+                inside.sample(made)
+            else:
+                inside.event(*made)
     with process(tmp_path / "out", lock_step=lock_step) as outside:
         number = inode(outside.ends.ring)
         assert holders(number) == {os.getpid(), outside.pid}
@@ -304,7 +305,7 @@ def test_a_wrong_shape_is_an_error_and_finishes_the_file(tmp_path: Path, lock_st
     def loop() -> None:
         with process(tmp_path / "run", lock_step=lock_step) as recorder:
             store(recorder, 0)
-            recorder.put(*(np.zeros(2) if k == 1 else value for k, value in enumerate(record(1))))
+            recorder.put(cycles(2)[1]._replace(position=np.zeros(2)))
 
     with pytest.raises(RecordingError, match=r"recording failed: .* the ring has 3 joints"):
         loop()
@@ -317,7 +318,7 @@ def test_what_the_writer_refuses_reaches_the_loop(tmp_path: Path) -> None:
     def loop() -> None:
         with process(tmp_path / "run", lock_step=True, share=0.0) as recorder:
             store(recorder, 0)
-            recorder.put(*record(1)[:-1], 1 << 40)
+            recorder.put(cycles(2)[1]._replace(lost=1 << 40))
 
     with pytest.raises(RecordingError, match="recording failed: "):
         loop()

@@ -21,9 +21,10 @@ from ring_actors import command, holders, inode, record, same, store
 
 from ident_service.errors import UsageError
 from ident_service.record import ring_memory
+from ident_service.record.cycle import Cycle
 from ident_service.record.ring import RingReader, RingWriter, create_ring
 from ident_service.record.ring_memory import Closed
-from ident_service.record.ring_slot import CycleRecord, EventRecord, slot_bytes
+from ident_service.record.ring_slot import EventRecord, slot_bytes
 
 Store = tuple[int, bytes]
 
@@ -126,11 +127,12 @@ def test_any_bits_of_a_float_survive(ring: Callable[..., int]) -> None:
     writer = RingWriter(fd)
     bits = np.array([0x7FF0000000000001, 0xFFF8123456789ABC, 0x8000000000000000], np.uint64)
     q, flags, ages = bits.view(np.float64), np.ones(3, bool), np.array([-1, 2**62, 0])
-    writer.put(-(2**63), q, q, q, q, q, 2**63 - 1, -1, -2, flags, ages, 7)
+    extreme = Cycle(-(2**63), q, q, q, q, q, 2**63 - 1, -1, -2, flags, ages, 7)
+    writer.put(extreme)
     with RingReader(fd) as reader:
         found = reader.read()
-        assert isinstance(found, CycleRecord)
-        assert same(found, CycleRecord(-(2**63), q, q, q, q, q, 2**63 - 1, -1, -2, flags, ages, 7))
+        assert isinstance(found, Cycle)
+        assert same(found, extreme)
         assert not found.position.flags.writeable
     writer.memory.close()
 
@@ -201,20 +203,19 @@ def test_one_writer_and_one_recorder(ring: Callable[..., int]) -> None:
 def test_wrong_values_are_refused_and_leave_no_record(ring: Callable[..., int]) -> None:
     fd = ring()
     writer = RingWriter(fd)
-    good = list(record(1))
-    for place, value in (
-        (1, np.zeros(2)),
-        (2, np.zeros(4)),
-        (3, np.float64(1.0)),
-        (9, np.ones((3, 1))),
-        (10, np.ones(1)),
+    good = record(1)
+    assert isinstance(good, Cycle)
+    for name, value in (
+        ("position", np.zeros(2)),
+        ("velocity", np.zeros(4)),
+        ("torque", np.float64(1.0)),
+        ("valid", np.ones((3, 1))),
+        ("age", np.ones(1)),
     ):
-        bad = list(good)
-        bad[place] = value
         with pytest.raises(ValueError, match="but the ring has 3 joints"):
-            writer.put(*bad)
+            writer.put(good._replace(**{name: value}))
     with pytest.raises((struct.error, OverflowError), match=r"int too large|argument out of range"):
-        writer.put(*good[:6], 2**70, *good[7:])
+        writer.put(good._replace(cycle=2**70))
     with RingReader(fd) as reader:
         assert reader.read() is None
         for n in range(2):

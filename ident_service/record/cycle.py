@@ -1,0 +1,45 @@
+"""One cycle as it is recorded: what passes from the motion loop through the ring to the file.
+
+Boundary: the record's fields and what they mean. A named tuple, because the loop makes one every millisecond.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+
+
+class Cycle(NamedTuple):
+    """One cycle; whoever keeps it longer than the call it was handed over in copies the arrays.
+
+    Attributes:
+        stamp_ns: monotonic time of the positions [ns].
+        position: measured [rad or m], shape (joints,).
+        velocity: measured by the drive [rad/s or m/s], shape (joints,), or None where it gives none.
+        torque: acts from this stamp until the next one [N m or N], shape (joints,).
+        reference_position: asked for [rad or m], shape (joints,).
+        reference_velocity: asked for [rad/s or m/s], shape (joints,).
+        cycle: its number.
+        lateness_ns: how late it began [ns].
+        compute_ns: how long it computed [ns].
+        valid: which axes answered, shape (joints,).
+        age: cycles since each answered, shape (joints,).
+        lost: frames lost so far.
+    """
+
+    stamp_ns: int
+    position: Vector
+    velocity: Vector | None
+    torque: Vector
+    reference_position: Vector
+    reference_velocity: Vector
+    cycle: int
+    lateness_ns: int
+    compute_ns: int
+    valid: NDArray[np.bool_]
+    age: NDArray[np.int64]
+    lost: int
