@@ -8,10 +8,12 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from ident_service.config import design, recording, simulation, workspace
+from ident_service.config import canopen, design, recording, simulation, workspace
+from ident_service.config.canopen import CanopenDriver
+from ident_service.config.drivers import SimulatedDriver
 from ident_service.config.quantities import Section
 from ident_service.config.recording import RecordingFormat
-from ident_service.config.schema import ArmConfig, DHTable, FourierMotion, SimulatedDriver
+from ident_service.config.schema import ArmConfig, DHTable, FourierMotion
 from ident_service.config.source import KeyPath, Tree, read_tree
 from ident_service.errors import ConfigError, Problem, UsageError
 
@@ -126,6 +128,8 @@ def _disagreements(config: ArmConfig) -> Iterator[tuple[KeyPath, str]]:
             if isinstance(given, tuple) and len(given) != len(names):
                 yield ("driver", key), f"driver.{key}: {len(given)} values for {len(names)} joints"
         yield from simulation.disagreements(config.driver, names)
+    if isinstance(config.driver, CanopenDriver):
+        yield from canopen.disagreements(config.driver, config.transmission, names)
     yield from recording.disagreements(config.recording, config.transmission, names)
     yield from workspace.disagreements(config.geometry, config.workspace, config.supply, names)
     yield from design.disagreements(config.design, names)

@@ -63,6 +63,8 @@ Positive = Annotated[float, Field(gt=0, strict=True)]
 NonNegative = Annotated[float, Field(ge=0, strict=True)]
 Interval = Annotated[tuple[Angle, Angle], AfterValidator(_ordered)]
 Vector3 = tuple[Number, Number, Number]
+Seed = Annotated[int, Field(strict=True, ge=0)]
+PerJoint = NonNegative | tuple[NonNegative, ...]
 
 
 class TextFile(Section):

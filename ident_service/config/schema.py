@@ -7,11 +7,12 @@ SI units; angles in radians. Tables 2, 4, 5 and 7 and eqs. 25, 26, 28 of Sousa &
 from __future__ import annotations
 
 import hashlib
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Discriminator, Field, Tag, model_validator
+from pydantic import Field, model_validator
 
 from ident_service.config.design import Design
+from ident_service.config.drivers import Driver
 from ident_service.config.quantities import (
     Angle,
     Count,
@@ -21,18 +22,16 @@ from ident_service.config.quantities import (
     ParameterTable,
     Positive,
     Section,
+    Seed,
     TextBeside,
     Vector3,
 )
 from ident_service.config.recording import RecordingFormat, Transmission
-from ident_service.config.simulation import SimulatedFault
 from ident_service.config.workspace import Geometry, Supply, Workspace
 
 JointTerm = Literal["drive_inertia", "viscous", "coulomb", "offset", "stribeck", "quadratic", "viscous_asymmetry"]
 FeasibleSetName = Literal["pseudo_inertia", "inertia"]
 Method = Literal["ols", "wls", "huber", "iv"]
-Seed = Annotated[int, Field(strict=True, ge=0)]
-PerJoint = NonNegative | tuple[NonNegative, ...]
 
 
 class DHRow(Section):
@@ -288,50 +287,6 @@ class Motions(Section):
 
     identification: Motion = SeededMotion(kind="seeded", seed=1)
     validation: Motion = SeededMotion(kind="seeded", seed=2)
-
-
-class SimulatedDriver(Section):
-    """The simulated arm: true parameters and imperfections, all per joint or one number for all.
-
-    `process` says where its plant lives; `bus` names a separate one that other processes may ask for, `status` the file
-    it reports to, `deadline` [s] how long an answer of it may take. `watchdog` [s] without a torque frame makes
-    the drives idle; idle drives brake with `braking` [N m s/rad].
-    """
-
-    kind: Literal["simulated"]
-    time: Literal["virtual", "real"] = "virtual"
-    process: Literal["own", "separate"] = "own"
-    bus: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")] | None = None
-    status: str | None = None
-    deadline: Positive | None = None
-    seed: Seed = 0
-    truth: ParameterTable | None = None
-    encoder_resolution: PerJoint = 0.0
-    torque_resolution: PerJoint = 0.0
-    torque_noise: PerJoint = 0.0
-    delay_cycles: Annotated[Count, Field(le=100)] = 1
-    watchdog: Positive = 0.01
-    braking: PerJoint | None = None
-    faults: tuple[SimulatedFault, ...] = ()
-
-
-class PluginDriver(Section):
-    """A driver that another distribution provides; it checks its own options."""
-
-    model_config = ConfigDict(frozen=True, extra="allow")
-
-    kind: str
-
-
-def _driver_kind(value: Any) -> str:
-    kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
-    return "simulated" if kind == "simulated" else "plugin"
-
-
-# A simulated driver with a mistake must not pass for somebody else's.
-Driver = Annotated[
-    Annotated[SimulatedDriver, Tag("simulated")] | Annotated[PluginDriver, Tag("plugin")], Discriminator(_driver_kind)
-]
 
 
 _MOTION_DEPENDS_ON = (

@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 from ident_service.config.quantities import NonNegative, Number, Positive, Section, Vector3
 
 if TYPE_CHECKING:
-    from ident_service.config.schema import SimulatedDriver
+    from ident_service.config.drivers import SimulatedDriver
 
 
 class FaultKind(Enum):

@@ -1,0 +1,26 @@
+"""One CAN frame, as every layer of this room hands it on."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Frame(NamedTuple):
+    """A data frame with an 11-bit identifier, unless a flag says otherwise (ISO 11898-1).
+
+    Attributes:
+        identifier: COB-ID.
+        data: payload, up to 8 bytes (64 with CAN FD).
+        remote: a remote frame; `data` is empty.
+        error: an error frame of the controller, not of the wire; `identifier` holds the error class bits of
+            linux/can/error.h and `data` its details.
+        extended: a 29-bit identifier, which CANopen never uses.
+        stamp_ns: when it was received, monotonic [ns]; 0 where nobody knows.
+    """
+
+    identifier: int
+    data: bytes = b""
+    remote: bool = False
+    error: bool = False
+    extended: bool = False
+    stamp_ns: int = 0

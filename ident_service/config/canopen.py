@@ -1,0 +1,155 @@
+"""CANopen drives (CiA 301, CiA 402) on one or two buses, as an arm's description names them.
+
+Boundary: data only. Frames and their cost on the wire are `drivers/canopen`, gears and couplings the section
+`transmission` of the arm, whose motors are the drives here, in this order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from ident_service.config.quantities import (
+    Count,
+    ParameterTable,
+    PerJoint,
+    Positive,
+    Section,
+    Seed,
+    TextBeside,
+)
+from ident_service.config.recording import Transmission
+from ident_service.config.simulation import SimulatedFault
+
+NodeId = Annotated[int, Field(strict=True, ge=1, le=127)]
+Unsigned32 = Annotated[int, Field(strict=True, ge=0, le=0xFFFF_FFFF)]
+
+
+class CanBus(Section):
+    """One bus, and who gives access to it.
+
+    `interface` is python-can's name of an interface, or `raw` for a CAN socket of the kernel without python-can, or
+    `lock_step` for emulated drives in this process and in virtual time. `options` go to python-can as they are.
+    """
+
+    interface: Annotated[str, Field(min_length=1)] = "socketcan"
+    channel: str = "can0"
+    bitrate: Count = 1_000_000
+    data_bitrate: Count | None = None
+    options: dict[str, str | int | float | bool] = Field(default_factory=dict)
+
+
+class DriveIdentity(Section):
+    """What object 1018h must answer; what is left out is logged but not compared."""
+
+    vendor: Unsigned32 | None = None
+    product: Unsigned32 | None = None
+    revision: Unsigned32 | None = None
+    serial: Unsigned32 | None = None
+
+
+class CanopenDrive(Section):
+    """One drive and its motor.
+
+    `counts` are those of a motor turn (6064h); `rated_torque` [N m] at the motor is what 6076h is set to, or must be
+    where the drive does not let it be set; a torque is sent in thousandths of it. `torque_scale` is how much torque
+    the motor really gives for one that was asked for. `max_torque` [N m] and `max_speed` [turns per minute] of the
+    motor are set as 6072h and 6080h.
+    """
+
+    node: NodeId
+    bus: Annotated[int, Field(strict=True, ge=0)] = 0
+    identity: DriveIdentity = DriveIdentity()
+    counts: Count = 4096
+    rated_torque: Positive
+    torque_scale: Positive = 1.0
+    max_torque: Positive
+    max_speed: Positive
+
+
+class Heartbeats(Section):
+    """Who says that it lives, how often, and how long the others wait for it [s] (1017h, 1016h)."""
+
+    node: NodeId = 127
+    period: Positive = 0.1
+    drives: Positive = 0.1
+    timeout: Positive = 0.3
+
+
+class Reactions(Section):
+    """What a drive does by itself: option codes of CiA 402, as its manual numbers them."""
+
+    quick_stop: Annotated[int, Field(strict=True)] = 2  # 605Ah: ramp, then switch-on disabled
+    fault: Annotated[int, Field(strict=True)] = 2  # 605Eh: quick-stop ramp
+    abort_connection: Annotated[int, Field(strict=True)] = 3  # 6007h: quick stop
+
+
+class StatusReports(Section):
+    """When a drive sends status word and torque (TPDO2) [s]: on change, but not within `inhibit`, and every `period`."""
+
+    period: Positive = 0.1
+    inhibit: Positive = 0.05
+
+
+class Emulation(Section):
+    """What stands behind emulated drives: an arm with true parameters, noise and faults, as `SimulatedDriver` has."""
+
+    seed: Seed = 0
+    truth: ParameterTable | None = None
+    torque_noise: PerJoint = 0.0
+    braking: PerJoint | None = None
+    faults: tuple[SimulatedFault, ...] = ()
+
+
+class CanopenDriver(Section):
+    """Drives in cyclic synchronous torque mode.
+
+    `torque_frames` says whether up to four drives share a frame, by dummy mapping, or each has its own.
+    `torque_deadline` [s] without torque frames makes a drive stop by itself (1400h:05). `bring_up` [s] is how long all
+    drives together may take for one step to `operation enabled`.
+    """
+
+    kind: Literal["canopen"]
+    eds: TextBeside
+    buses: Annotated[tuple[CanBus, ...], Field(min_length=1, max_length=4)] = (CanBus(),)
+    drives: Annotated[tuple[CanopenDrive, ...], Field(min_length=1)]
+    torque_frames: Literal["shared", "single"] = "shared"
+    torque_deadline: Positive = 0.01
+    bring_up: Positive = 0.5
+    zero: Literal["absolute", "at_home"] = "absolute"
+    heartbeats: Heartbeats = Heartbeats()
+    reactions: Reactions = Reactions()
+    status: StatusReports = StatusReports()
+    emulation: Emulation = Emulation()
+
+    @model_validator(mode="after")
+    def _nodes_apart(self) -> CanopenDriver:
+        places = [(drive.bus, drive.node) for drive in self.drives]
+        for bus, node in places:
+            if bus >= len(self.buses):
+                raise ValueError(f"node {node} is on bus {bus}, but there are {len(self.buses)} (counted from 0)")
+            if node == self.heartbeats.node:
+                raise ValueError(f"node {node} is a drive and the host (heartbeats.node); give the host another number")
+            if places.count((bus, node)) > 1:
+                raise ValueError(f"node {node} stands twice on bus {bus}")
+        return self
+
+
+def disagreements(
+    driver: CanopenDriver, transmission: Transmission | None, joints: Sequence[str]
+) -> Iterator[tuple[tuple[str | int, ...], str]]:
+    """What does not fit an arm of these joints: the place in the arm's file, and what is wrong.
+
+    Args:
+        driver: the section `driver`.
+        transmission: the arm's.
+        joints: names of the arm's joints; none where the file does not name them.
+    """
+    if transmission is None:
+        yield ("driver",), "CANopen drives need the section transmission: gear ratios from joints to motors"
+    elif len(transmission.ratios) != len(driver.drives):
+        yield ("driver", "drives"), f"{len(driver.drives)} drives but {len(transmission.ratios)} ratios in transmission"
+    if joints and len(joints) != len(driver.drives):
+        yield ("driver", "drives"), f"{len(driver.drives)} drives for {len(joints)} joints"
