@@ -87,7 +87,7 @@ class Reactions(Section):
 
 
 class StatusReports(Section):
-    """When a drive sends status word and torque (TPDO2) [s]: on change, but not within `inhibit`, and every `period`."""
+    """When a drive sends status word and torque (TPDO2) [s]: on change, not within `inhibit`, and every `period`."""
 
     period: Positive = 0.1
     inhibit: Positive = 0.05
