@@ -98,6 +98,7 @@ def test_table_6_corrected_meets_the_papers_constraints(wam7: ArmModel, wam7_dat
     assert certify(beta, base, stricter).verdict == "infeasible"
 
 
+@pytest.mark.slow
 def test_on_the_boundary_it_is_undecided_or_proven_but_never_wrong(wam7: ArmModel, wam7_data: Path) -> None:
     base = base_parameters(wam7.chain, wam7.layout)
     tables = table_6(wam7_data)

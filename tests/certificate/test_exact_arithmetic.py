@@ -40,6 +40,7 @@ def test_a_gram_matrix_of_low_rank_is_semidefinite_and_not_definite(factor: Matr
     assert not is_positive_definite(gram(factor))
 
 
+@pytest.mark.slow
 @given(matrices(4, 3), st.fractions(min_value=Fraction(1, 10**12), max_value=1))
 def test_a_gram_matrix_with_the_least_lift_is_definite_and_with_the_least_drop_is_nothing(
     factor: Matrix, lift: Fraction
@@ -54,6 +55,7 @@ def test_a_gram_matrix_with_the_least_lift_is_definite_and_with_the_least_drop_i
     assert not is_positive_semidefinite(dropped)
 
 
+@pytest.mark.slow
 @given(matrices(3, 3), st.lists(small, min_size=3, max_size=3))
 def test_a_negative_direction_is_found(factor: Matrix, direction: list[Fraction]) -> None:
     matrix = [[factor[min(i, j)][max(i, j)] for j in range(3)] for i in range(3)]
@@ -71,6 +73,7 @@ def test_a_zero_pivot_needs_a_zero_row() -> None:
     assert not is_positive_semidefinite([[one, one], [one, one - Fraction(1, 10**30)]])
 
 
+@pytest.mark.slow
 @given(matrices(3, 5), st.lists(small, min_size=5, max_size=5), st.lists(small, min_size=5, max_size=5))
 def test_repaired_values_solve_the_equations_exactly(
     matrix: Matrix, solution: list[Fraction], start: list[Fraction]

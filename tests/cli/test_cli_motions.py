@@ -16,6 +16,8 @@ from typing import Any
 import pytest
 from cli.conftest import Commissioned, Ended, Ident, left_over, quick_arm, run_main
 
+pytestmark = pytest.mark.slow  # designs and whole jobs
+
 FILES = ["arm.svg", "joints.svg", "motion.json", "preview.json", "preview.txt", "search.json"]
 QUICK = ("--starts", 2, "--workers", 1, "--base-frequency", 0.2, "--periods", 2, "--ramp", 1)
 

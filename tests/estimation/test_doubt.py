@@ -35,6 +35,7 @@ def test_it_is_the_jackknife_over_blocks() -> None:
     np.testing.assert_allclose(got / scale, wanted / scale, rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_it_is_calibrated_where_neighbours_are_alike() -> None:
     rng = np.random.default_rng(5)
     samples, blocks, parameters, repetitions = 2400, 60, 4, 300

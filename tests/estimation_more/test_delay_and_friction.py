@@ -157,6 +157,7 @@ def rubbed(model: ArmModel, delta: np.ndarray, presliding: np.ndarray, seconds: 
     )
 
 
+@pytest.mark.slow
 def test_presliding_and_stribeck_velocity_are_found() -> None:
     model, base, delta = rubbing(FIT)
     recording = rubbed(model, delta, PRESLIDING)

@@ -136,6 +136,7 @@ def random_path(seed: int, model: ArmModel) -> Path:
     return FourierPath(FourierSeries(frequency, a * scale, b * scale, postures[0]), 1, ramp)
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1), share=st.sampled_from([None, 0.5, 0.99]))
 def test_nothing_closer_is_found_between_the_samples(seed: int, share: float | None) -> None:

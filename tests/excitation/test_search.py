@@ -39,6 +39,7 @@ def assert_same(one: Found, other: Found) -> None:
         np.testing.assert_array_equal(first.coefficients, second.coefficients)
 
 
+@pytest.mark.slow
 def test_the_same_seed_and_starts_give_the_same_result_to_the_last_bit() -> None:
     found = starts(3)
     assert found.finished == 3

@@ -242,6 +242,7 @@ def test_no_distance_changes_faster_than_the_reach_says(seed: int, joints: int, 
     assert np.all(change <= bound + 1e-7)
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 4))
 def test_no_point_is_farther_from_an_axis_than_the_reach_says(seed: int, joints: int) -> None:
     rng = np.random.default_rng(seed)

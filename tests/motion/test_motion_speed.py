@@ -54,6 +54,7 @@ def test_a_slowed_way_is_the_way_within_slowed_limits() -> None:
         close(slow.at(float(time)), other.at(float(time)))
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(SEEDS, SHARES, FACTORS, st.sampled_from([0.05, 0.2, 0.5, 0.9, 0.99, 1.0]), st.booleans())
 def test_a_change_of_speed_keeps_to_all_limits(seed: int, share: float, one: float, other: float, faster: bool) -> None:

@@ -86,6 +86,7 @@ def test_each_joint_stops_as_soon_as_it_can() -> None:
     assert both.at(alone.duration).velocity[1] == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.slow
 @settings(max_examples=200)
 @given(reached())
 def test_from_every_reachable_state_the_stop_stays_within_all_limits(case: Reached) -> None:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import os
 import random
 import struct
-import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,7 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from ring_actors import command, holders, inode, record, same, store
+from ring_actors import record, same, store
 
 from ident_service.errors import UsageError
 from ident_service.record import ring_memory
@@ -358,56 +356,3 @@ def test_no_order_of_stores_makes_a_wrong_record(seed: int) -> None:
                 os.pwrite(fd, log[k][1], log[k][0])
                 read_rest(reader)
             assert reader.cursor >= 4
-
-
-def campaign(rounds: int, seed: int) -> None:
-    """A writer and two readers in processes of their own; the writer is killed, sometimes a reader too."""
-    chance = random.Random(seed)  # noqa: S311
-    returned = lost = 0
-    for _ in range(rounds):
-        fd = create_ring(3, chance.choice([4, 64, 4096]))
-        number = inode(fd)
-        plan = [("writer", chance.choice([0, 0, 1e-4]))]
-        plan += [("reader", chance.choice([0, 0, 0.003])), ("reader", 0.02)]
-        processes = [
-            subprocess.Popen(command(role, fd, value), pass_fds=[fd], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-            for role, value in plan
-        ]
-        try:
-            with RingReader(fd) as watch:
-                while not watch.memory.words[ring_memory.WRITTEN]:
-                    time.sleep(0.001)
-                time.sleep(chance.uniform(0.0, 0.25))
-                victim = chance.choice([None, None, processes[1]])
-                if victim is not None:
-                    victim.kill()
-                    time.sleep(chance.uniform(0.0, 0.05))
-                processes[0].kill()
-                processes[0].wait()
-                count = watch.memory.words[ring_memory.WRITTEN]
-                count += watch.memory.words[watch.memory.word_of(count)] == 2 * count + 2
-            for process in processes[1:]:
-                said, _ = process.communicate(timeout=60)
-                if process is not victim:
-                    found = json.loads(said)
-                    assert found["wrong"] == 0
-                    assert found["cursor"] == found["returned"] + found["lost"] == count
-                    returned, lost = returned + found["returned"], lost + found["lost"]
-            assert holders(number) == {os.getpid()}
-        finally:
-            for process in processes:
-                process.kill()
-                process.communicate()
-            os.close(fd)
-        assert holders(number) == set()
-    assert returned > 100 * rounds
-    assert lost > 0
-
-
-def test_processes_killed_at_random() -> None:
-    campaign(6, 5)
-
-
-@pytest.mark.slow
-def test_many_processes_killed_at_random() -> None:
-    campaign(25, random.randrange(1 << 32))  # noqa: S311

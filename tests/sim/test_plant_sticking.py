@@ -11,6 +11,7 @@ from sim_backend.arm import from_config
 WEIGHT = 2.0 * 9.81 * 0.4  # of the pendulum at zero [N m]
 
 
+@pytest.mark.slow
 def test_holds_exactly_for_a_minute_inside_the_cone():
     plant = plant_of(pendulum(fc=1.0, fv=0.1, fo=0.2), position=np.array([0.0]))
     torque = np.array([WEIGHT + 0.2 + 0.99])
