@@ -1,0 +1,381 @@
+"""The cyclic plane of one bus: torques in, bytes out; bytes in, the state of every drive out.
+
+Cycle: torque frames and SYNC go out, `begin_cycle` opens it, the frames that are heard go through `receive`, and
+`end_cycle` closes it. A drive answers once a cycle: a second position is a duplicate, one outside a cycle is late, and
+neither is used. What must not be missed is told as events (`take_events`), in words and with a code for the guard.
+
+Boundary: no I/O, no clock, no decision. `receive` takes any frame whatever and never raises; nothing that is received
+changes a torque. This runs in every cycle: `struct` and one look-up by identifier, no arrays.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from drivers.canopen.controller import ControllerState, controller_state, error_words, overflowed
+from drivers.canopen.frame import Frame
+from drivers.canopen.profile import (
+    EMERGENCY,
+    HEARTBEAT,
+    NMT,
+    RPDO2,
+    SDO_REPLY,
+    SDO_REQUEST,
+    SYNC,
+    TPDO1,
+    TPDO2,
+    BusProfile,
+)
+from drivers.canopen.words import (
+    INTERNAL_LIMIT,
+    WARNING,
+    DriveState,
+    NmtCommand,
+    NmtState,
+    emergency_words,
+    nmt_words,
+    state_of,
+)
+from ident_service.errors import DriverError
+
+HOST = 0  # the node of events that are of the bus or the host's own controller
+_POSITION, _STATUS, _CONTROL = struct.Struct("<i"), struct.Struct("<Hh"), struct.Struct("<Hb")
+_EMERGENCY_BYTES = 8
+_MOST_EVENTS = 256  # that wait to be taken; a flood must not eat the memory
+_FOLLOWED = 64  # identifiers of strangers that are remembered
+
+
+class EventCode(StrEnum):
+    """What can happen on a bus beside what is asked for."""
+
+    EMERGENCY = "emergency"
+    EMERGENCY_RESET = "emergency_reset"
+    BOOT_UP = "boot_up"
+    NMT_STATE = "nmt_state"  # another one than before
+    DRIVE_FAULT = "drive_fault"  # fault or fault reaction in the status word
+    DRIVE_STATE = "drive_state"  # any other change of state
+    DRIVE_WARNING = "drive_warning"  # bit 7 of the status word, on or off
+    TORQUE_LIMITED = "torque_limited"  # bit 11, internal limit active, on or off
+    DUPLICATE = "duplicate"
+    LATE = "late"
+    WRONG_LENGTH = "wrong_length"
+    STRANGER = "stranger"  # a frame of nobody who should be on this bus
+    SECOND_HOST = "second_host"  # somebody else sends what only we may
+    CONTROLLER = "controller"  # the host's controller changed its state, or recovered
+    BUS_ERROR = "bus_error"
+    OVERFLOW = "overflow"  # frames were lost in the host's controller
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that happened.
+
+    Attributes:
+        code: what.
+        node: whose; `HOST` for the bus as a whole.
+        words: for people, without the node.
+    """
+
+    code: EventCode
+    node: int
+    words: str
+
+
+@dataclass(frozen=True, slots=True)
+class Emergency:
+    """The latest emergency of a drive: error code, error register (1001h), the vendor's bytes."""
+
+    code: int
+    register: int
+    vendor: bytes
+
+
+@dataclass(slots=True)
+class Drive:
+    """What is known of one drive.
+
+    Attributes:
+        node: its number.
+        position: of the last answer [counts], as a signed number of 32 bits that wraps around.
+        seen: whether it has ever answered.
+        answered: in this cycle.
+        age: cycles since it answered, 0 in a cycle in which it did.
+        answers: positions that were accepted.
+        duplicates: positions that came second in a cycle.
+        late: positions that came outside a cycle.
+        status: the last status word (6041h), None before the first.
+        torque: actual torque with it [per mille of rated torque] (6077h).
+        status_age: cycles since it.
+        nmt: what its last heartbeat said, None before the first.
+        heartbeat_ns: when that was [ns of the link's clock].
+        boots: boot-up messages.
+        emergency: the latest, None before the first and after a reset.
+    """
+
+    node: int
+    position: int = 0
+    seen: bool = False
+    answered: bool = False
+    age: int = 0
+    answers: int = 0
+    duplicates: int = 0
+    late: int = 0
+    status: int | None = None
+    torque: int = 0
+    status_age: int = 0
+    nmt: int | None = None
+    heartbeat_ns: int = 0
+    boots: int = 0
+    emergency: Emergency | None = None
+
+    @property
+    def state(self) -> DriveState:
+        """Of CiA 402, unknown before the first status word."""
+        return DriveState.UNKNOWN if self.status is None else state_of(self.status)
+
+
+@dataclass(slots=True)
+class Counters:
+    """Frames that were received but not used, since the beginning.
+
+    Attributes:
+        ignored: remote frames, 29-bit identifiers, SDO replies and heartbeats of others.
+        wrong_length: frames of a drive with another length than its profile has.
+        strangers: frames of nobody who should be on the bus.
+        errors: error frames of the host's controller.
+        events_lost: events that nobody took before there were too many.
+    """
+
+    ignored: int = 0
+    wrong_length: int = 0
+    strangers: int = 0
+    errors: int = 0
+    events_lost: int = 0
+
+
+@dataclass(slots=True)
+class _Packed:
+    """A torque frame and how its bytes are made."""
+
+    cob_id: int
+    drives: tuple[int, ...]
+    pack: Callable[..., bytes] = field(repr=False)
+
+
+class BusCodec:
+    """The drives of one bus.
+
+    Attributes:
+        profile: what flows.
+        drives: the state of each, in the order of `profile.drives`.
+        controller: state of the host's CAN controller.
+        counters: what was not used.
+    """
+
+    def __init__(self, profile: BusProfile) -> None:
+        self.profile = profile
+        self.drives = tuple(Drive(node) for node in profile.nodes)
+        self.controller = ControllerState.ACTIVE
+        self.counters = Counters()
+        self._open = False
+        self._now_ns = 0
+        self._events: list[Event] = []
+        self._strangers: set[int] = set()
+        self._frames = [
+            _Packed(frame.cob_id, frame.drives, struct.Struct(f"<{len(frame.drives)}h").pack)
+            for frame in profile.torque_frames
+        ]
+        self._sync = Frame(SYNC)
+        self._handlers: dict[int, tuple[Callable[[Drive, Frame], None], Drive]] = {}
+        for drive in self.drives:
+            for base, handler in (
+                (TPDO1, self._on_position),
+                (TPDO2, self._on_status),
+                (EMERGENCY, self._on_emergency),
+                (HEARTBEAT, self._on_heartbeat),
+            ):
+                self._handlers[base + drive.node] = handler, drive
+        # Before streaming these belong to the configuration plane; they are neither used nor strange.
+        self._others = {SDO_REPLY + node for node in profile.nodes} | {SDO_REQUEST + node for node in profile.nodes}
+        self._ours = {NMT, SYNC, HEARTBEAT + profile.host, *(RPDO2 + node for node in profile.nodes)}
+        self._ours |= {frame.cob_id for frame in profile.torque_frames}
+
+    def torque_frames(self, counts: Sequence[int]) -> list[Frame]:
+        """The frames that carry a torque to every drive of this bus.
+
+        Args:
+            counts: of all drives of the arm [per mille of rated torque], in the arm's order.
+
+        Raises:
+            DriverError: a torque that 16 bits do not hold, or too few of them; nothing is to be sent then.
+        """
+        try:
+            return [Frame(one.cob_id, one.pack(*[counts[k] for k in one.drives])) for one in self._frames]
+        except (struct.error, IndexError, TypeError) as error:
+            raise DriverError(f"bus {self.profile.number}: torques {list(counts)} cannot be sent: {error}") from None
+
+    def sync(self) -> Frame:
+        """What starts a cycle: drives latch torques and sample positions."""
+        return self._sync
+
+    def heartbeat(self, state: NmtState = NmtState.OPERATIONAL) -> Frame:
+        """Our own heartbeat, which keeps the drives' watchdogs quiet."""
+        return Frame(HEARTBEAT + self.profile.host, bytes([state]))
+
+    def control_word(self, node: int, word: int, mode: int) -> Frame:
+        """A control word (6040h) and a mode of operation (6060h) for one drive (RPDO2)."""
+        return Frame(RPDO2 + node, _CONTROL.pack(word, mode))
+
+    def nmt(self, command: NmtCommand, node: int = 0) -> Frame:
+        """An NMT command for one node, or for all (0)."""
+        return Frame(NMT, bytes([command, node]))
+
+    def begin_cycle(self, now_ns: int = 0) -> None:
+        """SYNC has been sent: from now on each drive may answer once.
+
+        Args:
+            now_ns: when [ns of the link's clock], for frames that nobody stamped.
+        """
+        self._open, self._now_ns = True, now_ns
+        for drive in self.drives:
+            drive.answered = False
+            drive.age += 1
+            drive.status_age += 1
+
+    def end_cycle(self) -> None:
+        """The deadline has passed: what answers from now on is late."""
+        self._open = False
+
+    @property
+    def complete(self) -> bool:
+        """Whether every drive has answered in this cycle."""
+        return all(drive.answered for drive in self.drives)
+
+    def silent(self, now_ns: int) -> list[int]:
+        """Nodes whose heartbeat has been missing for longer than the configured time, those never heard included."""
+        oldest = now_ns - round(self.profile.heartbeat_timeout * 1e9)
+        return [drive.node for drive in self.drives if drive.nmt is None or drive.heartbeat_ns < oldest]
+
+    def take_events(self) -> list[Event]:
+        """What happened since the last time, oldest first."""
+        if not self._events:
+            return []
+        taken, self._events = self._events, []
+        return taken
+
+    def receive(self, frame: Frame) -> None:
+        """Take one frame, whatever it is; never raises."""
+        if frame.error:
+            self._on_error(frame)
+            return
+        if frame.extended or frame.remote:
+            self.counters.ignored += 1
+            return
+        known = self._handlers.get(frame.identifier)
+        if known is not None:
+            known[0](known[1], frame)
+        else:
+            self._on_other(frame)
+
+    def _on_position(self, drive: Drive, frame: Frame) -> None:
+        if len(frame.data) != _POSITION.size:
+            self._wrong_length(drive, frame, "position", _POSITION.size)
+        elif not self._open:
+            drive.late += 1
+            self._tell(EventCode.LATE, drive.node, "its position came after its cycle")
+        elif drive.answered:
+            drive.duplicates += 1
+            self._tell(EventCode.DUPLICATE, drive.node, "a second position in one cycle")
+        else:
+            (drive.position,) = _POSITION.unpack(frame.data)
+            drive.seen = drive.answered = True
+            drive.age = 0
+            drive.answers += 1
+
+    def _on_status(self, drive: Drive, frame: Frame) -> None:
+        if len(frame.data) != _STATUS.size:
+            self._wrong_length(drive, frame, "status", _STATUS.size)
+            return
+        status, drive.torque = _STATUS.unpack(frame.data)
+        before, drive.status, drive.status_age = drive.status, status, 0
+        if before == status:
+            return
+        state, was = state_of(status), None if before is None else state_of(before)
+        if state is not was:
+            bad = state in (DriveState.FAULT, DriveState.FAULT_REACTION)
+            words = f"{state} (status word {status:04X}h)" + ("" if was is None else f", was {was}")
+            self._tell(EventCode.DRIVE_FAULT if bad else EventCode.DRIVE_STATE, drive.node, words)
+        changed = status ^ (before or 0)
+        if changed & WARNING:
+            self._tell(EventCode.DRIVE_WARNING, drive.node, "warns" if status & WARNING else "warns no longer")
+        if changed & INTERNAL_LIMIT:
+            words = "limits its torque" if status & INTERNAL_LIMIT else "limits its torque no longer"
+            self._tell(EventCode.TORQUE_LIMITED, drive.node, words)
+
+    def _on_emergency(self, drive: Drive, frame: Frame) -> None:
+        data = frame.data
+        if len(data) != _EMERGENCY_BYTES:
+            self._wrong_length(drive, frame, "emergency", _EMERGENCY_BYTES)
+            if len(data) < 2:
+                return
+        # A torn emergency is one nevertheless.
+        code, register, vendor = data[0] | data[1] << 8, data[2] if len(data) > 2 else 0, bytes(data[3:8])
+        if code == 0:
+            drive.emergency = None
+            self._tell(EventCode.EMERGENCY_RESET, drive.node, "error reset")
+        else:
+            drive.emergency = Emergency(code, register, vendor)
+            self._tell(EventCode.EMERGENCY, drive.node, emergency_words(code, register, vendor))
+
+    def _on_heartbeat(self, drive: Drive, frame: Frame) -> None:
+        if len(frame.data) != 1:
+            self._wrong_length(drive, frame, "heartbeat", 1)
+            return
+        state, before = frame.data[0] & 0x7F, drive.nmt  # bit 7 belongs to node guarding
+        drive.nmt, drive.heartbeat_ns = state, frame.stamp_ns or self._now_ns
+        if state == NmtState.BOOT_UP:
+            drive.boots += 1
+            self._tell(EventCode.BOOT_UP, drive.node, "has booted")
+        elif before != state and before is not None:
+            words = f"NMT state {nmt_words(state)}, was {nmt_words(before)}"
+            self._tell(EventCode.NMT_STATE, drive.node, words)
+
+    def _on_other(self, frame: Frame) -> None:
+        identifier = frame.identifier
+        if identifier in self._others:
+            self.counters.ignored += 1
+            return
+        self.counters.strangers += 1
+        if identifier in self._strangers or len(self._strangers) >= _FOLLOWED:
+            return
+        self._strangers.add(identifier)
+        if identifier in self._ours:
+            words = f"somebody else sends frames {identifier:03X}h, which only this host may"
+            self._tell(EventCode.SECOND_HOST, HOST, words)
+        else:
+            self._tell(EventCode.STRANGER, identifier & 0x7F, f"frames {identifier:03X}h of a node that is not ours")
+
+    def _on_error(self, frame: Frame) -> None:
+        self.counters.errors += 1
+        before, self.controller = self.controller, controller_state(frame, self.controller)
+        if self.controller is not before:
+            words = f"the host's CAN controller is {self.controller.name.lower().replace('_', '-')}"
+            self._tell(EventCode.CONTROLLER, HOST, words)
+        if overflowed(frame):
+            self._tell(EventCode.OVERFLOW, HOST, "frames were lost in the host's CAN controller")
+        if words := error_words(frame):
+            self._tell(EventCode.BUS_ERROR, HOST, words)
+
+    def _wrong_length(self, drive: Drive, frame: Frame, what: str, length: int) -> None:
+        self.counters.wrong_length += 1
+        words = f"{what} frame {frame.identifier:03X}h of {len(frame.data)} bytes instead of {length}"
+        self._tell(EventCode.WRONG_LENGTH, drive.node, words)
+
+    def _tell(self, code: EventCode, node: int, words: str) -> None:
+        if len(self._events) >= _MOST_EVENTS:
+            self.counters.events_lost += 1
+            return
+        self._events.append(Event(code, node, words))

@@ -1,0 +1,195 @@
+"""Joints, motors, and the whole numbers that drives speak: counts and thousandths of a rated torque.
+
+With the gear ratios r, the coupling C and the offsets q0 of the arm's transmission (`config/recording.py`):
+
+    q = C^-1 diag(1/r) q_motor + q0,    tau = C^T diag(r) tau_motor,
+
+so that power is the same on both sides. A motor's position is `2 pi (counts - zero)/counts_per_turn`; the torque that
+it really gives for `n` thousandths is `n/1000 rated_torque torque_scale`.
+
+Clipping. Motors that share joints (a differential) are one group. Where one of them is asked for more than it may
+give, all joint torques of its group are scaled by the same factor: the direction is kept, so that no joint of the
+group is pushed the other way, and joints outside the group get all they asked for.
+
+Boundary: pure computation; joints as arrays, what goes over the bus as plain whole numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import pi
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident_service.config.canopen import CanopenDriver
+from ident_service.config.recording import Transmission
+from ident_service.errors import DriverError
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+
+MOST_COUNTS = 32_767  # of a torque, either way: -32768 has no opposite
+_TURN = 1 << 32  # counts after which a position of 32 bits comes round
+_PER_MILLE = 1000.0
+_ABSURD = 1e12  # N m; beyond, scaling down would not be exact, and no machine means it
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """Between n joints and their n motors.
+
+    Attributes:
+        joint_per_count: position [rad or m] per count of each motor, shape (n joints, n motors).
+        torque_per_count: joint torque [N m or N] per thousandth of each motor, shape (n joints, n motors).
+        count_per_torque: its inverse, shape (n motors, n joints).
+        offset: position of the joints where all counts are `zero`, shape (n,).
+        zero: counts of the motors there; whole numbers, any size.
+        limit: most thousandths that each motor may be asked for, either way.
+        groups: motors that share joints, and the joints they share, by number.
+    """
+
+    joint_per_count: Matrix
+    torque_per_count: Matrix
+    count_per_torque: Matrix
+    offset: Vector
+    zero: tuple[int, ...]
+    limit: tuple[int, ...]
+    groups: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
+
+    @property
+    def torque_limit(self) -> Vector:
+        """The most each joint can be given while the others are given nothing [N m or N], shape (n,)."""
+        with np.errstate(divide="ignore"):
+            alone = np.array(self.limit)[:, None] / np.abs(self.count_per_torque)
+        return np.asarray(alone.min(axis=0))
+
+    @property
+    def torque_resolution(self) -> Vector:
+        """Largest change of each joint's torque by one thousandth of one motor [N m or N], shape (n,)."""
+        return np.asarray(np.abs(self.torque_per_count).max(axis=1))
+
+    @property
+    def position_resolution(self) -> Vector:
+        """Largest change of each joint's position by one count of one motor [rad or m], shape (n,)."""
+        return np.asarray(np.abs(self.joint_per_count).max(axis=1))
+
+    def positions(self, counts: Sequence[int]) -> Vector:
+        """Joint positions [rad or m], shape (n,), of motors at these counts, which do not wrap around (`unwrapped`)."""
+        return self.joint_per_count @ [float(n - zero) for n, zero in zip(counts, self.zero, strict=True)] + self.offset
+
+    def counts_at(self, position: Vector) -> list[int]:
+        """The nearest counts of the motors when the joints are at this position [rad or m], shape (n,)."""
+        motors = np.linalg.solve(self.joint_per_count, position - self.offset)
+        return [round(turn) + zero for turn, zero in zip(motors.tolist(), self.zero, strict=True)]
+
+    def zeroed(self, counts: Sequence[int], position: Vector) -> Coordinates:
+        """The same for an arm whose motors are at these counts while its joints are at this position.
+
+        Args:
+            counts: of the motors, one each.
+            position: of the joints [rad or m], shape (n,).
+        """
+        return replace(self, zero=tuple(counts), offset=np.array(position, dtype=float))
+
+    def torque_counts(self, torque: Vector) -> tuple[list[int], bool]:
+        """What to ask of the motors for a joint torque.
+
+        Args:
+            torque: of the joints [N m or N], shape (n,).
+
+        Returns:
+            Thousandths of rated torque of each motor, clipped (see above) and rounded; whether it was clipped.
+
+        Raises:
+            DriverError: a torque that is not finite (or absurd), or not of this shape.
+        """
+        wanted = np.asarray(torque, dtype=float)
+        if wanted.shape != self.offset.shape or not np.abs(wanted).max() < _ABSURD:
+            raise DriverError(f"{len(self.limit)} finite joint torques are needed, not {torque}")
+        exact = (self.count_per_torque @ wanted).tolist()
+        counts, clipped = [0] * len(exact), False
+        for motors, _ in self.groups:
+            share = 1.0
+            for k in motors:
+                asked = abs(exact[k])
+                if asked * share > self.limit[k]:
+                    share = self.limit[k] / asked
+                    clipped = True
+            for k in motors:
+                limit = self.limit[k]
+                counts[k] = min(max(round(exact[k] * share), -limit), limit)
+        return counts, clipped
+
+    def joint_torque(self, counts: Sequence[int]) -> Vector:
+        """The joint torque [N m or N], shape (n,), that motors really give which are asked for this."""
+        return np.asarray(self.torque_per_count @ [float(n) for n in counts])
+
+
+def coordinates(driver: CanopenDriver, transmission: Transmission) -> Coordinates:
+    """Those of an arm as its description has them: counts of 0 where the transmission has its zero.
+
+    Args:
+        driver: the section `driver`.
+        transmission: the section `transmission`, whose motors are the driver's drives in their order.
+
+    Raises:
+        DriverError: not as many drives as ratios.
+    """
+    size = len(driver.drives)
+    if size != len(transmission.ratios):
+        raise DriverError(f"{size} drives but {len(transmission.ratios)} ratios in the transmission")
+    coupling = np.eye(size) if transmission.coupling is None else np.array(transmission.coupling)
+    motor_per_joint = np.array(transmission.ratios)[:, None] * coupling
+    joint_per_motor = np.linalg.inv(motor_per_joint)
+    # An inverse that is only nearly zero where it is zero would couple what is not coupled.
+    groups = _groups(coupling)
+    inside = np.zeros((size, size), dtype=bool)
+    for motors, joints in groups:
+        inside[np.ix_(joints, motors)] = True
+    joint_per_motor[~inside] = 0.0
+    radians = np.array([2.0 * pi / drive.counts for drive in driver.drives])
+    newton = np.array([drive.rated_torque * drive.torque_scale / _PER_MILLE for drive in driver.drives])
+    return Coordinates(
+        joint_per_motor * radians,
+        motor_per_joint.T * newton,
+        joint_per_motor.T / newton[:, None],
+        np.array(transmission.offsets or np.zeros(size)),
+        (0,) * size,
+        tuple(torque_limit_counts(drive.max_torque, drive.rated_torque) for drive in driver.drives),
+        groups,
+    )
+
+
+def torque_limit_counts(max_torque: float, rated_torque: float) -> int:
+    """A motor's largest torque as thousandths of its rated torque, rounded down; at most what 6071h can hold."""
+    # 1.8/0.2 is a little below 9 in floating point.
+    return min(int(_PER_MILLE * max_torque / rated_torque + 1e-6), MOST_COUNTS)
+
+
+def unwrapped(before: int, counts: int) -> int:
+    """A position of 32 bits as one that does not wrap around: the nearest to the one before.
+
+    Args:
+        before: the last position, unwrapped [counts].
+        counts: what the drive says now, a signed number of 32 bits.
+    """
+    return before + (counts - before + _TURN // 2) % _TURN - _TURN // 2
+
+
+def _groups(coupling: Matrix) -> tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]:
+    """Motors (rows) and joints (columns) that hang together through numbers that are not zero."""
+    size, left = len(coupling), set(range(len(coupling)))
+    found = []
+    while left:
+        motors, joints = {min(left)}, set[int]()
+        while True:
+            more = {j for m in motors for j in range(size) if coupling[m, j] != 0.0}
+            others = {m for j in more for m in range(size) if coupling[m, j] != 0.0}
+            if more == joints and others == motors:
+                break
+            joints, motors = more, others | motors
+        left -= motors
+        found.append((tuple(sorted(motors)), tuple(sorted(joints))))
+    return tuple(found)

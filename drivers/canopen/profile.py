@@ -1,0 +1,264 @@
+"""Which frames an arm's drives and their host exchange: COB-IDs, contents, and when each is sent.
+
+The communication profile of WAM-style drives in cyclic synchronous torque mode: SYNC starts a cycle, each drive answers
+it with its position (TPDO1) and lets the torque of the frames before it act (RPDO1, synchronous). Up to four drives
+share a torque frame: in each of them the slots of the others are mapped to a dummy (CiA 301, 0003h), so that the
+mapped length is the frame's. Control words (RPDO2), status reports (TPDO2, on change), emergencies and heartbeats come
+as they must; SDOs flow before streaming only.
+
+Boundary: data about one bus, worked out once from the configuration. Bytes are `codec.py`, costs are `budget.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from drivers.canopen import dictionary as od
+from drivers.canopen.dictionary import Entry, pdo_entry
+from ident_service.config.canopen import CanBus, CanopenDrive, CanopenDriver
+
+NMT, SYNC, EMERGENCY = 0x000, 0x080, 0x080
+TPDO1, RPDO1, TPDO2, RPDO2 = 0x180, 0x200, 0x280, 0x300
+SDO_REPLY, SDO_REQUEST, HEARTBEAT = 0x580, 0x600, 0x700
+SLOTS = 4  # torques of 16 bits in a frame of eight bytes
+
+# CiA 301, table "restricted COB-IDs": of no PDO, SYNC or EMCY that can be configured.
+_RESTRICTED = (
+    (0x000, 0x000),
+    (0x001, 0x07F),
+    (0x101, 0x180),
+    (0x581, 0x5FF),
+    (0x601, 0x67F),
+    (0x6E0, 0x6FF),
+    (0x701, 0x7FF),
+)
+_NOT_VALID, _NO_REMOTE = 1 << 31, 1 << 30  # bits of a PDO's COB-ID entry
+_EVERY_SYNC, _ON_RECEPTION, _ON_CHANGE = 1, 255, 255
+_STATUS_SLOTS = (od.STATUS_WORD, od.TORQUE_ACTUAL)
+_UNUSED = (3, 4)  # some drives command their axis by these out of the box
+_MOST_16 = 0xFFFF
+
+# One emergency a second and drive (1015h): a drive with a storm of errors must not take the bus from the others.
+EMERGENCY_INHIBIT = 1.0
+
+
+def restricted(cob_id: int) -> bool:
+    """Whether CiA 301 keeps this COB-ID for itself."""
+    return any(low <= cob_id <= high for low, high in _RESTRICTED)
+
+
+@dataclass(frozen=True)
+class Write:
+    """One SDO download: the value of an entry."""
+
+    entry: Entry
+    value: int
+
+    @property
+    def data(self) -> bytes:
+        """The value's bytes."""
+        return self.entry.pack(self.value)
+
+
+@dataclass(frozen=True)
+class TorqueFrame:
+    """A frame with the torques of some drives.
+
+    Attributes:
+        cob_id: of the frame.
+        drives: whose torques it carries, in the order of its slots; numbers in the arm's list of drives.
+        nodes: the same drives as node numbers.
+    """
+
+    cob_id: int
+    drives: tuple[int, ...]
+    nodes: tuple[int, ...]
+
+    @property
+    def length(self) -> int:
+        """Bytes."""
+        return 2 * len(self.drives)
+
+
+@dataclass(frozen=True)
+class Pdo:
+    """One PDO of one drive, as the drive has to be told.
+
+    Attributes:
+        number: from 1.
+        sent: by the drive (TPDO), else to it (RPDO).
+        cob_id: of its frame.
+        type: transmission type.
+        slots: what it maps, in order.
+        inhibit: least time between two [100 us]; of TPDOs.
+        timer: of a TPDO its event timer, of an RPDO its deadline [ms]; 0 for none.
+    """
+
+    number: int
+    sent: bool
+    cob_id: int
+    type: int
+    slots: tuple[Entry, ...]
+    inhibit: int = 0
+    timer: int = 0
+
+    def writes(self) -> list[Write]:
+        """What to write, in this order (CiA 301, 7.5.2.36): off, no mapping, mapping, type and times, on."""
+        cob_id, kind, count, slot, timer = _TPDO if self.sent else _RPDO
+
+        def entry(of: Entry, sub: int | None = None) -> Entry:
+            return pdo_entry(of, self.number, sub)
+
+        value = self.cob_id | (_NO_REMOTE if self.sent else 0)
+        todo = [Write(entry(cob_id), value | _NOT_VALID), Write(entry(count), 0)]
+        todo += [Write(entry(slot, sub), mapped.mapping) for sub, mapped in enumerate(self.slots, 1)]
+        todo += [Write(entry(count), len(self.slots)), Write(entry(kind), self.type)]
+        if self.sent and self.type == _ON_CHANGE:
+            todo.append(Write(entry(od.TPDO_INHIBIT), self.inhibit))
+        if self.timer:
+            todo.append(Write(entry(timer), self.timer))
+        return [*todo, Write(entry(cob_id), value)]
+
+
+_RPDO = (od.RPDO_COB_ID, od.RPDO_TYPE, od.RPDO_COUNT, od.RPDO_MAPPING, od.RPDO_DEADLINE)
+_TPDO = (od.TPDO_COB_ID, od.TPDO_TYPE, od.TPDO_COUNT, od.TPDO_MAPPING, od.TPDO_PERIOD)
+
+
+@dataclass(frozen=True)
+class BusProfile:
+    """One bus of an arm.
+
+    Attributes:
+        number: of the bus, from 0.
+        bus: its section of the configuration.
+        rate: cycles per second.
+        host: node number of the host.
+        drives: which of the arm's drives are on it, in the arm's order.
+        nodes: the same drives as node numbers.
+        torque_frames: what carries their torques.
+        heartbeat_host: period of the host's heartbeat [s].
+        heartbeat_drives: period of each drive's [s].
+        heartbeat_timeout: how long either side waits for the other's [s].
+        torque_deadline: after which a drive without torque frames stops by itself [s].
+        status_period: of a drive's status report without a change [s].
+        status_inhibit: least time between two of them [s].
+    """
+
+    number: int
+    bus: CanBus
+    rate: float
+    host: int
+    drives: tuple[int, ...]
+    nodes: tuple[int, ...]
+    torque_frames: tuple[TorqueFrame, ...]
+    heartbeat_host: float
+    heartbeat_drives: float
+    heartbeat_timeout: float
+    torque_deadline: float
+    status_period: float
+    status_inhibit: float
+
+    @property
+    def fd(self) -> bool:
+        """Whether frames are those of CAN FD."""
+        return self.bus.data_bitrate is not None
+
+    @cached_property
+    def position_ids(self) -> dict[int, int]:
+        """COB-ID of each drive's position to its node."""
+        return {TPDO1 + node: node for node in self.nodes}
+
+    def pdos(self, node: int) -> list[Pdo]:
+        """The PDOs of one drive; raises KeyError for a node that is not on this bus."""
+        frame = next((frame for frame in self.torque_frames if node in frame.nodes), None)
+        if frame is None:
+            raise KeyError(node)
+        slots = tuple(od.TARGET_TORQUE if other == node else od.DUMMY_INT16 for other in frame.nodes)
+        inhibit, period = _whole(self.status_inhibit, 1e-4), _whole(self.status_period, 1e-3)
+        return [
+            Pdo(1, False, frame.cob_id, _EVERY_SYNC, slots, timer=_whole(self.torque_deadline, 1e-3)),
+            Pdo(2, False, RPDO2 + node, _ON_RECEPTION, (od.CONTROL_WORD, od.MODE)),
+            Pdo(1, True, TPDO1 + node, _EVERY_SYNC, (od.POSITION,)),
+            Pdo(2, True, TPDO2 + node, _ON_CHANGE, _STATUS_SLOTS, inhibit, period),
+        ]
+
+    def writes(self, node: int) -> list[Write]:
+        """All that makes one drive speak this profile, in order; the drive must be pre-operational.
+
+        Unused PDOs go first, so that none shares a COB-ID with a new one even for a moment. Their bit "not valid" is
+        written with COB-IDs that they have by default; a drive that lacks one of them answers with an abort.
+
+        Raises:
+            KeyError: the node is not on this bus.
+        """
+        todo = [Write(od.SYNC_COB_ID, SYNC), Write(od.SYNC_OVERFLOW, 0)]
+        todo += [Write(od.EMERGENCY_COB_ID, EMERGENCY + node)]
+        todo += [Write(od.EMERGENCY_INHIBIT, _whole(EMERGENCY_INHIBIT, 1e-4))]
+        todo += self.silenced(node)
+        for pdo in self.pdos(node):
+            todo += pdo.writes()
+        wait = self.host << 16 | _whole(self.heartbeat_timeout, 1e-3)
+        return [
+            *todo,
+            Write(od.HEARTBEAT_PRODUCER, _whole(self.heartbeat_drives, 1e-3)),
+            Write(od.HEARTBEAT_CONSUMER, wait),
+        ]
+
+    def silenced(self, node: int) -> list[Write]:
+        """What switches the PDOs off that this profile does not use."""
+        off = []
+        for number in _UNUSED:
+            base = (number - 1) * 0x100 + node
+            off.append(Write(pdo_entry(od.RPDO_COB_ID, number), RPDO1 + base | _NOT_VALID))
+            off.append(Write(pdo_entry(od.TPDO_COB_ID, number), TPDO1 + base | _NOT_VALID | _NO_REMOTE))
+        return off
+
+
+def bus_profiles(driver: CanopenDriver, rate: float) -> list[BusProfile]:
+    """What flows on each bus of an arm.
+
+    Args:
+        driver: the arm's section `driver`.
+        rate: cycles per second.
+
+    Returns:
+        One profile for each bus that has drives, in the order of the configuration.
+    """
+    return [_profile(driver, rate, number, bus) for number, bus in enumerate(driver.buses)]
+
+
+def _profile(driver: CanopenDriver, rate: float, number: int, bus: CanBus) -> BusProfile:
+    drives = [k for k, drive in enumerate(driver.drives) if drive.bus == number]
+    slots = SLOTS if driver.torque_frames == "shared" else 1
+    together = [drives[first : first + slots] for first in range(0, len(drives), slots)]
+    return BusProfile(
+        number,
+        bus,
+        rate,
+        driver.heartbeats.node,
+        tuple(drives),
+        _nodes(driver.drives, drives),
+        tuple(_torque_frame(driver.drives, frame) for frame in together),
+        driver.heartbeats.period,
+        driver.heartbeats.drives,
+        driver.heartbeats.timeout,
+        driver.torque_deadline,
+        driver.status.period,
+        driver.status.inhibit,
+    )
+
+
+def _torque_frame(drives: Sequence[CanopenDrive], chosen: Sequence[int]) -> TorqueFrame:
+    nodes = _nodes(drives, chosen)
+    return TorqueFrame(RPDO1 + nodes[0], tuple(chosen), nodes)
+
+
+def _nodes(drives: Sequence[CanopenDrive], chosen: Sequence[int]) -> tuple[int, ...]:
+    return tuple(drives[k].node for k in chosen)
+
+
+def _whole(seconds: float, unit: float) -> int:
+    """A time as a whole number of units, at least one and at most what 16 bits hold."""
+    return min(max(1, round(seconds / unit)), _MOST_16)
