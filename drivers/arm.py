@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.clock import Clock
+from drivers.status import AxisEvent
 
 Vector = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -70,6 +71,7 @@ class Sample:
         age: cycles since each axis answered, shape (joints,); 0 where `valid`.
         lost: frames lost since `open`.
         status: slow per-axis status words, with `status_age` cycles since they were read.
+        events: what happened on the bus since the sample before.
     """
 
     cycle: int
@@ -82,6 +84,7 @@ class Sample:
     lost: int = 0
     status: tuple[int, ...] = field(default=())
     status_age: int = 0
+    events: tuple[AxisEvent, ...] = ()
 
 
 class Arm(ABC):

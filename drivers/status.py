@@ -1,12 +1,13 @@
 """What the drive of one axis says of itself, in the same words for every fieldbus.
 
-Boundary: names of bits. A driver translates its hardware's words into these (CiA 402 status words, puck modes);
-`Sample.status` holds one number per axis.
+Boundary: names of bits and of events. A driver translates its hardware's words into these (CiA 402 status words, puck
+modes); `Sample.status` holds one number per axis, `Sample.events` what happened since the sample before.
 """
 
 from __future__ import annotations
 
-from enum import IntFlag
+from dataclasses import dataclass
+from enum import IntFlag, StrEnum
 
 
 class AxisStatus(IntFlag):
@@ -21,3 +22,33 @@ class AxisStatus(IntFlag):
 
 # Any of these on a running arm means that the torque asked for does not act.
 TRIPPED = AxisStatus.FAULT | AxisStatus.EMERGENCY_STOP | AxisStatus.WATCHDOG
+
+
+class AxisEventCode(StrEnum):
+    """What may happen on a fieldbus beside the exchange; each is a fault or a warning of the guard's table."""
+
+    EMERGENCY_MESSAGE = "drive_emergency"  # a drive reports an error of its own
+    DRIVE_SILENT = "drive_silent"  # its heartbeat is missing
+    DRIVE_RESTARTED = "drive_restarted"  # it booted in the middle of a run
+    DRIVE_LEFT = "drive_left"  # it left the state in which it takes torques
+    SECOND_HOST = "second_host"  # somebody else sends what only this host may
+    BUS_DEGRADED = "bus_degraded"  # so many errors that the host's controller or a drive's is in error passive
+    BUS_OFF = "bus_off"  # the host's controller has left the bus
+    DRIVE_WARNING = "drive_warning"
+    TORQUE_LIMITED = "torque_limited"  # the drive gives less than it was asked for
+    STRANGE_FRAME = "strange_frame"  # of nobody, of a wrong length, or at a wrong time
+
+
+@dataclass(frozen=True, slots=True)
+class AxisEvent:
+    """Something that happened since the last sample.
+
+    Attributes:
+        code: what.
+        axis: whose, by the order of the joints; None for the bus or the host.
+        words: one sentence's middle, for people, that names the drive itself.
+    """
+
+    code: AxisEventCode
+    axis: int | None
+    words: str

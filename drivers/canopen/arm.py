@@ -1,0 +1,311 @@
+"""An arm of CANopen drives in cyclic synchronous torque mode.
+
+A sample is stamped when SYNC was sent, at which the torque that was handed over began to act and all positions were
+taken.
+
+Torque frames begin with `enable` and then never cease while cycles come, with zero torque once the arm is stopped: a
+drive that missed them would rightly report it. `close` takes the drives back to what they were when they were powered.
+
+Boundary: the contract. Cycles are `buses.py`, states of drives `enabling.py`, joints `coordinates.py`, what drives are
+told beforehand `setup.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+
+import numpy as np
+
+from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector
+from drivers.canopen.buses import Buses
+from drivers.canopen.codec import BusCodec, Drive
+from drivers.canopen.coordinates import Coordinates, coordinates, unwrapped
+from drivers.canopen.enabling import Enabling, Resetting
+from drivers.canopen.events import axis_events
+from drivers.canopen.link import Link, open_links
+from drivers.canopen.lock import BusLock
+from drivers.canopen.profile import bus_profiles
+from drivers.canopen.setup import Setup, configure, identify
+from drivers.canopen.words import DISABLE_VOLTAGE, QUICK_STOP, NmtCommand, axis_status
+from drivers.clock import Clock, RealClock
+from drivers.status import AxisEvent, AxisEventCode, AxisStatus
+from ident_service.config.canopen import CanopenDriver
+from ident_service.config.schema import ArmConfig
+from ident_service.errors import DriverError
+
+LIMIT_SLACK = 0.05  # rad or m beyond the joints' limits that the drives keep by themselves
+_HEARTBEAT_CHECK = 10  # cycles between two looks at everybody's heartbeat
+_LOST_TORQUE = (0x8130, 0x8250)  # emergencies of a drive that heard nothing from us
+
+
+class CanopenArm(Arm):
+    """Drives on one or more buses, behind one transmission."""
+
+    def __init__(self, config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_links) -> None:
+        """Take the description; nothing is opened.
+
+        Args:
+            config: with a CANopen driver and a transmission.
+            open_bus: gives the links, in the order of the buses.
+
+        Raises:
+            DriverError: the description lacks the driver, the transmission, or joints.
+        """
+        if not isinstance(config.driver, CanopenDriver) or config.transmission is None:
+            raise DriverError(f"{config.name}: needs a CANopen driver and a transmission")
+        self._config, self._driver, self._open_bus = config, config.driver, open_bus
+        self._period_ns = round(1e9 / config.control.rate)
+        self._profiles = bus_profiles(config.driver, config.control.rate)
+        self._coordinates: Coordinates = coordinates(config.driver, config.transmission)
+        self._limits = np.array([np.inf if j.torque is None else j.torque for j in config.joints.values()])
+        if len(self._limits) != len(config.driver.drives):
+            raise DriverError(f"{config.name}: joints must name all {len(config.driver.drives)} joints")
+        # Joints that each drive moves, and drives that each joint needs.
+        self._joints_of = {k: joints for motors, joints in self._coordinates.groups for k in motors}
+        self._drives_of = [
+            next(motors for motors, joints in self._coordinates.groups if j in joints) for j in range(len(self._limits))
+        ]
+        self.clock: Clock = RealClock()
+        self._buses: Buses | None = None
+        self._locks: list[BusLock] = []
+        self._reset_state()
+
+    def _reset_state(self) -> None:
+        self._enabled = self._streaming = False
+        self._counts = [0] * len(self._limits)
+        self._acting = _frozen(np.zeros(len(self._limits)))
+        self._unwrapped: list[int] | None = None
+        self._cycle = 0
+        self._silent: set[int] = set()
+        self._identities: tuple[str, ...] = ()
+
+    def open(self) -> None:
+        """Lock and open every bus, and tell every drive what it is to do; nothing is energised.
+
+        Raises:
+            DriverError: a bus is in use or cannot be had; a drive does not answer, is another one, or refuses a part
+                of its configuration. Nothing stays open.
+        """
+        if self._buses is not None:
+            raise DriverError("the arm is already open")
+        self._reset_state()
+        try:
+            if all(bus.interface != "lock_step" for bus in self._driver.buses):
+                self._locks = [BusLock(bus) for bus in self._driver.buses]
+            buses = self._buses = Buses(self._profiles, self._open_bus(self._config), self._period_ns)
+            self.clock = buses.clock
+            buses.boot()
+            self._identities = tuple(self._configured(buses, number) for number in range(len(buses.drives)))
+            buses.command(NmtCommand.START)
+            buses.keep_alive()
+        except BaseException:
+            self.close()
+            raise
+
+    def describe(self) -> ArmDescription:
+        """Say what is open; raises DriverError when nothing is."""
+        self._open()
+        found = self._coordinates
+        return ArmDescription(
+            tuple(self._config.joints),
+            1e9 / self._period_ns,
+            np.minimum(found.torque_limit, self._limits),
+            found.torque_resolution,
+            found.position_resolution,
+            self._identities,
+            "drivers.canopen",
+        )
+
+    def enable(self) -> None:
+        """Energise all drives together with zero torque, through the states of CiA 402.
+
+        Raises:
+            DriverError: not open, a drive has a fault, or does not follow in time; none stays energised.
+        """
+        buses = self._open()
+        self._no_torque()
+        self._streaming = True
+        try:
+            self._through(buses, Enabling(buses.drives, self._driver.bring_up, self.clock.now_ns()))
+        except BaseException:
+            self.stop(StopKind.TORQUE_OFF)
+            raise
+        self._enabled = True
+
+    def reset(self) -> None:
+        """Clear the faults that drives have latched; nothing is energised.
+
+        Raises:
+            DriverError: not open, enabled, or a fault stays because its cause does.
+        """
+        buses = self._open()
+        if self._enabled:
+            raise DriverError("the arm is enabled; stop it before its faults are cleared")
+        self._through(buses, Resetting(buses.drives, self._driver.bring_up, self.clock.now_ns()))
+
+    def exchange(self, torque: Vector | None) -> Sample:
+        """One cycle, as the contract has it.
+
+        Raises:
+            DriverError: as in the contract.
+        """
+        buses = self._open()
+        if torque is not None:
+            if not self._enabled:
+                raise DriverError("a torque was given, but the arm is not enabled")
+            wanted = np.clip(np.asarray(torque, dtype=float), -self._limits, self._limits)
+            # Checked as it came: clipping hides an infinity.
+            if np.shape(torque) != self._limits.shape or not np.isfinite(torque).all():
+                raise DriverError(f"{len(self._limits)} finite torques are needed, not {torque}")
+            self._counts, _ = self._coordinates.torque_counts(wanted)
+            self._acting = _frozen(self._coordinates.joint_torque(self._counts))
+        # Enabled, an exchange that only looks is no torque frame: drives that count them must notice.
+        send = torque is not None or (self._streaming and not self._enabled)
+        stamp_ns = buses.cycle(self._counts if send else None)
+        sample = self._sample(buses, stamp_ns)
+        self._cycle += 1
+        return sample
+
+    def stop(self, kind: StopKind) -> None:
+        """Tell every drive to let go, or to stop by itself; never raises. What was sent before acts until it does."""
+        word = QUICK_STOP if kind is StopKind.QUICK_STOP else DISABLE_VOLTAGE
+        self._enabled = False
+        self._no_torque()
+        if self._buses is not None:
+            for number in range(len(self._limits)):
+                # One drive that cannot be told must not keep the others from it.
+                with suppress(Exception):
+                    self._buses.control(number, word)
+
+    def close(self) -> None:
+        """Torque off, drives as they were powered up, buses free; any number of times."""
+        self.stop(StopKind.TORQUE_OFF)
+        if self._buses is not None:
+            with suppress(Exception):
+                self._buses.command(NmtCommand.RESET_COMMUNICATION)
+            self._buses.close()
+        for lock in self._locks:
+            lock.close()
+        self._buses, self._locks = None, []
+        self._streaming = False
+
+    def _open(self) -> Buses:
+        if self._buses is None:
+            raise DriverError("the arm is not open")
+        return self._buses
+
+    def _no_torque(self) -> None:
+        self._counts = [0] * len(self._limits)
+        self._acting = _frozen(np.zeros(len(self._limits)))
+
+    def _configured(self, buses: Buses, number: int) -> str:
+        """One drive identified and configured; its identity in words."""
+        drive, objects = self._driver.drives[number], buses.objects(number)
+        identity = identify(objects, drive.identity)
+        lowest, highest = self._count_limits(number)
+        configure(objects, Setup(drive, buses.profile(number), self._driver.reactions, lowest, highest))
+        return identity
+
+    def _count_limits(self, number: int) -> tuple[int | None, int | None]:
+        """Between which counts a drive may be while all joints are within their limits, and a little more."""
+        found, joints = self._coordinates, list(self._config.joints.values())
+        turns = np.linalg.inv(found.joint_per_count)[number]
+        low = high = float(found.zero[number])
+        for joint, share, offset in zip(joints, turns, found.offset, strict=True):
+            if share == 0.0:
+                continue
+            if joint.position is None:
+                return None, None
+            ends = [
+                share * (joint.position[0] - LIMIT_SLACK - offset),
+                share * (joint.position[1] + LIMIT_SLACK - offset),
+            ]
+            low, high = low + min(ends), high + max(ends)
+        return round(low), round(high)
+
+    def _through(self, buses: Buses, steps: Enabling | Resetting) -> None:
+        """Cycle with zero torque until the drives have gone where they are led."""
+        while not steps.done:
+            buses.cycle(self._counts if self._streaming else None)
+            for number, word in steps.commands(self.clock.now_ns()):
+                buses.control(number, word)
+
+    def _sample(self, buses: Buses, stamp_ns: int) -> Sample:
+        drives = buses.drives
+        if self._unwrapped is None:
+            self._unwrapped = [drive.position for drive in drives]
+        else:
+            self._unwrapped = [
+                unwrapped(before, drive.position) for before, drive in zip(self._unwrapped, drives, strict=True)
+            ]
+        ages = [max(drives[k].age for k in needed) for needed in self._drives_of]
+        age = np.array(ages, dtype=np.int64)
+        return Sample(
+            self._cycle,
+            stamp_ns,
+            self._coordinates.positions(self._unwrapped),
+            None,
+            self._acting,
+            age == 0,
+            age,
+            buses.lost,
+            tuple(_status([drives[k] for k in needed]) for needed in self._drives_of),
+            max(drive.status_age for drive in drives),
+            tuple(self._events(buses)),
+        )
+
+    def _events(self, buses: Buses) -> list[AxisEvent]:
+        found: list[AxisEvent] = []
+        for codec in buses.codecs:
+            events = codec.take_events()
+            if events:
+                joints = {self._driver.drives[k].node: self._joints_of[k][0] for k in codec.profile.drives}
+                found += axis_events(events, codec.controller, joints, codec.profile.bus.channel)
+            if self._cycle % _HEARTBEAT_CHECK == 0:
+                found += self._missed(codec)
+        return found
+
+    def _missed(self, codec: BusCodec) -> list[AxisEvent]:
+        """Drives whose heartbeat is missing, each told once."""
+        silent = set(codec.silent(self.clock.now_ns()))
+        new = silent - self._silent
+        self._silent = self._silent - set(codec.profile.nodes) | silent
+        return [
+            AxisEvent(
+                AxisEventCode.DRIVE_SILENT,
+                self._joints_of[codec.profile.drives[codec.profile.nodes.index(node)]][0],
+                f"node {node}: no heartbeat for {codec.profile.heartbeat_timeout:g} s",
+            )
+            for node in sorted(new)
+        ]
+
+
+def from_config(config: ArmConfig, clock: Clock | None = None) -> CanopenArm:
+    """The arm that a configuration with a CANopen driver describes, not open.
+
+    Args:
+        config: the arm's.
+        clock: ignored: time is that of the link, virtual in lock step.
+
+    Raises:
+        DriverError: the description lacks something.
+    """
+    return CanopenArm(config)
+
+
+def _status(drives: Sequence[Drive]) -> int:
+    """Of a joint: powered when all its drives are, in trouble when one of them is."""
+    powered, trouble = True, AxisStatus(0)
+    for drive in drives:
+        word = AxisStatus(0) if drive.status is None else axis_status(drive.status)
+        if drive.emergency is not None and drive.emergency.code in _LOST_TORQUE:
+            word |= AxisStatus.WATCHDOG
+        powered = powered and bool(word & AxisStatus.POWERED)
+        trouble |= word & ~AxisStatus.POWERED
+    return int(trouble | (AxisStatus.POWERED if powered else 0))
+
+
+def _frozen(array: Vector) -> Vector:
+    array.setflags(write=False)
+    return array

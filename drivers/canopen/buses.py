@@ -1,0 +1,156 @@
+"""All buses of an arm in step: when a cycle begins, what is sent in it and in which order, until when answers count.
+
+A cycle begins one period after the one before; periods that are over are skipped, never made up for. On every bus the
+torques go first, then SYNC on all of them back to back, so that all drives act and sample at one time. Our heartbeat is
+sent behind the answers, by this loop and nobody else: a loop that stops is missed by the drives.
+
+Boundary: frames and time. What torques mean and what states drives should be in is `arm.py`'s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+
+from drivers.canopen.codec import BusCodec, Drive
+from drivers.canopen.dictionary import CST
+from drivers.canopen.link import Link
+from drivers.canopen.profile import BusProfile
+from drivers.canopen.sdo import Objects
+from drivers.canopen.words import NmtCommand, NmtState
+from drivers.clock import Clock
+from ident_service.errors import DriverError
+
+RECEIVE = 0.97  # of a period, within which a position counts for its cycle (FIELDBUS.md: the last is on the wire then)
+BOOT = 2.0  # s within which a drive that was reset must have booted
+
+
+class Buses:
+    """The open buses of one arm.
+
+    Attributes:
+        codecs: one a bus.
+        drives: the state of every drive, in the arm's order.
+        clock: of the links.
+        lost: positions that did not come in their cycle, so far.
+    """
+
+    def __init__(self, profiles: Sequence[BusProfile], links: Sequence[Link], period_ns: int) -> None:
+        """Take the links, which this closes.
+
+        Args:
+            profiles: of the buses.
+            links: to them, in the same order.
+            period_ns: of a cycle [ns].
+        """
+        self.codecs = [BusCodec(profile) for profile in profiles]
+        self.clock: Clock = links[0].clock
+        self.lost = 0
+        self._links = list(links)
+        self._pairs = list(zip(self.codecs, self._links, strict=True))
+        self._at: dict[int, tuple[BusCodec, Link]] = {}
+        drives: dict[int, Drive] = {}
+        for codec, link in self._pairs:
+            for number, drive in zip(codec.profile.drives, codec.drives, strict=True):
+                drives[number], self._at[number] = drive, (codec, link)
+        self.drives = [drives[number] for number in range(len(drives))]
+        self._period_ns = period_ns
+        self._heartbeat_period_ns = min(round(0.5e9 * profile.heartbeat_host) for profile in profiles)
+        self._heartbeat_ns = 0
+        self._next_ns: int | None = None
+
+    def close(self) -> None:
+        """Give all links back; never raises."""
+        for link in self._links:
+            with suppress(Exception):
+                link.close()
+
+    def command(self, command: NmtCommand) -> None:
+        """An NMT command for our drives; others on the bus are none of our business."""
+        for codec, link in self._pairs:
+            for node in codec.profile.nodes:
+                link.send(codec.nmt(command, node))
+
+    def control(self, number: int, word: int) -> None:
+        """A control word for one drive."""
+        codec, link = self._at[number]
+        link.send(codec.control_word(self.drives[number].node, word, CST))
+
+    def objects(self, number: int) -> Objects:
+        """The object dictionary of one drive, for as long as nothing streams."""
+        codec, link = self._at[number]
+        return Objects(link, self.drives[number].node, codec.receive)
+
+    def profile(self, number: int) -> BusProfile:
+        """Of the bus that a drive is on."""
+        return self._at[number][0].profile
+
+    def boot(self) -> None:
+        """Bring every drive to its power-on communication state, and wait until all have said so.
+
+        Raises:
+            DriverError: some do not; the message names them.
+        """
+        for link in self._links:
+            link.drain()
+        self.command(NmtCommand.RESET_COMMUNICATION)
+        deadline = self.clock.now_ns() + round(BOOT * 1e9)
+        for codec, link in self._pairs:
+            while not all(drive.boots for drive in codec.drives):
+                frame = link.receive(deadline)
+                if frame is None:
+                    break
+                codec.receive(frame)
+            codec.take_events()
+        if missing := ", ".join(str(drive.node) for drive in self.drives if not drive.boots):
+            raise DriverError(
+                f"no answer of drives {missing} within {BOOT:g} s; check power, cable and bit rate (`ident bus scan`)"
+            )
+
+    def cycle(self, counts: Sequence[int] | None) -> int:
+        """Wait for the next cycle and make it.
+
+        Args:
+            counts: torque of every drive [per mille of rated torque]; None for SYNC alone.
+
+        Returns:
+            When SYNC was sent [ns].
+
+        Raises:
+            DriverError: a bus is gone, or torques that cannot be sent, of which none has been.
+        """
+        now_ns = self.clock.now_ns()
+        begin_ns = now_ns if self._next_ns is None else self._next_ns
+        self.clock.sleep_until_ns(begin_ns)
+        begin_ns += max(0, self.clock.now_ns() - begin_ns) // self._period_ns * self._period_ns
+        self._next_ns = begin_ns + self._period_ns
+        torques = [[] if counts is None else codec.torque_frames(counts) for codec in self.codecs]
+        for (codec, link), frames in zip(self._pairs, torques, strict=True):
+            for heard in link.drain():
+                codec.receive(heard)
+            for frame in frames:
+                link.send(frame)
+        for codec, link in self._pairs:
+            link.send(codec.sync())
+        stamp_ns = self.clock.now_ns()
+        for codec in self.codecs:
+            codec.begin_cycle(stamp_ns)
+        deadline = begin_ns + round(RECEIVE * self._period_ns)
+        for codec, link in self._pairs:
+            while not codec.complete:
+                answer = link.receive(deadline)
+                if answer is None:
+                    break
+                codec.receive(answer)
+            codec.end_cycle()
+        self.lost += sum(not drive.answered for drive in self.drives)
+        self.keep_alive()
+        return stamp_ns
+
+    def keep_alive(self) -> None:
+        """Our heartbeat, when half of its period is over: one that is sent late must not be missed."""
+        now_ns = self.clock.now_ns()
+        if now_ns >= self._heartbeat_ns:
+            self._heartbeat_ns = now_ns + self._heartbeat_period_ns
+            for codec, link in self._pairs:
+                link.send(codec.heartbeat(NmtState.OPERATIONAL))

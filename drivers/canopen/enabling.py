@@ -1,0 +1,121 @@
+"""All drives of an arm through the states of CiA 402 at once, cycle by cycle.
+
+Ready, switched on, a few cycles with zero torque and everybody's position, enabled: each step has one deadline for all
+drives. Commands go to those who have not come so far, and again where one was lost.
+
+Boundary: which command to whom; who sends it, and the cycles themselves, are `arm.py`'s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from drivers.canopen.codec import Drive
+from drivers.canopen.words import DISABLE_VOLTAGE, RESET_FAULT, TOWARDS_ENABLED, DriveState, emergency_words
+from ident_service.errors import DriverError
+
+SEEDED = 5  # cycles in a row with zero torque and all positions before anything is enabled
+REPEAT = 0.05  # s after which a command that had no effect is sent again
+_WAY = (DriveState.READY_TO_SWITCH_ON, DriveState.SWITCHED_ON, DriveState.OPERATION_ENABLED)
+_FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION)
+
+
+class Enabling:
+    """From switched off to `operation enabled`."""
+
+    def __init__(self, drives: Sequence[Drive], step: float, now_ns: int) -> None:
+        """Begin.
+
+        Args:
+            drives: of all buses, as their codecs know them.
+            step: how long all drives together may take for one step [s].
+            now_ns: of the link's clock.
+        """
+        self._drives = drives
+        self._step_ns = round(step * 1e9)
+        self._deadline_ns = now_ns + self._step_ns
+        self._target = 0
+        self._seeded = 0
+        self._sent: dict[int, tuple[DriveState, int]] = {}
+
+    @property
+    def done(self) -> bool:
+        """Whether all drives are enabled."""
+        return self._target == len(_WAY)
+
+    def commands(self, now_ns: int) -> list[tuple[int, int]]:
+        """What to send in this cycle: numbers of drives and control words.
+
+        Raises:
+            DriverError: a drive has a fault, or the step's time is over; who, and why as far as it is known.
+        """
+        if bad := [drive for drive in self._drives if drive.state in _FAULTS]:
+            raise DriverError(f"{'; '.join(map(_told, bad))}; only a reset clears it (`ident recover`)")
+        fresh = all(drive.answered for drive in self._drives)
+        self._seeded = self._seeded + 1 if fresh else 0
+        while not self.done and self._reached():
+            if self._target == 1 and self._seeded < SEEDED:
+                break
+            self._target += 1
+            self._deadline_ns = now_ns + self._step_ns
+        if self.done:
+            return []
+        if now_ns > self._deadline_ns:
+            late = [drive for drive in self._drives if not self._there(drive)] or list(self._drives)
+            raise DriverError(
+                f"not {_WAY[self._target]} within {self._step_ns * 1e-9:g} s: {'; '.join(map(_told, late))}"
+            )
+        words = []
+        for number, drive in enumerate(self._drives):
+            if self._there(drive):  # and waits for the others, or for the seed
+                continue
+            word = TOWARDS_ENABLED.get(drive.state, DISABLE_VOLTAGE)
+            state, sent_ns = self._sent.get(number, (None, 0))
+            if state is not drive.state or now_ns - sent_ns > REPEAT * 1e9:
+                self._sent[number] = drive.state, now_ns
+                words.append((number, word))
+        return words
+
+    def _reached(self) -> bool:
+        return all(self._there(drive) for drive in self._drives)
+
+    def _there(self, drive: Drive) -> bool:
+        return drive.state in _WAY[self._target :]
+
+
+class Resetting:
+    """Out of the state `fault`: a rising edge of bit 7, nothing else; the drives stay off."""
+
+    def __init__(self, drives: Sequence[Drive], step: float, now_ns: int) -> None:
+        """Begin; arguments as for `Enabling`."""
+        self._drives = drives
+        self._deadline_ns = now_ns + round(step * 1e9)
+        self._edge: dict[int, int] = {}
+
+    @property
+    def done(self) -> bool:
+        """Whether no drive is in a fault any more, nor in a state that nobody knows."""
+        return all(drive.state not in (*_FAULTS, DriveState.UNKNOWN) for drive in self._drives)
+
+    def commands(self, now_ns: int) -> list[tuple[int, int]]:
+        """What to send in this cycle; raises DriverError when the time is over and a fault is still there."""
+        if self.done:
+            return []
+        if now_ns > self._deadline_ns:
+            kept = [drive for drive in self._drives if drive.state in (*_FAULTS, DriveState.UNKNOWN)]
+            raise DriverError(f"the cause is still there: {'; '.join(map(_told, kept))}")
+        words = []
+        for number, drive in enumerate(self._drives):
+            if drive.state is DriveState.FAULT:
+                # First low, in the next cycle high; then again, in case that one of them was lost.
+                phase = self._edge.get(number, 0)
+                self._edge[number] = phase + 1
+                words.append((number, RESET_FAULT if phase % 2 else DISABLE_VOLTAGE))
+        return words
+
+
+def _told(drive: Drive) -> str:
+    if drive.status is None:
+        return f"node {drive.node} has told no status word"
+    words, last = f"node {drive.node} is {drive.state}", drive.emergency
+    return words if last is None else f"{words} ({emergency_words(last.code, last.register, last.vendor)})"

@@ -1,0 +1,156 @@
+"""What every drive is told before anything moves: who it must be, what it protects by itself, which frames it speaks.
+
+Everything that protects is written and read back (FIELDBUS.md 2.5). Entries that a drive may lack are left out where
+it does: SYNC's period and window, the interpolation period, PDOs that are only switched off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from drivers.canopen import dictionary as od
+from drivers.canopen.coordinates import torque_limit_counts
+from drivers.canopen.profile import BusProfile, Write
+from drivers.canopen.sdo import DOES_NOT_EXIST, READ_ONLY, Objects, SdoRefused
+from ident_service.config.canopen import CanopenDrive, DriveIdentity, Reactions
+from ident_service.errors import DriverError
+
+_DRIVE_PROFILE = 402  # low word of 1000h
+_FIRMWARE = 0x100A
+_IDENTITY = {"vendor": od.VENDOR, "product": od.PRODUCT, "revision": od.REVISION, "serial": od.SERIAL}
+
+
+@dataclass(frozen=True)
+class Setup:
+    """One drive's part of the configuration.
+
+    Attributes:
+        drive: its section.
+        profile: of its bus.
+        reactions: to what it finds by itself.
+        lowest: position that the drive itself does not pass [counts]; None where the joints have no limits.
+        highest: the other end.
+    """
+
+    drive: CanopenDrive
+    profile: BusProfile
+    reactions: Reactions
+    lowest: int | None
+    highest: int | None
+
+    def protections(self) -> list[Write]:
+        """What the drive keeps to by itself."""
+        drive = self.drive
+        todo = [
+            Write(od.MAX_TORQUE, torque_limit_counts(drive.max_torque, drive.rated_torque)),
+            Write(od.MAX_SPEED, round(drive.max_speed)),
+            Write(od.QUICK_STOP_OPTION, self.reactions.quick_stop),
+            Write(od.FAULT_OPTION, self.reactions.fault),
+            Write(od.ABORT_CONNECTION, self.reactions.abort_connection),
+        ]
+        if self.lowest is not None and self.highest is not None:
+            todo += [Write(od.LOWER_LIMIT, self.lowest), Write(od.UPPER_LIMIT, self.highest)]
+        return todo
+
+    def timing(self) -> list[Write]:
+        """The cycle, for drives that want to know it."""
+        period_us = round(1e6 / self.profile.rate)
+        power = next(power for power in (-3, -4, -5, -6) if period_us % 10 ** (6 + power) == 0)
+        number = period_us // 10 ** (6 + power)
+        todo = [Write(od.SYNC_PERIOD, period_us), Write(od.SYNC_WINDOW, round(0.9 * period_us))]
+        if number <= 0xFF:
+            todo += [Write(od.PERIOD_POWER, power), Write(od.PERIOD_NUMBER, number)]
+        return todo
+
+
+def identify(objects: Objects, wanted: DriveIdentity) -> str:
+    """Ask a drive who it is.
+
+    Returns:
+        `node 3: vendor 0000019Eh, product ..., revision ..., serial ..., firmware ...`.
+
+    Raises:
+        DriverError: it does not answer, is no drive, or not the one that the configuration names.
+    """
+    kind = objects.read(od.DEVICE_TYPE)
+    if kind & 0xFFFF != _DRIVE_PROFILE:
+        raise DriverError(f"node {objects.node}: is no drive of CiA 402 (1000h is {kind:08X}h)")
+    found = {}
+    for name, entry in (
+        ("vendor", od.VENDOR),
+        ("product", od.PRODUCT),
+        ("revision", od.REVISION),
+        ("serial", od.SERIAL),
+    ):
+        try:
+            found[name] = objects.read(entry)
+        except SdoRefused as refused:  # all but the vendor are optional (CiA 301, 7.5.2.19)
+            if refused.code not in DOES_NOT_EXIST:
+                raise
+    others = [
+        f"{name} is {found[name]:08X}h" if name in found else f"{name} is not told"
+        for name, value in wanted.model_dump(exclude_none=True).items()
+        if found.get(name) != value
+    ]
+    if others:
+        raise DriverError(f"node {objects.node}: is not the drive that the configuration names: {', '.join(others)}")
+    try:
+        firmware = objects.read_bytes(_FIRMWARE, 0, "software version").decode("ascii", "replace").strip("\0 ")
+    except SdoRefused:
+        firmware = "not told"
+    words = ", ".join(f"{name} {value:08X}h" for name, value in found.items())
+    return f"node {objects.node}: {words}, firmware {firmware}"
+
+
+def configure(objects: Objects, setup: Setup) -> None:
+    """Make a pre-operational drive speak the profile and protect itself.
+
+    Raises:
+        DriverError: it refuses or forgets something; the message names the entry and says why.
+    """
+    _rated_torque(objects, setup.drive)
+    for write in setup.protections():
+        objects.set(write)
+    for write in setup.timing():
+        _if_there(objects, write)
+    if not objects.read(od.SUPPORTED_MODES) & od.CST_SUPPORTED:
+        raise DriverError(f"node {objects.node}: does not support cyclic synchronous torque mode (6502h, bit 9)")
+    objects.write(Write(od.MODE, od.CST))
+    silenced = setup.profile.silenced(setup.drive.node)
+    for write in setup.profile.writes(setup.drive.node):
+        if write in silenced:
+            _if_there(objects, write)
+        else:
+            objects.write(write)
+    for guarded in (od.RPDO_DEADLINE, od.HEARTBEAT_CONSUMER):
+        write = next(write for write in setup.profile.writes(setup.drive.node) if write.entry == guarded)
+        if objects.read(write.entry) != write.value:
+            raise DriverError(
+                f"node {objects.node}: {write.entry} does not hold {write.value}: it would not stop by itself"
+            )
+    if (mode := objects.read(od.MODE_DISPLAY)) != od.CST:
+        raise DriverError(f"node {objects.node}: is in mode {mode} (6061h) although {od.CST} was set")
+
+
+def _rated_torque(objects: Objects, drive: CanopenDrive) -> None:
+    """Set what a thousandth is of, or make sure that it is so where the drive alone decides."""
+    wanted = Write(od.RATED_TORQUE, round(1e3 * drive.rated_torque))
+    try:
+        objects.set(wanted)
+    except SdoRefused as refused:
+        if refused.code not in READ_ONLY:
+            raise
+        held = objects.read(od.RATED_TORQUE)
+        if held != wanted.value:
+            raise DriverError(
+                f"node {objects.node}: its rated torque is {held} mN m and cannot be set; "
+                f"the configuration says rated_torque: {drive.rated_torque:g}"
+            ) from None
+
+
+def _if_there(objects: Objects, write: Write) -> None:
+    try:
+        objects.write(write)
+    except SdoRefused as refused:
+        if refused.code not in DOES_NOT_EXIST:
+            raise
