@@ -21,7 +21,7 @@ from ident_service.excitation.following import ExpectedFriction, expected_fricti
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.rigid_body import InverseDynamics
 from ident_service.motion.control import ComputedTorque
-from ident_service.motion.preflight_check import CODES, Check, Verdict, failed, skipped
+from ident_service.motion.preflight_check import ABOUT_THE_MOTION, CODES, Check, Verdict, failed, skipped
 from ident_service.motion.preflight_direction import (
     answer,
     direction_check,
@@ -56,8 +56,6 @@ from ident_service.motion.reference import hold, rest
 LOOK = 1.0  # s
 _LEAST_CYCLES = 100
 _LOOK_AGAIN = 20  # cycles
-# A motion that does not fit or is not proven is not run; holding the arm where it stands is as safe as ever.
-_ABOUT_THE_MOTION = ("motion_fits", "motion_proven", "ways_clear")
 
 Tell = Callable[[Check], None]
 
@@ -162,7 +160,7 @@ class _Preflight:
         friction = expected_friction(self.model, limits, self.model.config.design.friction_guess)
         session = Session(self.arm, self.model, limits, period, home, friction)
         self._passed(noise_check(looked, self.described, self.model, limits, session.mass))
-        if any(c.verdict is Verdict.FAILED and c.code not in _ABOUT_THE_MOTION for c in self.checks.values()):
+        if any(c.verdict is Verdict.FAILED and c.code not in ABOUT_THE_MOTION for c in self.checks.values()):
             return
         if (impossible := holdable(session.gravity, self.model, limits)) is not None:
             self._passed(impossible)
