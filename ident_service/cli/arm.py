@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
 from ident_service.cli.words import Parser, Verbs, seconds, speed
-from ident_service.errors import MotionRefused
+from ident_service.errors import MotionRefused, UsageError
 
 if TYPE_CHECKING:
     from ident_service.config.schema import ArmConfig
@@ -30,6 +30,7 @@ def add(verbs: Verbs) -> None:
     sub = verbs.add("check", _check, "preflight: what must be true before the arm moves (exit code 3: it is not)")
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
+    sub.add_argument("--home", action="store_true", help="for `ident home` and `ident recover`, and no motion")
     sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person: the arm is supported")
     sub = verbs.add("run", _run, "move the arm along a motion and record it")
     _motion(sub)
@@ -94,7 +95,10 @@ def _check(arguments: argparse.Namespace) -> Answer:
             return str(arguments.confirm)
         return input(f"{question} ") if sys.stdin.isatty() and not arguments.json else ""
 
-    ticket = preflight(make_arm(config), arm_model(config), _chosen(config, arguments.motion), confirm=confirm)
+    if arguments.home and arguments.motion is not None:
+        raise UsageError("give a motion or --home, not both")
+    motion = None if arguments.home else _chosen(config, arguments.motion)
+    ticket = preflight(make_arm(config), arm_model(config), motion, confirm=confirm)
     path = ticket_path(state_folder(arguments), config.name)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_ticket(path, ticket)

@@ -36,14 +36,19 @@ def outside(position: Vector, limits: MotionLimits, names: Sequence[str]) -> lis
     ]
 
 
+def reachable(limits: MotionLimits) -> MotionLimits:
+    """The limits, and as far outside as an arm may be led back from."""
+    more = limits.following_error
+    return replace(limits, lower=limits.lower - more, upper=limits.upper + more)
+
+
 def require_near(position: Vector, limits: MotionLimits, names: Sequence[str]) -> None:
     """Refuse to move an arm that stands farther outside its position limits than its following error.
 
     Raises:
         MotionRefused: naming every such joint.
     """
-    reach = replace(limits, lower=limits.lower - limits.following_error, upper=limits.upper + limits.following_error)
-    if outside(position, reach, names):
+    if outside(position, reachable(limits), names):
         raise MotionRefused(
             "farther outside the position limits than a following error: "
             f"{'; '.join(outside(position, limits, names))}; its zero may be wrong: compare the numbers with the arm, "

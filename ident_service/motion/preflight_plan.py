@@ -14,6 +14,7 @@ from ident_service.excitation.proof import objections, proof_of
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
 from ident_service.model.rigid_body import InverseDynamics
+from ident_service.motion.plans import Destination, GoTo
 from ident_service.motion.preflight_check import Check, Measure, Verdict, failed, judged, measure, measures
 from ident_service.motion.preflight_stability import INERTIA, stability
 from ident_service.motion.reference import PathReference, rest
@@ -112,6 +113,16 @@ def stability_check(model: ArmModel, limits: MotionLimits, excitation: Excitatio
         f"Lower kp and kd, raise control.velocity_cutoff or control.rate, or give the prior its drive inertia; inertia "
         f"is taken to be {INERTIA[0]:g} to {INERTIA[1]:g} times the model's.",
     )
+
+
+def way_home_check(model: ArmModel, limits: MotionLimits, position: Vector) -> Check:
+    """Whether the straight way home from where the arm stands ([rad or m], shape (joints,)) is within limits and clear."""
+    code = "ways_clear"
+    try:
+        ((_, leg),) = GoTo(Destination.HOME).legs(model, position, limits)
+    except (ModelError, MotionRefused) as error:
+        return failed(code, str(error), "Move the arm by hand to where the straight way home is free.")
+    return Check(code, Verdict.PASSED, (measure("the way home, length", leg.duration, "s"),))
 
 
 def ways_check(model: ArmModel, limits: MotionLimits, excitation: Excitation, position: Vector) -> Check:
