@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
+from ident_service.cli.moving import RELEASED, HeldKey, moved, require_terminal
 from ident_service.cli.words import Parser, Verbs, seconds, speed
 from ident_service.errors import MotionRefused, UsageError
 
@@ -35,8 +36,9 @@ def add(verbs: Verbs) -> None:
     sub = verbs.add("run", _run, "move the arm along a motion and record it")
     _motion(sub)
     sub.add_argument("--speed", type=speed, default=1.0, metavar="SHARE", help="of the motion's own speed")
-    sub = verbs.add("rehearse", _run, "the run at a fifth of its speed; Ctrl-C stops")
+    sub = verbs.add("rehearse", _rehearse, "the run at a fifth of its speed, while the space bar is held")
     _motion(sub)
+    sub.add_argument("--no-key", action="store_true", help="no key to hold; Ctrl-C and `ident stop` stop")
     sub.add_argument("--speed", type=speed, default=_REHEARSAL, metavar="SHARE", help="of the motion's own speed")
     for name, text in (
         ("stop", "bring the arm to a controlled stop; needs no lease and always works"),
@@ -108,44 +110,40 @@ def _check(arguments: argparse.Namespace) -> Answer:
 
 def _run(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
-    from ident_service.motion.preflight_ticket import read_ticket
-    from ident_service.service.arm_state import ticket_path
-    from ident_service.service.commission import new_run_folder
-    from ident_service.service.run import run_motion
 
     config = load_arm(arguments.arm)
     motion = _chosen(config, arguments.motion)
-    state = state_folder(arguments)
-    path = ticket_path(state, config.name)
-    if not path.exists():
-        raise MotionRefused(f"{config.name}: not checked yet; `ident check` comes before every motion")
-    folder = arguments.out or new_run_folder(state, config.name)
-    tell(arguments, f"{config.name}: {motion.name} motion of {motion.duration / arguments.speed:g} s, into {folder}")
+    sentence = f"{motion.name} motion of {motion.duration / arguments.speed:g} s"
     stopping = StopOnSignal()
     with stopping:
-        ran = run_motion(
+        return moved(arguments, config, motion, sentence, speed=arguments.speed, stop_requested=stopping.requested)
+
+
+def _rehearse(arguments: argparse.Namespace) -> Answer:
+    if arguments.no_key:
+        return _run(arguments)
+    terminal = require_terminal(arguments)
+    from ident_service.config.load import load_arm
+    from ident_service.motion.controls import HOLD_TO_RUN_SECONDS
+
+    config = load_arm(arguments.arm)
+    motion = _chosen(config, arguments.motion)
+    sentence = f"{motion.name} motion of {motion.duration / arguments.speed:g} s while the space bar is held"
+    stopping = StopOnSignal()
+    with stopping, HeldKey(terminal) as key:
+        tell(arguments, f"{config.name}: hold the space bar: the arm begins to move some seconds later")
+        tell(arguments, f"release it: the arm stops ({RELEASED:g} s without the key), and the rehearsal is over")
+        if not key.wait(stopping.requested):
+            raise MotionRefused("nobody held the key; nothing has moved")
+        return moved(
+            arguments,
             config,
             motion,
-            folder,
-            state,
-            read_ticket(path),
+            sentence,
             speed=arguments.speed,
-            tell=lambda word: tell(arguments, word),
-            stop_requested=stopping.requested,
+            lease=HOLD_TO_RUN_SECONDS,
+            stop_requested=lambda: stopping.requested() or key.released(),
         )
-    report = ran.report
-    warnings = ", ".join(f"{code} {count} times" for code, count in report["warnings"].items()) or "none"
-    lateness, compute = report["lateness"], report["compute"]
-    text = (
-        f"{report['state']} after {report['cycles']} cycles; warnings: {warnings}\n"
-        f"{report['real_time']}\n"
-        f"woke late by below {lateness['median_below_us']:g} us (median), {lateness['p999_below_us']:g} us (99.9 %), "
-        f"at worst {lateness['worst_us']:.0f} us\n"
-        f"computed for below {compute['median_below_us']:g} us (median), {compute['p999_below_us']:g} us (99.9 %), "
-        f"at worst {compute['worst_us']:.0f} us\n"
-        f"files: {folder}\n" + "".join(f"  {path.name}\n" for path in sorted(folder.iterdir()))
-    )
-    return DONE, text, {"folder": str(folder), "report": report}
 
 
 def _ask(arguments: argparse.Namespace) -> Answer:

@@ -116,7 +116,7 @@ def stability_check(model: ArmModel, limits: MotionLimits, excitation: Excitatio
 
 
 def way_home_check(model: ArmModel, limits: MotionLimits, position: Vector) -> Check:
-    """Whether the straight way home from where the arm stands ([rad or m], shape (joints,)) is within limits and clear."""
+    """Whether the straight way home is clear, from where the arm stands [rad or m], shape (joints,)."""
     code = "ways_clear"
     try:
         ((_, leg),) = GoTo(Destination.HOME).legs(model, position, limits)
