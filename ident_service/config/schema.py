@@ -118,7 +118,7 @@ class Body(Section):
 class Joint(Section):
     """Limits, gains and body of one joint; what a motion needs may be left out of an arm that is only identified.
 
-    `drive_inertia` [kg m^2 or kg] is what its rotors have at the joint by their data sheets, so the least that is there.
+    `drive_inertia` [kg m^2 or kg] is what its rotors have at the joint by data sheet, the least that is there.
     Margins of the gains are stated with it where the prior, a CAD model of the links, lacks it.
     """
 
