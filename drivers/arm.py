@@ -102,7 +102,24 @@ class Arm(ABC):
 
     @abstractmethod
     def enable(self) -> None:
-        """Energise all axes with zero torque. Raises DriverError; on failure no axis stays energised."""
+        """Energise all axes with zero torque; what a watchdog or a quick stop left behind ends with it.
+
+        Raises:
+            DriverError: a drive has latched a fault of its own or an emergency stop, which only `reset` clears, or
+                refuses for another reason; no axis stays energised.
+        """
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Clear what the drives have latched: faults of their own, an emergency stop, their watchdog.
+
+        For a person who knows why; no loop calls it. Nothing is energised by it, and an axis that is braked stays
+        braked: an arm without brakes must not fall because a fault is forgotten. Without anything latched it does
+        nothing. The status of the next sample says what came of it.
+
+        Raises:
+            DriverError: not open, enabled, or a drive keeps its fault, because the cause is still there.
+        """
 
     @abstractmethod
     def exchange(self, torque: Vector | None) -> Sample:

@@ -114,6 +114,11 @@ class SimulatedArm(Arm):
         self._require_open()
         self._machine.enable()
 
+    def reset(self) -> None:
+        """Clear what the drives have latched, as the contract has it; raises DriverError when not open."""
+        self._require_open()
+        self._machine.reset()
+
     def exchange(self, torque: Vector | None) -> Sample:
         """One cycle, as the contract has it; None while enabled lets the last torque act on, as drives do.
 

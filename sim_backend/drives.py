@@ -2,7 +2,8 @@
 
 A drive is on, off, or idle. Off, an axis coasts. Idle, its windings are shorted and brake it like viscous friction,
 `tau = -b dq`, as the WAM's do. Without a torque frame for the watchdog's time, whatever the host believes, all drives
-go idle and stay so until they are enabled again.
+go idle and stay so until they are enabled again. A drive's own fault and an emergency stop stay latched until `reset`,
+which leaves their axes idle.
 
 Boundary: torques only, period by period; who may send one is `arm.py`, what a drive can make of it `imperfections.py`.
 """
@@ -90,8 +91,18 @@ class Drives:
         """Bits of `AxisStatus` per axis."""
         return self._words
 
+    @property
+    def latched(self) -> tuple[int, ...]:
+        """Axes that only `reset` lets be enabled again."""
+        return tuple(np.flatnonzero(self._trips & int(AxisStatus.FAULT | AxisStatus.EMERGENCY_STOP)).tolist())
+
+    def reset(self) -> None:
+        """Forget faults, emergency stop and watchdog; their axes are left idle, that is braked."""
+        self._trips[self._trips != 0] = int(AxisStatus.IDLE)
+        self._silent = 0
+
     def enable(self) -> None:
-        """Energise without torque, and forget why the drives had given up."""
+        """Energise without torque, and forget that the drives had given up for silence."""
         self._forget()
         self._trips[:] = 0
         self._silent = 0

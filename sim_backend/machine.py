@@ -134,13 +134,30 @@ class Machine:
         """Energise with zero torque.
 
         Raises:
-            DriverError: a fault that struck in the last cycle forbids it; the drives are off then.
+            DriverError: a fault forbids it that struck in the last cycle or is latched; the drives are off then.
         """
-        why = self._drives.refusal(active_faults(self.faults, self.tick - 1), self.plant.chain.names)
+        names = self.plant.chain.names
+        why = self._drives.refusal(active_faults(self.faults, self.tick - 1), names)
+        if why is None and (latched := self._drives.latched):
+            which = ", ".join(names[axis] for axis in latched)
+            why = f"{which}: a fault or an emergency stop is latched; `ident recover` resets it"
         if why is not None:
             self._drives.release(StopKind.TORQUE_OFF)
             raise DriverError(f"cannot be enabled: {why}")
         self._drives.enable()
+
+    def reset(self) -> None:
+        """Clear what the drives have latched; nothing is energised.
+
+        Raises:
+            DriverError: enabled, or the cause of a fault is still there.
+        """
+        if self.enabled:
+            raise DriverError("drives are reset before they are enabled, not while")
+        why = self._drives.refusal(active_faults(self.faults, self.tick - 1), self.plant.chain.names)
+        if why is not None:
+            raise DriverError(f"cannot be reset: {why}")
+        self._drives.reset()
 
     def stop(self, kind: StopKind) -> None:
         """No torque from the end of this period on: coasting after a torque off, braked after a quick stop."""

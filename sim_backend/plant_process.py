@@ -188,6 +188,8 @@ class PlantProcess:
                 return self._cycle(request)
             if isinstance(request, wire.Enable):
                 machine.enable()
+            elif isinstance(request, wire.Reset):
+                machine.reset()
             elif isinstance(request, wire.Stop):
                 machine.stop(StopKind.QUICK_STOP if request.brakes else StopKind.TORQUE_OFF)
             else:

@@ -132,6 +132,11 @@ class RemoteArm(Arm):
         self._done(self._ask(wire.Enable(), self._deadline))
         self._enabled = True
 
+    def reset(self) -> None:
+        """Clear what the drives have latched, as the contract has it; raises DriverError when not open."""
+        self._require_open()
+        self._done(self._ask(wire.Reset(), self._deadline))
+
     def exchange(self, torque: Vector | None) -> Sample:
         """One cycle, as the contract has it; a cycle without a torque is silence for the drives' watchdog.
 

@@ -6,6 +6,7 @@ answers every request with one reply that has its number, in order::
 
     Hello    -> Welcome | Refused      who is there; a plant serves one client at a time
     Enable   -> Done | Failed
+    Reset    -> Done | Failed          what the drives have latched
     Exchange -> Answer | Failed        one cycle
     Stop     -> Done
 
@@ -26,7 +27,7 @@ from drivers.arm import Counts, Flags, Vector
 from ident_service.errors import DriverError
 
 MAGIC = b"IDP"
-VERSION = 1
+VERSION = 2
 _HEADER = struct.Struct("<3sBBxHI")  # magic, version, kind, -, joints (0 where no field is per joint), number
 _TEXT = 480
 MAX_BYTES = 65536
@@ -59,6 +60,11 @@ class Refused:
 @dataclass(frozen=True, slots=True)
 class Enable:
     """Energise with zero torque."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reset:
+    """Clear what the drives have latched."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +113,7 @@ class Answer:
     true_torque: Vector
 
 
-Request = Hello | Enable | Exchange | Stop
+Request = Hello | Enable | Reset | Exchange | Stop
 Reply = Welcome | Refused | Done | Failed | Answer
 
 # Kind, frame, and per field: struct code, and whether there is one per joint.
@@ -117,6 +123,7 @@ TABLE: tuple[tuple[int, type[Request] | type[Reply], tuple[tuple[str, bool], ...
     (2, Enable, ()),
     (3, Exchange, (("q", _ONE), ("B", _ONE), ("d", _EACH))),
     (4, Stop, (("B", _ONE),)),
+    (5, Reset, ()),
     (65, Welcome, (("i", _ONE),)),
     (66, Refused, (("B", _ONE), ("i", _ONE))),
     (67, Done, ()),

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
+from ident_service.cli.moving import RELEASED, HeldKey, moved, require_terminal
 from ident_service.cli.words import Parser, Verbs, seconds, speed
-from ident_service.errors import MotionRefused
+from ident_service.errors import MotionRefused, UsageError
 
 if TYPE_CHECKING:
     from ident_service.config.schema import ArmConfig
@@ -30,12 +31,14 @@ def add(verbs: Verbs) -> None:
     sub = verbs.add("check", _check, "preflight: what must be true before the arm moves (exit code 3: it is not)")
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
+    sub.add_argument("--home", action="store_true", help="for `ident home` and `ident recover`, and no motion")
     sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person: the arm is supported")
     sub = verbs.add("run", _run, "move the arm along a motion and record it")
     _motion(sub)
     sub.add_argument("--speed", type=speed, default=1.0, metavar="SHARE", help="of the motion's own speed")
-    sub = verbs.add("rehearse", _run, "the run at a fifth of its speed; Ctrl-C stops")
+    sub = verbs.add("rehearse", _rehearse, "the run at a fifth of its speed, while the space bar is held")
     _motion(sub)
+    sub.add_argument("--no-key", action="store_true", help="no key to hold; Ctrl-C and `ident stop` stop")
     sub.add_argument("--speed", type=speed, default=_REHEARSAL, metavar="SHARE", help="of the motion's own speed")
     for name, text in (
         ("stop", "bring the arm to a controlled stop; needs no lease and always works"),
@@ -94,7 +97,10 @@ def _check(arguments: argparse.Namespace) -> Answer:
             return str(arguments.confirm)
         return input(f"{question} ") if sys.stdin.isatty() and not arguments.json else ""
 
-    ticket = preflight(make_arm(config), arm_model(config), _chosen(config, arguments.motion), confirm=confirm)
+    if arguments.home and arguments.motion is not None:
+        raise UsageError("give a motion or --home, not both")
+    motion = None if arguments.home else _chosen(config, arguments.motion)
+    ticket = preflight(make_arm(config), arm_model(config), motion, confirm=confirm)
     path = ticket_path(state_folder(arguments), config.name)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_ticket(path, ticket)
@@ -104,44 +110,40 @@ def _check(arguments: argparse.Namespace) -> Answer:
 
 def _run(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
-    from ident_service.motion.preflight_ticket import read_ticket
-    from ident_service.service.arm_state import ticket_path
-    from ident_service.service.commission import new_run_folder
-    from ident_service.service.run import run_motion
 
     config = load_arm(arguments.arm)
     motion = _chosen(config, arguments.motion)
-    state = state_folder(arguments)
-    path = ticket_path(state, config.name)
-    if not path.exists():
-        raise MotionRefused(f"{config.name}: not checked yet; `ident check` comes before every motion")
-    folder = arguments.out or new_run_folder(state, config.name)
-    tell(arguments, f"{config.name}: {motion.name} motion of {motion.duration / arguments.speed:g} s, into {folder}")
+    sentence = f"{motion.name} motion of {motion.duration / arguments.speed:g} s"
     stopping = StopOnSignal()
     with stopping:
-        ran = run_motion(
+        return moved(arguments, config, motion, sentence, speed=arguments.speed, stop_requested=stopping.requested)
+
+
+def _rehearse(arguments: argparse.Namespace) -> Answer:
+    if arguments.no_key:
+        return _run(arguments)
+    terminal = require_terminal(arguments)
+    from ident_service.config.load import load_arm
+    from ident_service.motion.controls import HOLD_TO_RUN_SECONDS
+
+    config = load_arm(arguments.arm)
+    motion = _chosen(config, arguments.motion)
+    sentence = f"{motion.name} motion of {motion.duration / arguments.speed:g} s while the space bar is held"
+    stopping = StopOnSignal()
+    with stopping, HeldKey(terminal) as key:
+        tell(arguments, f"{config.name}: hold the space bar: the arm begins to move some seconds later")
+        tell(arguments, f"release it: the arm stops ({RELEASED:g} s without the key), and the rehearsal is over")
+        if not key.wait(stopping.requested):
+            raise MotionRefused("nobody held the key; nothing has moved")
+        return moved(
+            arguments,
             config,
             motion,
-            folder,
-            state,
-            read_ticket(path),
+            sentence,
             speed=arguments.speed,
-            tell=lambda word: tell(arguments, word),
-            stop_requested=stopping.requested,
+            lease=HOLD_TO_RUN_SECONDS,
+            stop_requested=lambda: stopping.requested() or key.released(),
         )
-    report = ran.report
-    warnings = ", ".join(f"{code} {count} times" for code, count in report["warnings"].items()) or "none"
-    lateness, compute = report["lateness"], report["compute"]
-    text = (
-        f"{report['state']} after {report['cycles']} cycles; warnings: {warnings}\n"
-        f"{report['real_time']}\n"
-        f"woke late by below {lateness['median_below_us']:g} us (median), {lateness['p999_below_us']:g} us (99.9 %), "
-        f"at worst {lateness['worst_us']:.0f} us\n"
-        f"computed for below {compute['median_below_us']:g} us (median), {compute['p999_below_us']:g} us (99.9 %), "
-        f"at worst {compute['worst_us']:.0f} us\n"
-        f"files: {folder}\n" + "".join(f"  {path.name}\n" for path in sorted(folder.iterdir()))
-    )
-    return DONE, text, {"folder": str(folder), "report": report}
 
 
 def _ask(arguments: argparse.Namespace) -> Answer:

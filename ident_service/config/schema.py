@@ -115,7 +115,11 @@ class Body(Section):
 
 
 class Joint(Section):
-    """Limits, gains and body of one joint; what a motion needs may be left out of an arm that is only identified."""
+    """Limits, gains and body of one joint; what a motion needs may be left out of an arm that is only identified.
+
+    `drive_inertia` [kg m^2 or kg] is what its rotors have at the joint by data sheet, the least that is there.
+    Margins of the gains are stated with it where the prior, a CAD model of the links, lacks it.
+    """
 
     position: Interval | None = None
     velocity: Positive | None = None
@@ -126,6 +130,7 @@ class Joint(Section):
     home: Angle | None = None
     kp: Positive | None = None
     kd: Positive | None = None
+    drive_inertia: NonNegative | None = None
     body: Body = Body()
 
     @model_validator(mode="after")

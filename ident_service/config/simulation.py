@@ -72,13 +72,13 @@ FAULT_RULES: dict[FaultKind, FaultRule] = {
     FaultKind.STUCK_TORQUE: FaultRule("the torque of the cycle before goes on acting"),
     FaultKind.TORQUE_SIGN: FaultRule("the opposite torque acts, and the sample does not say so", stays=True),
     FaultKind.TORQUE_SATURATION: FaultRule("torques clipped below the limit", "share of the limit", stays=True),
-    FaultKind.DRIVE_FAULT: FaultRule("no torque until enabled again, the axis coasts; status says fault", stays=True),
+    FaultKind.DRIVE_FAULT: FaultRule("no torque until reset, the axis coasts; status says fault", stays=True),
     FaultKind.NODE_SILENT: FaultRule(
         "as lost feedback, and no torque but resistive braking until enabled again, which no sample says",
         stays=True,
     ),
     FaultKind.EMERGENCY_STOP: FaultRule(
-        "no torque but resistive braking until enabled again; status says so", of_joint=False, stays=True
+        "no torque but resistive braking until reset; status says so", of_joint=False, stays=True
     ),
     # What happens to the plant.
     FaultKind.LOAD_ATTACHED: FaultRule("a point mass on the last link", "mass [kg]", of_joint=False, stays=True),

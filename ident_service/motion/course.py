@@ -10,11 +10,9 @@ from collections.abc import Generator, Sequence
 from ident_service.config.limits import MotionLimits
 from ident_service.errors import MotionRefused
 from ident_service.motion.pause import Paused, Resumed
-from ident_service.motion.reference import Reference, Setpoint
+from ident_service.motion.reference import Reference, Setpoint, hold
 from ident_service.motion.states import MOVING, STOPPABLE, State, States
 from ident_service.motion.stop import stop
-
-_FOLLOWER = {State.APPROACHING: State.EXCITING, State.EXCITING: State.RETURNING, State.RETURNING: State.DONE}
 
 
 class Course:
@@ -22,26 +20,38 @@ class Course:
 
     Attributes:
         reference: of the last cycle.
+        first: the state of the first way.
+        complete: whether the last way has been followed to its end.
     """
 
     def __init__(
-        self, states: States, ways: Sequence[Reference], start: Setpoint, limits: MotionLimits, resuming: MotionLimits
+        self,
+        states: States,
+        legs: Sequence[tuple[State, Reference]],
+        start: Setpoint,
+        limits: MotionLimits,
+        resuming: MotionLimits,
+        *,
+        held: bool = False,
     ) -> None:
         """Plan to move.
 
         Args:
             states: armed when the first cycle comes.
-            ways: approach, motion, return.
+            legs: ways and the states in which they are followed, in order; states is armed, the first comes next.
             start: where the arm stands.
             limits: of the arm, for stops and pauses.
             resuming: of ways out of pauses.
+            held: whether the end of the last way is held like the end of a stop, instead of being done at once.
         """
         self.reference = start
+        self.complete = False
         self._states = states
         self._limits, self._resuming = limits, resuming
-        self._way, *self._later = ways
+        self._held = held
+        (self.first, self._way), *self._later = legs
         self._begin_ns: int | None = None
-        self._left = State.APPROACHING  # what a pause interrupts
+        self._left = self.first  # what a pause interrupts
         self._paused: Paused | None = None
         self._search: Generator[None, None, Resumed] | None = None
         self._back: Resumed | None = None
@@ -55,12 +65,15 @@ class Course:
         if states.state is State.RESUMING and self._back is not None and elapsed >= self._back.back:
             states.enter(self._left)
         while states.state in MOVING and elapsed >= self._way.duration:
-            states.enter(_FOLLOWER[states.state])
-            if states.state is State.DONE:
-                break
             self._begin_ns += round(self._way.duration * 1e9)
-            self._way, self._back = self._later.pop(0), None
             elapsed = (stamp_ns - self._begin_ns) * 1e-9
+            if self._later:
+                (state, self._way), self._back = self._later.pop(0), None
+                states.enter(state)
+                continue
+            self.complete = True
+            states.enter(State.STOPPING if self._held else State.DONE)
+            self._way = hold(self._way.at(self._way.duration).position, 0.0)
         self.reference = self._way.at(elapsed)
         return self.reference
 

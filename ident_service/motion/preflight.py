@@ -21,7 +21,8 @@ from ident_service.excitation.following import ExpectedFriction, expected_fricti
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.rigid_body import InverseDynamics
 from ident_service.motion.control import ComputedTorque
-from ident_service.motion.preflight_check import CODES, Check, Verdict, failed, skipped
+from ident_service.motion.outside import admitting, reachable
+from ident_service.motion.preflight_check import ABOUT_THE_MOTION, CODES, Check, Verdict, failed, skipped
 from ident_service.motion.preflight_direction import (
     answer,
     direction_check,
@@ -46,6 +47,7 @@ from ident_service.motion.preflight_plan import (
     motion_fits_check,
     motion_proven_check,
     stability_check,
+    way_home_check,
     ways_check,
 )
 from ident_service.motion.preflight_session import Session
@@ -56,8 +58,6 @@ from ident_service.motion.reference import hold, rest
 LOOK = 1.0  # s
 _LEAST_CYCLES = 100
 _LOOK_AGAIN = 20  # cycles
-# A motion that does not fit or is not proven is not run; holding the arm where it stands is as safe as ever.
-_ABOUT_THE_MOTION = ("motion_fits", "motion_proven", "ways_clear")
 
 Tell = Callable[[Check], None]
 
@@ -65,7 +65,7 @@ Tell = Callable[[Check], None]
 def preflight(
     arm: Arm,
     model: ArmModel,
-    excitation: Excitation,
+    excitation: Excitation | None,
     *,
     confirm: Confirm = lambda question: "",
     clock: Clock | None = None,
@@ -79,7 +79,8 @@ def preflight(
     Args:
         arm: not open; it stands on its support, without torque.
         model: of the arm.
-        excitation: to be run.
+        excitation: to be run; None to check the arm for a way home or out of a limit, which may begin a little outside
+            the position limits.
         confirm: shows a question and returns what a person typed; asked once, before anything is energised.
         clock: whose UTC the ticket is stamped with; by default the machine's. The loop has the arm's own.
         identities: of the drives, as an earlier ticket has them; None accepts whatever answers.
@@ -106,7 +107,7 @@ class _Preflight:
         self,
         arm: Arm,
         model: ArmModel,
-        excitation: Excitation,
+        excitation: Excitation | None,
         confirm: Confirm,
         identities: Sequence[str] | None,
         tell: Tell,
@@ -123,8 +124,9 @@ class _Preflight:
         if not self._passed(configuration_check(self.model)):
             return
         limits = motion_limits(self.model.config)
-        if self._passed(motion_fits_check(self.model, self.excitation)):
-            self._passed(motion_proven_check(self.model, limits, self.excitation))
+        motion = self.excitation
+        if motion is not None and self._passed(motion_fits_check(self.model, motion)):
+            self._passed(motion_proven_check(self.model, limits, motion))
         self._passed(stability_check(self.model, limits, self.excitation))
         try:
             with self.arm:
@@ -143,7 +145,10 @@ class _Preflight:
         """Every check; those that were not made say because of which."""
         because = next((code for code, check in self.checks.items() if check.verdict is Verdict.FAILED), None)
         why = "nothing before it failed, but it was not reached" if because is None else f"because {because} failed"
-        return [self.checks.get(code) or skipped(code, why) for code in CODES]
+        made = dict(self.checks)
+        if self.excitation is None:
+            made |= {code: skipped(code, "no motion is asked about") for code in ("motion_fits", "motion_proven")}
+        return [made.get(code) or skipped(code, why) for code in CODES]
 
     def _opened(self, limits: MotionLimits) -> None:
         self.described = self.arm.describe()
@@ -153,16 +158,21 @@ class _Preflight:
         looked = look(self.arm, cycles, period, self._load(first, limits, period))
         if not self._passed(identities_check(self.described, self.model, limits, self.identities, looked)):
             return
-        if not self._passed(at_rest_check(looked, self.model, limits)):
+        # A motion begins inside the limits; a way home may begin as far outside as the arm may be led back from.
+        bounds = limits if self.excitation is not None else reachable(limits)
+        if not self._passed(at_rest_check(looked, self.model, bounds)):
             return
         home = looked.samples[-1].position.copy()
-        if self.checks["motion_fits"].verdict is Verdict.PASSED:
+        if self.excitation is None:
+            self._passed(way_home_check(self.model, limits, home))
+            limits = admitting(home, limits)
+        elif self.checks["motion_fits"].verdict is Verdict.PASSED:
             self._passed(ways_check(self.model, limits, self.excitation, home))
         self._passed(rate_check(looked, self.arm.clock.lock_step))
         friction = expected_friction(self.model, limits, self.model.config.design.friction_guess)
         session = Session(self.arm, self.model, limits, period, home, friction)
         self._passed(noise_check(looked, self.described, self.model, limits, session.mass))
-        if any(c.verdict is Verdict.FAILED and c.code not in _ABOUT_THE_MOTION for c in self.checks.values()):
+        if any(c.verdict is Verdict.FAILED and c.code not in ABOUT_THE_MOTION for c in self.checks.values()):
             return
         if (impossible := holdable(session.gravity, self.model, limits)) is not None:
             self._passed(impossible)
@@ -172,7 +182,7 @@ class _Preflight:
             self._passed(agreed.check)
         # A person may have taken minutes to answer, and may have moved the arm meanwhile.
         again = look(self.arm, _LOOK_AGAIN, period)
-        if (still := at_rest_check(again, self.model, limits)).verdict is not Verdict.PASSED:
+        if (still := at_rest_check(again, self.model, bounds)).verdict is not Verdict.PASSED:
             self._passed(still)
             return
         session = Session(self.arm, self.model, limits, period, again.samples[-1].position, friction)
@@ -184,7 +194,9 @@ class _Preflight:
     def _touched(self, session: Session, limits: MotionLimits, friction: ExpectedFriction) -> bool:
         """Hold the arm and move it a little; True when it is held afterwards and all its joints are known."""
         try:
-            planned = strokes(session, self.model, limits)
+            # Of a joint that stands outside its limits none leads farther out.
+            room = admitting(session.home, motion_limits(self.model.config), 0.0)
+            planned = strokes(session, self.model, room)
         except (ModelError, MotionRefused) as error:
             planned = []
             self._passed(failed("direction", str(error), "Move the arm by hand to where every joint has room."))

@@ -38,6 +38,9 @@ CODES = (
     "watchdog",
 )
 
+# What these find is wrong with the motion, or with where the arm stands for it; the arm may be held, and sent home.
+ABOUT_THE_MOTION = ("motion_fits", "motion_proven", "ways_clear")
+
 
 @dataclass(frozen=True)
 class Measure:

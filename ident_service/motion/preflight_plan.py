@@ -14,8 +14,9 @@ from ident_service.excitation.proof import objections, proof_of
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
 from ident_service.model.rigid_body import InverseDynamics
+from ident_service.motion.plans import Destination, GoTo
 from ident_service.motion.preflight_check import Check, Measure, Verdict, failed, judged, measure, measures
-from ident_service.motion.preflight_stability import INERTIA, stability
+from ident_service.motion.preflight_stability import INERTIA, LEAST_GAIN_MARGIN, delay_of, stability
 from ident_service.motion.reference import PathReference, rest
 from ident_service.motion.stop import require_stops_within_limits
 from ident_service.motion.surroundings import stop_clearance, way_clearance
@@ -91,9 +92,7 @@ def stability_check(model: ArmModel, limits: MotionLimits, excitation: Excitatio
     postures = np.vstack([limits.home, 0.5 * (limits.lower + limits.upper)])
     if path is not None:
         postures = np.vstack([postures, path.at(np.linspace(0.0, path.duration, _POSTURES))[0]])
-    # A driver that knows of more delay than the contract's one cycle says so in its section.
-    delay = getattr(model.config.driver, "delay_cycles", 1)
-    report = stability(model, limits, delay if isinstance(delay, int) and delay > 1 else 1, postures)
+    report = stability(model, limits, delay_of(model.config), postures)
     names, ones = model.chain.names, ("",) * model.chain.joints
     radius, gain, more = (
         np.array([getattr(one, key) for one in report.joints]) for key in ("radius", "gain_margin", "delay_margin")
@@ -101,7 +100,7 @@ def stability_check(model: ArmModel, limits: MotionLimits, excitation: Excitatio
     most = np.full(len(names), np.nextafter(1.0, 0.0))
     found = [
         *measures("largest spectral radius", radius, ones, names, most=most),
-        *measures("gain margin", gain, ones, names),
+        *measures("gain margin", gain, ones, names, least=np.full(len(names), LEAST_GAIN_MARGIN)),
         *measures("delay margin", more * 1e3, ("ms",) * len(names), names),
     ]
     if report.coupled_radius is not None:
@@ -112,6 +111,16 @@ def stability_check(model: ArmModel, limits: MotionLimits, excitation: Excitatio
         f"Lower kp and kd, raise control.velocity_cutoff or control.rate, or give the prior its drive inertia; inertia "
         f"is taken to be {INERTIA[0]:g} to {INERTIA[1]:g} times the model's.",
     )
+
+
+def way_home_check(model: ArmModel, limits: MotionLimits, position: Vector) -> Check:
+    """Whether the straight way home is clear, from where the arm stands [rad or m], shape (joints,)."""
+    code = "ways_clear"
+    try:
+        ((_, leg),) = GoTo(Destination.HOME).legs(model, position, limits)
+    except (ModelError, MotionRefused) as error:
+        return failed(code, str(error), "Move the arm by hand to where the straight way home is free.")
+    return Check(code, Verdict.PASSED, (measure("the way home, length", leg.duration, "s"),))
 
 
 def ways_check(model: ArmModel, limits: MotionLimits, excitation: Excitation, position: Vector) -> Check:

@@ -11,8 +11,9 @@ linear recursion is below 1. A delay between whole cycles is exact too: the torq
 
 The true inertia is any sum of the links' inertias, each between `INERTIA` times the model's, plus drive inertia that
 the model lacks. A model without any drive inertia for a joint (a CAD model of the links) lacks some, so that such a
-joint's link is taken to be no lighter than modelled. Friction and gravity's stiffness are left out: the first only
-damps, the second is small beside K_p. Margins are stated for the model's own inertia.
+joint's link is taken to be no lighter than modelled, unless the description's `drive_inertia` says what its rotors have
+at least. Friction and gravity's stiffness are left out: the first only damps, the second is small beside K_p. Margins
+are stated for the least inertia that is known to be there: the model's, and what `drive_inertia` says beyond it.
 
 Boundary: pure computation.
 """
@@ -25,6 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident_service.config.limits import MotionLimits, Vector
+from ident_service.config.schema import ArmConfig
 from ident_service.errors import UsageError
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.rigid_body import InverseDynamics
@@ -33,6 +35,7 @@ INERTIA = (0.5, 2.0)  # every link's true inertia, as a share of the model's
 # Drive inertia that the model lacks, as a share of the joint's inertia: where it has some, and where it has none.
 # Behind the WAM's wrist the drives are forty times what its CAD model knows.
 KNOWN_DRIVE, UNKNOWN_DRIVE = 1.0, 50.0
+LEAST_GAIN_MARGIN = 2.0  # 6 dB, as textbooks ask (Astrom & Murray, Feedback Systems, ch. 10: 2 to 5)
 _MOST_GAIN, _MOST_DELAY = 1e3, 50.0
 _RANDOM_CASES, _RANDOM_POSTURES, _SEED = 8, 4, 20140101
 _ROUNDING = 1e-9
@@ -69,14 +72,16 @@ class JointStability:
     Attributes:
         joint: its name.
         lightest: the least true inertia looked at, as a share of the model's.
+        known: the inertia that margins are stated for, as a share of the model's; 1 without `drive_inertia`.
         radius: the largest spectral radius over the range of inertias.
-        gain_margin: the loop gain may rise by this factor above the model's before it oscillates; 1000 stands for more,
-            and 1 for none.
-        delay_margin: so much may be added to the delay at the model's inertia [s]; 0 for none.
+        gain_margin: the loop gain may rise by this factor at the known inertia before it oscillates; 1000 stands for
+            more, and 1 for none.
+        delay_margin: so much may be added to the delay at the known inertia [s]; 0 for none.
     """
 
     joint: str
     lightest: float
+    known: float
     radius: float
     gain_margin: float
     delay_margin: float
@@ -112,9 +117,20 @@ class StabilityReport:
             for one in self.joints
             if not one.radius < 1.0
         ]
+        found += [
+            f"{one.joint}: gain margin {one.gain_margin:.2f}, at least {LEAST_GAIN_MARGIN:g} is needed"
+            for one in self.joints
+            if one.radius < 1.0 and one.gain_margin < LEAST_GAIN_MARGIN
+        ]
         if self.coupled_radius is not None and not self.coupled_radius < 1.0:
             found.append(f"all joints together are unstable (spectral radius {self.coupled_radius:.4f})")
         return found
+
+
+def delay_of(config: ArmConfig) -> int:
+    """Cycles from a sample to the torque computed from it, where the driver knows of more than the contract's one."""
+    delay = getattr(config.driver, "delay_cycles", 1)
+    return delay if isinstance(delay, int) and delay > 1 else 1
 
 
 def stability(
@@ -137,16 +153,22 @@ def stability(
         raise UsageError(f"{delay_cycles=}, but no torque can act before it is computed")
     control = model.config.control
     loop = Loop(limits.kp, limits.kd, 1.0 / control.rate, control.velocity_cutoff, float(delay_cycles))
+    some = _postures(limits) if postures is None else postures
     lightest, unknown = _lightest_and_unknown(model)
+    drives = _known_drives(model)
+    # Where a joint's links are heaviest, its drives help least.
+    more = 0.0 * drives
+    if model.prior is not None:
+        more = drives / np.einsum("skk->sk", _mass_matrices(model, model.prior, some)).max(axis=0)
+    shares = np.array([lightest + more, 1.0 + more, INERTIA[1] + unknown])
     joints = tuple(
-        _joint(name, _alone(loop, k), float(lightest[k]), INERTIA[1] + float(unknown[k]))
+        _joint(name, _alone(loop, k), *(float(share) for share in shares[:, k]))
         for k, name in enumerate(model.chain.names)
     )
     coupled: float | None = None
     if model.prior is not None:
-        some = _postures(limits) if postures is None else postures
         coupled = max(
-            float(spectral_radius(loop, R).max()) for R in _ratios(model, model.prior, some, lightest, unknown)
+            float(spectral_radius(loop, R).max()) for R in _ratios(model, model.prior, some, lightest, unknown, drives)
         )
     return StabilityReport(loop.period, delay_cycles, joints, coupled)
 
@@ -201,19 +223,19 @@ def _alone(loop: Loop, joint: int) -> Loop:
     return Loop(loop.kp[kept], loop.kd[kept], loop.period, loop.cutoff, loop.delay)
 
 
-def _joint(name: str, loop: Loop, least: float, most: float) -> JointStability:
-    factors = np.geomspace(least, most, 16)
+def _joint(name: str, loop: Loop, least: float, known: float, most: float) -> JointStability:
+    factors = np.geomspace(least, max(most, known), 16)
     radius = float(spectral_radius(loop, (1.0 / factors)[:, None, None]).max())
     gains = np.geomspace(1.0, _MOST_GAIN, 64)
-    gain = _first(gains, lambda some: spectral_radius(loop, some[:, None, None]))
+    gain = _first(gains, lambda some: spectral_radius(loop, some[:, None, None] / known))
     extra = np.linspace(0.0, _MOST_DELAY, 101)
-    delay = _first(extra, lambda some: np.array([_delayed(loop, float(more)) for more in some]))
-    return JointStability(name, least, radius, gain, delay * loop.period)
+    delay = _first(extra, lambda some: np.array([_delayed(loop, float(more), known) for more in some]))
+    return JointStability(name, least, known, radius, gain, delay * loop.period)
 
 
-def _delayed(loop: Loop, more: float) -> float:
+def _delayed(loop: Loop, more: float, known: float) -> float:
     later = Loop(loop.kp, loop.kd, loop.period, loop.cutoff, loop.delay + more)
-    return float(spectral_radius(later, np.ones((1, 1))))
+    return float(spectral_radius(later, np.ones((1, 1)) / known))
 
 
 def _first(values: Vector, radii: Callable[[Vector], Vector]) -> float:
@@ -237,7 +259,17 @@ def _lightest_and_unknown(model: ArmModel) -> tuple[Vector, Vector]:
     if model.prior is None:
         return np.full(n, INERTIA[0]), np.full(n, UNKNOWN_DRIVE)
     known = model.layout.term_values("drive_inertia", model.prior) > 0.0
-    return np.where(known, INERTIA[0], 1.0), np.where(known, KNOWN_DRIVE, UNKNOWN_DRIVE)
+    said = _known_drives(model) > 0.0
+    return np.where(known | said, INERTIA[0], 1.0), np.where(known, KNOWN_DRIVE, UNKNOWN_DRIVE)
+
+
+def _known_drives(model: ArmModel) -> Vector:
+    """Drive inertia that the description knows of beyond the prior's [kg m^2 or kg], shape (joints,)."""
+    joints = [model.config.joints.get(name) for name in model.chain.names]
+    said = np.array([0.0 if joint is None else joint.drive_inertia or 0.0 for joint in joints])
+    if model.prior is None:
+        return 0.0 * said
+    return np.asarray(np.maximum(said - model.layout.term_values("drive_inertia", model.prior), 0.0))
 
 
 def _postures(limits: MotionLimits) -> Vector:
@@ -258,7 +290,9 @@ def _link_factors(lightest: Vector) -> Iterator[Vector]:
         yield np.where(rng.random(len(lightest)) < 0.5, lightest, heaviest)
 
 
-def _ratios(model: ArmModel, prior: Vector, postures: Vector, lightest: Vector, unknown: Vector) -> Iterator[Vector]:
+def _ratios(
+    model: ArmModel, prior: Vector, postures: Vector, lightest: Vector, unknown: Vector, known: Vector
+) -> Iterator[Vector]:
     """`M_true^-1 M_model` at all postures, case by case, each of shape (samples, joints, joints)."""
     nominal = _mass_matrices(model, prior, postures)
     own = np.einsum("skk->sk", nominal)
@@ -267,7 +301,7 @@ def _ratios(model: ArmModel, prior: Vector, postures: Vector, lightest: Vector, 
         for link, factor in enumerate(factors):
             delta[model.layout.inertial(link)] *= factor
         rigid = _mass_matrices(model, delta, postures)
-        for drives in (0.0 * own, unknown * own):
+        for drives in (known + 0.0 * own, known + unknown * own):
             yield np.linalg.solve(rigid + drives[:, :, None] * np.eye(own.shape[1]), nominal)
 
 

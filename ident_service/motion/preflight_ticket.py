@@ -20,7 +20,7 @@ from ident_service import __version__
 from ident_service.errors import UsageError
 from ident_service.excitation.excitation import Excitation
 from ident_service.model.arm_model import ArmModel
-from ident_service.motion.preflight_check import CODES, Check, Measure, Verdict
+from ident_service.motion.preflight_check import ABOUT_THE_MOTION, CODES, Check, Measure, Verdict
 
 FORMAT, VERSION = "ident-ticket", 1
 VALID = timedelta(minutes=15)
@@ -40,8 +40,8 @@ class Subject:
     Attributes:
         arm: name.
         arm_sha256: of the configuration.
-        excitation: name of the motion.
-        excitation_sha256: of its JSON.
+        excitation: name of the motion; empty for none.
+        excitation_sha256: of its JSON; empty for none.
         model_sha256: of the prior parameters.
         identities: per axis, what the drives answered; empty where no arm could be opened.
         bus_sha256: of all else that the open arm says of itself; empty likewise.
@@ -89,13 +89,20 @@ class Ticket:
         """Why this ticket does not allow a motion; empty when it does.
 
         Args:
-            subject: of what is about to be done, with the open arm's own description.
+            subject: of what is about to be done, with the open arm's own description. One without a motion, for a way
+                home, asks for all that was found of the arm and for nothing that was found of the motion: such a way is
+                checked from where it begins, when it begins.
             now: UTC.
         """
         found = []
-        if self.verdict is not Verdict.PASSED:
-            codes = ", ".join(c.code for c in self.checks if c.verdict in (Verdict.FAILED, Verdict.NEEDS_PERSON))
-            found.append(f"the check did not pass: {codes}")
+        no_motion = not subject.excitation_sha256
+        if codes := [
+            check.code
+            for check in self.checks
+            if check.verdict in (Verdict.FAILED, Verdict.NEEDS_PERSON)
+            and not (no_motion and check.code in ABOUT_THE_MOTION)
+        ]:
+            found.append(f"the check did not pass: {', '.join(codes)}")
         if now < self.created:
             found.append("it was made in the future: a clock has been set")
         elif now >= self.expires:
@@ -104,7 +111,7 @@ class Ticket:
         if mine.arm != theirs.arm:
             found.append(f"it is for {mine.arm}, not for {theirs.arm}")
         for key, what in _HASHES.items():
-            if getattr(mine, key) != getattr(theirs, key):
+            if getattr(mine, key) != getattr(theirs, key) and not (no_motion and key == "excitation_sha256"):
                 found.append(f"{what} has changed since")
         if mine.identities != theirs.identities:
             found.append("the drives are others than those that were checked")
@@ -117,12 +124,12 @@ class Ticket:
         return json.dumps(ticket_values(self), indent=1, allow_nan=False)
 
 
-def subject_of(model: ArmModel, excitation: Excitation, described: ArmDescription | None) -> Subject:
+def subject_of(model: ArmModel, excitation: Excitation | None, described: ArmDescription | None) -> Subject:
     """What a ticket would have to be about to allow this motion on this arm.
 
     Args:
         model: of the arm.
-        excitation: to be run.
+        excitation: to be run; None for a way home.
         described: by the open arm, None where it could not be opened.
     """
     bus = driver = ""
@@ -136,8 +143,8 @@ def subject_of(model: ArmModel, excitation: Excitation, described: ArmDescriptio
     return Subject(
         arm=model.config.name,
         arm_sha256=model.config.sha256,
-        excitation=excitation.name,
-        excitation_sha256=_sha256(excitation.to_json().encode()),
+        excitation="" if excitation is None else excitation.name,
+        excitation_sha256="" if excitation is None else _sha256(excitation.to_json().encode()),
         model_sha256=_sha256(" ".join(model.layout.names).encode() + prior),
         identities=axes,
         bus_sha256=bus,

@@ -28,9 +28,10 @@ from ident_service.model.arm_model import arm_model
 from ident_service.motion.control_file import ControlFile
 from ident_service.motion.factory import make_arm
 from ident_service.motion.histogram import Histogram
+from ident_service.motion.plans import Destination, Excite, GoTo, Plan
 from ident_service.motion.preflight_ticket import subject_of, ticket_from_json
 from ident_service.motion.realtime import ask
-from ident_service.motion.run import RunReport, run
+from ident_service.motion.run import RunReport, follow
 from ident_service.motion.states import State
 from ident_service.record.cycle import Cycle
 from ident_service.record.ring_sink import RingSink, SinkEnds
@@ -115,7 +116,8 @@ def _ended(error: dict[str, str], code: int) -> int:
 
 def _moved(request: dict[str, Any], controls: ControlFile) -> tuple[RunReport, TimedSink, str]:
     config = ArmConfig.model_validate(request["config"])
-    motion = excitation_from_json(request["excitation"])
+    motion = None if request["excitation"] is None else excitation_from_json(request["excitation"])
+    plan: Plan = GoTo(Destination(request["destination"])) if motion is None else Excite(motion, request["speed"])
     model = arm_model(config)
     arm = make_arm(config)
     sink = TimedSink(RingSink(SinkEnds(*request["ends"]), request["recording"], lock_step=arm.clock.lock_step))
@@ -129,7 +131,7 @@ def _moved(request: dict[str, Any], controls: ControlFile) -> tuple[RunReport, T
                 f"the preflight ticket does not allow this: {'; '.join(why)}; `ident check` makes a new one"
             )
         sink.event(arm.clock.now_ns(), 20, sentence)
-        return run(arm, model, motion, sink, controls, speed=request["speed"]), sink, sentence
+        return follow(arm, model, plan, sink, controls), sink, sentence
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""One run: check, arm, approach, excite, return, every cycle guarded, every cycle recorded.
+"""One run: check, arm, follow the ways of a plan (`plans.py`), every cycle guarded, every cycle recorded.
 
 The loop owns no file: it hands samples to a sink that keeps the disk away, and a sink that fails stops the arm under
 control like one that is slow. The stop path is `_halt`: torque away, no condition, nothing that can raise.
@@ -14,7 +14,6 @@ import numpy as np
 from drivers.arm import Arm, Sample, StopKind, Vector
 from ident_service.config.limits import MotionLimits, motion_limits
 from ident_service.errors import ArmFault, DriverError, MotionRefused
-from ident_service.excitation.demands import require_within_limits
 from ident_service.excitation.excitation import Excitation
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.outline import Outline
@@ -27,13 +26,11 @@ from ident_service.motion.faults import FAULTS, HOLD
 from ident_service.motion.guard import Guard
 from ident_service.motion.latch import Latch
 from ident_service.motion.loop import REST_CYCLES, REST_SPEED, Loop, Peaks
-from ident_service.motion.reference import PathReference, Reference, rest
+from ident_service.motion.plans import Excite, Plan
+from ident_service.motion.reference import rest
 from ident_service.motion.sink import Sink as Sink
-from ident_service.motion.speed import Slowed, require_factor, slowed_limits
+from ident_service.motion.speed import require_factor, slowed_limits
 from ident_service.motion.states import LAWFUL, State, States
-from ident_service.motion.stop import require_stops_within_limits
-from ident_service.motion.surroundings import require_clear
-from ident_service.motion.way import calm_way
 
 _INFO: Final = 20  # level of rcl_interfaces/msg/Log
 
@@ -90,19 +87,47 @@ def run(
         ArmFault: a fault stopped the motion; the arm is without torque, and the fault latched.
         DriverError: the arm refused to be enabled.
     """
-    require_factor(speed)
-    run_ = _Run(arm, model, excitation, sink, controls or StopWhen(), speed, latch or Latch(), hold_seconds)
-    return run_.run()
+    return follow(arm, model, Excite(excitation, speed), sink, controls, latch=latch, hold_seconds=hold_seconds)
+
+
+def follow(
+    arm: Arm,
+    model: ArmModel,
+    plan: Plan,
+    sink: Sink,
+    controls: Controls | None = None,
+    *,
+    latch: Latch | None = None,
+    hold_seconds: float = HOLD,
+) -> RunReport:
+    """Do what a plan says with an open arm; `run` is this for an excitation.
+
+    Args:
+        arm: open, not enabled.
+        model: with the prior parameters that control needs.
+        plan: where to.
+        sink: takes every sample.
+        controls: as for `run`.
+        latch: as for `run`.
+        hold_seconds: as for `run`; also for the end of a plan that is held.
+
+    Returns:
+        As `run`; DONE where the plan was followed to its end, held there or not.
+
+    Raises:
+        UsageError, MotionRefused, ArmFault, DriverError: as `run`.
+    """
+    require_factor(plan.speed)
+    return _Run(arm, model, plan, sink, controls or StopWhen(), latch or Latch(), hold_seconds).run()
 
 
 @dataclass
 class _Run:
     arm: Arm
     model: ArmModel
-    excitation: Excitation
+    plan: Plan
     sink: Sink
     controls: Controls
-    speed: float
     latch: Latch
     hold_seconds: float
 
@@ -115,11 +140,13 @@ class _Run:
             self.states.enter(State.CHECKED)
             self.arm.enable()
             self.states.enter(State.ARMED)
-            self.states.enter(State.APPROACHING)
+            self.states.enter(loop.course.first)
             loop.run(torque)
             # Done, the arm stands where it stood supported; stopped, it may not, and the drives brake it.
             done = self.states.state is State.DONE
             self.arm.stop(StopKind.TORQUE_OFF if done else StopKind.QUICK_STOP)
+            if loop.course.complete and loop.ended_by is None and not done:
+                self.states.enter(State.DONE)
         except BaseException as error:
             self._halt(error, loop)
             raise
@@ -146,15 +173,12 @@ class _Run:
                 f"the arm on the bus has the joints {', '.join(described.joint_names)}, "
                 f"the description {', '.join(chain.names)}"
             )
-        if self.excitation.arm_sha256 != model.config.motion_sha256:
-            raise MotionRefused(f"the {self.excitation.name} motion was made for another description of the arm")
-        require_within_limits(self.excitation.path, model, limits)
-        require_stops_within_limits(self.excitation.path, limits, chain.names)
+        self.plan.require_possible(model, limits)
         period = 1.0 / described.rate
         sample = self._look(limits, period)
         home = sample.position.copy()
-        ways = self._ways(home, limits)
-        require_clear(model, self.excitation.path, [ways[0], ways[-1]], limits)
+        admitted = self.plan.admits(model, home, limits)
+        legs, limits = self.plan.legs(model, home, limits), admitted
         guard = Guard(chain.names, limits, period, home, revolute=chain.revolute, outline=Outline(model, model.prior))
         dynamics = InverseDynamics(chain, model.layout, model.prior)
         control = ComputedTorque(dynamics, limits, period, model.config.control.velocity_cutoff, home)
@@ -166,7 +190,7 @@ class _Run:
             arm,
             guard,
             control,
-            Course(self.states, ways, rest(home), limits, slowed_limits(limits, self.speed)),
+            Course(self.states, legs, rest(home), limits, slowed_limits(limits, self.plan.speed), held=self.plan.held),
             self.states,
             Deadlines(guard.findings, period),
             self.controls,
@@ -181,7 +205,7 @@ class _Run:
         return loop, torque
 
     def _look(self, limits: MotionLimits, period: float) -> Sample:
-        """Samples without torque: the arm must be where it may be, and at rest."""
+        """Samples without torque: the arm must be at rest."""
         samples = [self.arm.exchange(None) for _ in range(REST_CYCLES)]
         last = samples[-1]
         if not all(bool(sample.valid.all() and np.isfinite(sample.position).all()) for sample in samples):
@@ -190,21 +214,7 @@ class _Run:
         drift = (seen.max(axis=0) - seen.min(axis=0)) / (period * (REST_CYCLES - 1))
         if bool(np.any(drift > REST_SPEED * limits.velocity)):
             raise MotionRefused("the arm is moving; it must be at rest and supported before a run begins")
-        names = self.model.chain.names
-        outside = [
-            f"{name} at {q:.3f}, limits {low:g}..{high:g}"
-            for name, q, low, high in zip(names, last.position, limits.lower, limits.upper, strict=True)
-            if not low <= q <= high
-        ]
-        if outside:
-            raise MotionRefused("outside the position limits: " + "; ".join(outside))
         return last
-
-    def _ways(self, home: Vector, limits: MotionLimits) -> list[Reference]:
-        exciting = PathReference(self.excitation.path)
-        start, end = exciting.at(0.0), exciting.at(exciting.duration)
-        ways: list[Reference] = [calm_way(rest(home), start, limits), exciting, calm_way(end, rest(home), limits)]
-        return [Slowed(reference, self.speed) for reference in ways]
 
     def _entered(self, state: State) -> None:
         stamp_ns = self._loop.last[-1].stamp_ns if self._loop.last else self._stamp_ns

@@ -17,7 +17,7 @@ class State(Enum):
     ARMED = "armed"  # energised, no torque yet
     APPROACHING = "approaching"
     EXCITING = "exciting"
-    RETURNING = "returning"
+    RETURNING = "returning"  # or going home: the last way of a run, or its only one
     DONE = "done"
     PAUSING = "pausing"  # decelerating under control, to go on later
     PAUSED = "paused"  # held at rest
@@ -30,12 +30,13 @@ class State(Enum):
 MOVING = (State.APPROACHING, State.EXCITING, State.RETURNING)
 STOPPABLE = (State.ARMED, *MOVING, State.PAUSING, State.PAUSED, State.RESUMING)
 
-# Stopping and faulting are lawful from every state that is energised. Out of the ends leads only the way to the next
+# Stopping and faulting are lawful from every state that is energised. A way that ends where nothing supports the arm
+# ends as a stop does, held at rest, and is done after that. Out of the ends leads only the way to the next
 # run, out of a fault only when nothing is latched any more.
 LAWFUL: dict[State, tuple[State, ...]] = {
     State.IDLE: (State.CHECKED, State.FAULTED),
     State.CHECKED: (State.ARMED, State.IDLE, State.FAULTED),
-    State.ARMED: (State.APPROACHING, State.STOPPING, State.FAULTED),
+    State.ARMED: (State.APPROACHING, State.RETURNING, State.STOPPING, State.FAULTED),
     State.APPROACHING: (State.EXCITING, State.PAUSING, State.STOPPING, State.FAULTED),
     State.EXCITING: (State.RETURNING, State.PAUSING, State.STOPPING, State.FAULTED),
     State.RETURNING: (State.DONE, State.PAUSING, State.STOPPING, State.FAULTED),
@@ -44,7 +45,7 @@ LAWFUL: dict[State, tuple[State, ...]] = {
     State.RESUMING: (*MOVING, State.PAUSING, State.STOPPING, State.FAULTED),
     State.STOPPING: (State.STOPPED, State.FAULTED),
     State.DONE: (State.IDLE, State.FAULTED),
-    State.STOPPED: (State.IDLE, State.FAULTED),
+    State.STOPPED: (State.DONE, State.IDLE, State.FAULTED),
     State.FAULTED: (State.IDLE,),
 }
 

@@ -86,17 +86,38 @@ def require_clear(model: ArmModel, path: Path, ways: Sequence[Reference], limits
     Raises:
         MotionRefused: naming what comes how near to what, and when.
     """
+    require_ways_clear(model, [("a way to or from the motion", way) for way in ways], limits)
     collision = CollisionModel(model)
     if not collision.pairs:
         return
     least = model.config.workspace.clearance
-    found = [("the motion", certified_clearance(collision, path, least))]
-    found += [("a way to or from the motion", way_clearance(collision, way, limits, least)) for way in ways]
-    for what, clearance in found:
-        if not clearance.proven:
-            raise MotionRefused(
-                f"{what} comes within {clearance.lower_bound:.4f} m at {clearance.pair}, {clearance.time:.2f} s; "
-                f"{least:g} m must remain"
-            )
+    _require_proven("the motion", certified_clearance(collision, path, least), least)
     if touching := touching_stop(path, limits, model):
         raise MotionRefused(touching)
+
+
+def require_ways_clear(model: ArmModel, ways: Sequence[tuple[str, Reference]], limits: MotionLimits) -> None:
+    """Refuse ways that come too near to anything.
+
+    Args:
+        model: of the arm, with its geometry and surroundings; without any, nothing is checked.
+        ways: each with what it is called in a refusal.
+        limits: of the arm; no way is faster.
+
+    Raises:
+        MotionRefused: naming what comes how near to what, and when.
+    """
+    collision = CollisionModel(model)
+    if not collision.pairs:
+        return
+    least = model.config.workspace.clearance
+    for what, way in ways:
+        _require_proven(what, way_clearance(collision, way, limits, least), least)
+
+
+def _require_proven(what: str, clearance: Clearance, least: float) -> None:
+    if not clearance.proven:
+        raise MotionRefused(
+            f"{what} comes within {clearance.lower_bound:.4f} m at {clearance.pair}, {clearance.time:.2f} s; "
+            f"{least:g} m must remain"
+        )

@@ -55,7 +55,8 @@ def ticket_text(ticket: Ticket, *, every_measure: bool = False) -> str:
         ticket: to be shown.
         every_measure: every number of every check, and not only the one nearest to its limit.
     """
-    lines = [f"preflight of {ticket.subject.arm} for the {ticket.subject.excitation} motion", ""]
+    motion = ticket.subject.excitation
+    lines = [f"preflight of {ticket.subject.arm} for {f'the {motion} motion' if motion else 'a way home'}", ""]
     for check in ticket.checks:
         lines += _check_lines(check, every_measure)
     lines.append("")

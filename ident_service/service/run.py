@@ -26,6 +26,7 @@ from ident_service.model.urdf import urdf_text
 from ident_service.motion.control_file import ControlFile
 from ident_service.motion.controls import LEASE_SECONDS
 from ident_service.motion.factory import make_arm
+from ident_service.motion.plans import HOMING_SPEED, Destination
 from ident_service.motion.preflight_ticket import Ticket
 from ident_service.record.recorder_process import RecorderProcess
 from ident_service.results.files import write_atomically
@@ -55,7 +56,7 @@ class Ran:
 
 def run_motion(
     config: ArmConfig,
-    motion: Excitation,
+    motion: Excitation | Destination,
     folder: Path,
     state: Path,
     ticket: Ticket,
@@ -65,15 +66,15 @@ def run_motion(
     tell: Callable[[str], None] = lambda _: None,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> Ran:
-    """Move an arm along a motion and record it.
+    """Move an arm along a motion, or to a destination, and record it.
 
     Args:
         config: of the arm.
-        motion: made for it.
+        motion: made for it; or where one slow way is to lead, home for example.
         folder: the run folder; it must not exist.
         state: the state folder, where the arm's controls and faults are.
         ticket: of the preflight; the motion process holds it against the open arm.
-        speed: share of the motion's own speed.
+        speed: share of the motion's own speed; ways to a destination have theirs.
         lease: how long the arm moves on when this process is gone [s].
         tell: called with each state that is entered.
         stop_requested: asked several times a second.
@@ -94,11 +95,16 @@ def run_motion(
     model = arm_model(config)
     clock = make_arm(config).clock
     folder.mkdir(parents=True)
-    write_atomically(folder / "excitation.json", motion.to_json() + "\n")
+    excitation = motion.to_json() if isinstance(motion, Excitation) else None
+    name = motion.name if isinstance(motion, Excitation) else motion.value
+    speed = speed if isinstance(motion, Excitation) else HOMING_SPEED
     write_ticket(folder / "ticket.json", ticket)
     write_atomically(folder / "arm.json", config.model_dump_json(indent=1) + "\n")
-    attachments = {"arm.json": config.model_dump_json(indent=1).encode(), "excitation.json": motion.to_json().encode()}
-    metadata = {"arm": config.name, "arm_sha256": config.sha256, "motion": motion.name, "speed": repr(speed)}
+    attachments = {"arm.json": config.model_dump_json(indent=1).encode()}
+    if excitation is not None:
+        write_atomically(folder / "excitation.json", excitation + "\n")
+        attachments["excitation.json"] = excitation.encode()
+    metadata = {"arm": config.name, "arm_sha256": config.sha256, "motion": name, "speed": repr(speed)}
     recording = folder / "run.mcap"
     description = urdf_text(model, model.prior)
     recorder = RecorderProcess(
@@ -113,7 +119,8 @@ def run_motion(
     )
     request = {
         "config": json.loads(config.model_dump_json()),
-        "excitation": motion.to_json(),
+        "excitation": excitation,
+        "destination": None if isinstance(motion, Excitation) else motion.value,
         "recording": str(recording),
         "controls": str(control_path(state, config.name)),
         "lease": lease,

@@ -228,8 +228,34 @@ def test_table_1_through_the_command(ident: Ident, wam7_data: Path, tmp_path: Pa
 def test_shipped_descriptions_are_good(ident: Ident, arm: str) -> None:
     words = ident("config", "check", arm)
     assert words.code == 0, words.err
-    assert words.out.rstrip().endswith(": good")
-    assert ident("config", "check", arm, "--json").json["problems"] == []
+    assert words.out.splitlines()[0].endswith(": good")
+    assert words.out.splitlines()[1].startswith("gains")
+    document = ident("config", "check", arm, "--json").json
+    assert document["problems"] == []
+    assert document["stability"] is None or document["stability"]["stable"]
+
+
+def test_gains_that_are_too_high_are_a_no(ident: Ident, tmp_path: Path) -> None:
+    # Twelve times the loop gain of which fifteen would be too much leaves a margin of less than two.
+    arm = quick_arm(tmp_path, ("home: 0, kp: 400, kd: 40", "home: 0, kp: 4800, kd: 480"))
+    ended = ident("config", "check", arm)
+    assert ended.code == 3
+    assert "shoulder: unstable" in ended.out or "shoulder: gain margin" in ended.out
+    document = ident("config", "check", arm, "--json").json
+    assert document["exit_code"] == 3
+    assert not document["stability"]["stable"]
+    assert document["stability"]["joints"][0]["gain_margin"] == pytest.approx(15.56 / 12.0, rel=1e-3)
+
+
+def test_more_delay_in_the_driver_is_more_delay_in_the_check(ident: Ident, tmp_path: Path) -> None:
+    late = quick_arm(tmp_path, ("delay_cycles: 1", "delay_cycles: 20"))
+    ended = ident("config", "check", late)
+    assert "20 cycles of delay" in ended.out
+    near, far = (
+        ident("config", "check", arm, "--json").json["stability"]["joints"][0]["delay_margin"]
+        for arm in ("planar2", late)
+    )
+    assert far == pytest.approx(near - 19e-3, abs=1e-6)
 
 
 @pytest.mark.parametrize("words", [(), ("simulate",), ("identify",), ("config",), ("config", "check"), ("correct",)])

@@ -1,7 +1,7 @@
 """What every Arm keeps to, whatever stands behind it.
 
 A backend joins by a function in BACKENDS that builds a two-joint arm in virtual time, not yet open, with an eye on the
-true state of what moves.
+true state of what moves, and with the faults injected that it is given.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from drivers.arm import Arm, StopKind
+from drivers.status import TRIPPED, AxisStatus
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError
 
@@ -49,26 +50,40 @@ def bench_config(**driver: Any) -> ArmConfig:
     )
 
 
-def simulated() -> Bench:
+def simulated(**driver: Any) -> Bench:
     from sim_backend.arm import from_config
 
-    arm = from_config(bench_config())
+    arm = from_config(bench_config(**driver))
     return Bench(arm, lambda: arm.plant.velocity, lambda: arm.plant.position)
 
 
-def separate() -> Bench:
+def separate(**driver: Any) -> Bench:
     from sim_backend.arm import from_config
 
-    arm = from_config(bench_config(process="separate"))
+    arm = from_config(bench_config(process="separate", **driver))
     return Bench(arm, lambda: arm.truth.velocity, lambda: arm.truth.position)
 
 
-BACKENDS: dict[str, Callable[[], Bench]] = {"separate": separate, "simulated": simulated}
+BACKENDS: dict[str, Callable[..., Bench]] = {"separate": separate, "simulated": simulated}
 
 
 @pytest.fixture(params=sorted(BACKENDS))
 def bench(request):
     bench = BACKENDS[request.param]()
+    yield bench
+    bench.arm.close()
+
+
+@pytest.fixture(params=sorted(BACKENDS))
+def broken(request):
+    """An arm whose first drive has had a fault of its own for ten milliseconds; the cause is mended."""
+    fault = {"kind": "drive_fault", "joint": "turn", "cycle": 3, "duration": 0.01}
+    bench = BACKENDS[request.param](faults=[fault])
+    bench.arm.open()
+    bench.arm.enable()
+    for _ in range(10):
+        bench.arm.exchange(np.array([1.0, 1.0]))
+    bench.arm.stop(StopKind.QUICK_STOP)
     yield bench
     bench.arm.close()
 
@@ -90,7 +105,7 @@ def test_opening_twice_is_refused_and_reopening_is_not(bench):
 
 
 def test_a_closed_arm_does_nothing(bench):
-    for act in (bench.arm.describe, bench.arm.enable, lambda: bench.arm.exchange(None)):
+    for act in (bench.arm.describe, bench.arm.enable, bench.arm.reset, lambda: bench.arm.exchange(None)):
         with pytest.raises(DriverError):
             act()
 
@@ -246,6 +261,51 @@ def test_stopping_never_raises(bench, kind):
     stop_twice()
     bench.arm.close()
     stop_twice()
+
+
+def test_a_drive_that_latched_a_fault_is_not_enabled_before_it_is_reset(broken):
+    assert broken.arm.exchange(None).status[0] & AxisStatus.FAULT
+    with pytest.raises(DriverError, match="turn"):
+        broken.arm.enable()
+    with pytest.raises(DriverError):
+        broken.arm.exchange(NONE)
+    broken.arm.reset()
+    assert not any(word & TRIPPED for word in broken.arm.exchange(None).status)
+    broken.arm.enable()
+    np.testing.assert_array_equal(broken.arm.exchange(np.array([1.0, 1.0])).torque, 1.0)
+
+
+def test_what_is_latched_outlives_closing(broken):
+    broken.arm.close()
+    broken.arm.open()
+    assert broken.arm.exchange(None).status[0] & AxisStatus.FAULT
+
+
+def test_a_reset_energises_nothing_and_releases_no_brake(broken):
+    broken.arm.reset()
+    idle = [broken.arm.exchange(None) for _ in range(5)]
+    assert not any(sample.torque.any() for sample in idle)
+    assert not any(word & AxisStatus.POWERED for sample in idle for word in sample.status)
+    assert all(word & AxisStatus.IDLE for word in idle[-1].status), "braked by the quick stop, as before"
+    with pytest.raises(DriverError):
+        broken.arm.exchange(NONE)
+
+
+def test_a_running_arm_is_not_reset(running):
+    running.arm.exchange(np.array([1.0, 1.0]))
+    with pytest.raises(DriverError):
+        running.arm.reset()
+    np.testing.assert_array_equal(running.arm.exchange(None).torque, 1.0)
+
+
+def test_with_nothing_latched_a_reset_changes_nothing(bench):
+    with bench.arm as arm:
+        before = arm.exchange(None)
+        arm.reset()
+        arm.reset()
+        after = arm.exchange(None)
+        np.testing.assert_array_equal(after.position, before.position)
+        assert after.status == before.status
 
 
 def test_closing_is_safe_from_any_state(bench):

@@ -88,6 +88,9 @@ class WatchedArm(Arm):
             raise self.enable_error
         self.after_enable()
 
+    def reset(self) -> None:
+        self.inner.reset()
+
     def exchange(self, torque: Array | None) -> Sample:
         if torque is not None:
             self.torques.append(torque.copy())

@@ -82,6 +82,10 @@ class FlightArm(Arm):
         self.calls.append("enable")
         self.inner.enable()
 
+    def reset(self) -> None:
+        self.calls.append("reset")
+        self.inner.reset()
+
     def exchange(self, torque: Array | None) -> Sample:
         if torque is None:
             sample = self.inner.exchange(None)

@@ -173,6 +173,51 @@ def test_a_link_without_known_drive_inertia_is_taken_to_be_no_lighter_than_model
     assert [one.lightest for one in stability(model, motion_limits(model.config)).joints] == [0.5, 1.0]
 
 
+def test_known_drive_inertia_gives_its_share_of_the_margin() -> None:
+    """Loop gain goes with one over inertia, so a margin grows by exactly what the drives add to the joint's own."""
+    bare = {name: value for name, value in PRIOR.items() if not name.startswith("Ia2")}
+    joints = config_at_1_kHz().joints
+    said = {name: joint.model_dump() | {"drive_inertia": 0.1} for name, joint in joints.items()}
+    posture = np.array([[0.3, -0.2]])
+    without, with_ = (arm_model(config_at_1_kHz(prior=bare, **changes)) for changes in ({}, {"joints": said}))
+    limits = motion_limits(without.config)
+    own = np.diag(InverseDynamics(without.chain, without.layout, without.prior).mass_matrix(posture[0]))
+    before, after = (stability(model, limits, postures=posture).joints for model in (without, with_))
+    for k, beyond in enumerate((0.1 - 0.02, 0.1)):  # the prior knows 0.02 of the shoulder's
+        assert after[k].gain_margin == pytest.approx(before[k].gain_margin * (1.0 + beyond / own[k]), rel=1e-6)
+        assert after[k].known == pytest.approx(1.0 + beyond / own[k])
+        assert after[k].delay_margin > before[k].delay_margin
+    # Said drives hold a link up to the same doubt as drives of the prior.
+    assert after[1].lightest == pytest.approx(0.5 + 0.1 / own[1])
+
+
+def test_a_stable_loop_without_margin_is_objected_to() -> None:
+    first = stability(arm_model(config_at_1_kHz()), motion_limits(config_at_1_kHz())).joints[0]
+    factor = first.gain_margin / 1.9
+    heavy = {name: value for name, value in PRIOR.items() if not name.startswith("Ia")}  # so no link is lighter
+    joints = {name: joint.model_dump() for name, joint in config_at_1_kHz().joints.items()}
+    for joint in joints.values():
+        joint |= {"kp": 400.0 * factor, "kd": 40.0 * factor}
+    model = arm_model(config_at_1_kHz(joints=joints, prior=heavy))
+    report = stability(model, motion_limits(model.config))
+    assert all(one.radius < 1.0 for one in report.joints)
+    assert [one.gain_margin for one in report.joints] == pytest.approx([1.9, 1.9], rel=1e-6)
+    assert report.objections()[0] == "shoulder: gain margin 1.90, at least 2 is needed"
+    assert not report.stable
+
+
+def test_the_wams_wrist_owes_its_margin_to_its_rotors() -> None:
+    """Without what its data sheet says, table 4's gain of the last joint could rise by a fifth only."""
+    config = load_arm("wam7")
+    bare = {name: joint.model_copy(update={"drive_inertia": None}) for name, joint in config.joints.items()}
+    with_, without = (
+        stability(arm_model(one), motion_limits(one)).joints[6].gain_margin
+        for one in (config, config.model_copy(update={"joints": bare}))
+    )
+    assert without == pytest.approx(1.21, abs=0.01)
+    assert with_ > 5.0
+
+
 def test_the_coupled_loop_of_the_true_inertia_decays_when_the_report_says_so() -> None:
     """Both joints together with one true inertia of the range, by a simulation that shares no code."""
     model = arm_model(config_at_1_kHz())

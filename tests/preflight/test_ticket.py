@@ -99,6 +99,23 @@ def test_any_change_asks_for_a_new_check(other: Callable[[], Subject], reason: s
     assert any(reason in one for one in found), found
 
 
+@pytest.mark.parametrize("code", ["motion_fits", "motion_proven", "ways_clear"])
+def test_a_way_home_asks_for_nothing_that_is_about_the_motion(code: str) -> None:
+    home = subject_of(MODEL, None, ARM)
+    assert ticket(failed(code, "not this motion", "another")).valid_for(home, later()) == []
+    assert ticket(failed(code, "not this motion", "another")).valid_for(SUBJECT, later()) != []
+
+
+@pytest.mark.parametrize("check", [failed("direction", "x", "y"), Check("watchdog", Verdict.NEEDS_PERSON)])
+def test_a_way_home_asks_for_all_that_is_about_the_arm(check: Check) -> None:
+    home = subject_of(MODEL, None, ARM)
+    assert f"did not pass: {check.code}" in ticket(check).valid_for(home, later())[0]
+    assert "the drives are others than those that were checked" in ticket().valid_for(
+        subject_of(MODEL, None, replace(ARM, identities=("a 1", "b 3"))), later()
+    )
+    assert "expired" in ticket().valid_for(home, later(minutes=15))[0]
+
+
 def test_what_does_not_matter_does_not_change_the_subject() -> None:
     again = arm_model(flight_config())
     assert subject_of(again, excitation(again, "identification"), replace(ARM)) == SUBJECT

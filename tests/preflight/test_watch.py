@@ -40,6 +40,9 @@ class OnlyLooked(Arm):
     def enable(self) -> None:
         pytest.fail("watching energised the arm")
 
+    def reset(self) -> None:
+        pytest.fail("watching reset the drives")
+
     def stop(self, kind: StopKind) -> None:
         pytest.fail("watching sent a stop, which changes the drives' state")
 

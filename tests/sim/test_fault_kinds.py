@@ -124,12 +124,15 @@ def test_a_saturated_axis_clips_and_says_what_acts():
     np.testing.assert_allclose(np.diff(column(truths, "velocity", 1)), np.where(struck, -0.5, -1.0)[:-1] * MS)
 
 
-def test_a_drive_with_a_fault_coasts_until_enabled_again():
+def test_a_drive_with_a_fault_coasts_until_reset():
     samples, truths, arm = run(Fault(AT, FaultKind.DRIVE_FAULT, 1, duration=5))
     np.testing.assert_array_equal(column(samples, "torque"), np.where(np.arange(CYCLES) < AT, 1.0, 0.0))
     assert [s.status[1] for s in samples] == [AxisStatus.POWERED] * AT + [AxisStatus.FAULT] * (CYCLES - AT)
     assert {s.status[0] for s in samples} == {AxisStatus.POWERED}
     np.testing.assert_array_equal(column(truths, "velocity")[AT:], column(truths, "velocity")[AT])
+    with pytest.raises(DriverError, match="y: a fault or an emergency stop is latched"):
+        arm.enable()
+    arm.reset()
     arm.enable()
     assert arm.exchange(np.ones(2)).status == (AxisStatus.POWERED, AxisStatus.POWERED)
 
@@ -171,6 +174,11 @@ def test_an_emergency_stop_takes_all_torque_and_brakes():
         np.testing.assert_array_equal(column(samples, "torque", joint)[AT:], 0.0)
         braked(column(truths, "velocity", joint)[AT:], 2.5, mass)
     assert {s.status for s in samples[AT:]} == {(AxisStatus.EMERGENCY_STOP | IDLE,) * 2}
+    arm.stop(StopKind.TORQUE_OFF)
+    arm.reset()
+    moving = len(truths)
+    assert {arm.exchange(None).status for _ in range(20)} == {(IDLE, IDLE)}
+    braked(column(truths, "velocity", 1)[moving:], 2.5)  # a reset lets nothing fall
     arm.enable()
     assert arm.exchange(np.ones(2)).torque.tolist() == [1.0, 1.0]
     arm = run(Fault(AT, FaultKind.EMERGENCY_STOP))[2]

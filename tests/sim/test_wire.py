@@ -25,7 +25,7 @@ ANSWER = wire.Answer(
     (1, 2, 2**32 - 1),
     *np.arange(12.0).reshape(4, N),
 )
-REQUESTS = [wire.Hello(bytes(range(32))), wire.Enable(), wire.Exchange(-5, 1, TORQUE), wire.Stop(1)]
+REQUESTS = [wire.Hello(bytes(range(32))), wire.Enable(), wire.Reset(), wire.Exchange(-5, 1, TORQUE), wire.Stop(1)]
 REPLIES = [wire.Welcome(77), wire.Refused(wire.IN_USE, 4), wire.Done(), ANSWER]
 
 
@@ -78,7 +78,7 @@ def changed(frame, place, value):
     ("data", "message"),
     [
         pytest.param(changed(wire.Enable(), 0, 0), "begins with", id="magic"),
-        pytest.param(changed(wire.Enable(), 3, 2), "begins with", id="version"),
+        pytest.param(changed(wire.Enable(), 3, wire.VERSION + 1), "begins with", id="version"),
         pytest.param(changed(wire.Enable(), 4, 99), "no kind 99", id="kind"),
         pytest.param(encode(wire.Exchange(0, 1, np.zeros(4)), 1, 4), "for 4 joints", id="another arm"),
         pytest.param(changed(wire.Enable(), 6, 3), "for 3 joints", id="joints where there are none"),

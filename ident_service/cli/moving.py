@@ -1,0 +1,184 @@
+"""What all verbs that move an arm share: the ticket, the run folder, the words at the end; and a key that must be held.
+
+Boundary: words and files; the run is `service/run.py`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import select
+import sys
+import termios
+import time
+import tty
+from collections.abc import Callable
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+from ident_service.cli.answer import DONE, Answer, state_folder, tell
+from ident_service.errors import MotionRefused, UsageError
+
+if TYPE_CHECKING:
+    from ident_service.config.schema import ArmConfig
+    from ident_service.excitation.excitation import Excitation
+    from ident_service.motion.plans import Destination
+
+# A terminal tells of keys that are pressed, never of keys that are released: a held key is one that repeats. Keyboards
+# begin to repeat after 0.2 to 0.7 s, then every 25 to 95 ms (the Linux console by default 92 ms, desktops 30 to 40 ms).
+RELEASED = 0.15  # s without the key, after which it counts as released
+REPEATS = 4  # in a row, each in time, before it counts as held
+KEY = b" "
+
+
+class HeldKey:
+    """The space bar of a terminal, which must be held while the arm moves.
+
+    The first press begins nothing; repeats do. Released, it stays so: a key that is touched again by accident must not
+    move an arm that somebody may have stepped up to. So it is a new rehearsal that moves it again, and not a pause.
+
+    From the last repeat to the beginning of the stop it takes at most `RELEASED`, a quarter of the lease (how often it
+    is looked at) and a cycle: 0.22 s. A keyboard or a network that repeats more slowly stops the arm by itself.
+    """
+
+    def __init__(self, fd: int, now: Callable[[], float] = time.monotonic) -> None:
+        """`fd` is a terminal's; `now` [s] is only for differences."""
+        self._fd, self._now = fd, now
+        self._last = self._looked = -1.0  # when the key came last, and when that was looked at
+        self._row = 0
+        self._held = self._released = False
+
+    def __enter__(self) -> HeldKey:
+        """Take keys one by one and unseen; Ctrl-C goes on working."""
+        self._before = termios.tcgetattr(self._fd)
+        tty.setcbreak(self._fd)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Give the terminal back as it was, without the keys that nobody has read."""
+        with suppress(termios.error):  # a terminal that is gone needs nothing
+            termios.tcsetattr(self._fd, termios.TCSAFLUSH, self._before)
+
+    def held(self) -> bool:
+        """Whether it has begun to repeat, and has not been released since."""
+        self._look()
+        return self._held and not self._released
+
+    def released(self) -> bool:
+        """Whether it was held and is not any more, or nobody can ever press it."""
+        self._look()
+        return self._released
+
+    def wait(self, given_up: Callable[[], bool], seconds: float = 0.02) -> bool:
+        """Wait until the key is held; False when it never will be, or `given_up` says so. Looks every `seconds`."""
+        while not self.held():
+            if self._released or given_up():
+                return False
+            select.select([self._fd], [], [], seconds)
+        return True
+
+    def _look(self) -> None:
+        if self._released:
+            return
+        now = self._now()
+        gap, unwatched, self._looked = now - self._last, now - self._looked > RELEASED, now
+        keys = self._keys()
+        if keys is None:
+            self._released = True
+        elif KEY in keys:
+            self._row = self._row + 1 if gap <= RELEASED else 1
+            # Keys that waited while nobody looked, because this program was busy, are taken for fresh ones: that is one
+            # more `RELEASED` at most, and while the arm moves the lease ends what nobody looks after.
+            self._released = self._held and gap > RELEASED and not unwatched
+            self._held = self._held or self._row >= REPEATS
+            self._last = now
+        else:
+            self._released = self._held and gap > RELEASED
+
+    def _keys(self) -> bytes | None:
+        """What was pressed since the last look; None where the terminal is gone."""
+        if not select.select([self._fd], [], [], 0.0)[0]:
+            return b""
+        try:
+            return os.read(self._fd, 4096) or None
+        except OSError:
+            return None
+
+
+def moved(
+    arguments: argparse.Namespace,
+    config: ArmConfig,
+    motion: Excitation | Destination,
+    sentence: str,
+    *,
+    speed: float = 1.0,
+    lease: float | None = None,
+    stop_requested: Callable[[], bool],
+) -> Answer:
+    """Move the arm and say how it went.
+
+    Args:
+        arguments: with `out` and `state`.
+        config: of the arm.
+        motion: or destination.
+        sentence: what is about to happen, told with the folder.
+        speed: share of the motion's own.
+        lease: how long the arm moves on when this process is gone [s]; None for the ordinary one.
+        stop_requested: asked several times per lease.
+
+    Raises:
+        As `service.run.run_motion`; MotionRefused without a ticket.
+    """
+    from ident_service.motion.controls import LEASE_SECONDS
+    from ident_service.motion.preflight_ticket import read_ticket
+    from ident_service.service.arm_state import ticket_path
+    from ident_service.service.commission import new_run_folder
+    from ident_service.service.run import run_motion
+
+    state = state_folder(arguments)
+    path = ticket_path(state, config.name)
+    if not path.exists():
+        raise MotionRefused(f"{config.name}: not checked yet; `ident check` comes before every motion")
+    folder = arguments.out or new_run_folder(state, config.name)
+    tell(arguments, f"{config.name}: {sentence}, into {folder}")
+    ran = run_motion(
+        config,
+        motion,
+        folder,
+        state,
+        read_ticket(path),
+        speed=speed,
+        lease=LEASE_SECONDS if lease is None else lease,
+        tell=lambda word: tell(arguments, word),
+        stop_requested=stop_requested,
+    )
+    files = "".join(f"  {path.name}\n" for path in sorted(folder.iterdir()))
+    text = _report_text(ran.report) + f"files: {folder}\n" + files
+    return DONE, text, {"folder": str(folder), "report": ran.report}
+
+
+def require_terminal(arguments: argparse.Namespace) -> int:
+    """The descriptor of the terminal whose key is to be held.
+
+    Raises:
+        UsageError: a program is asking, or standard input is no terminal.
+    """
+    if arguments.json or not sys.stdin.isatty():
+        raise UsageError(
+            "a rehearsal moves only while a key is held, and there is no terminal to hold one at; give --no-key to "
+            "rehearse without, and have `ident stop` ready in another terminal"
+        )
+    return sys.stdin.fileno()
+
+
+def _report_text(report: dict[str, Any]) -> str:
+    warnings = ", ".join(f"{code} {count} times" for code, count in report["warnings"].items()) or "none"
+    lateness, compute = report["lateness"], report["compute"]
+    return (
+        f"{report['state']} after {report['cycles']} cycles; warnings: {warnings}\n"
+        f"{report['real_time']}\n"
+        f"woke late by below {lateness['median_below_us']:g} us (median), {lateness['p999_below_us']:g} us (99.9 %), "
+        f"at worst {lateness['worst_us']:.0f} us\n"
+        f"computed for below {compute['median_below_us']:g} us (median), {compute['p999_below_us']:g} us (99.9 %), "
+        f"at worst {compute['worst_us']:.0f} us\n"
+    )

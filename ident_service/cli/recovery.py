@@ -1,0 +1,106 @@
+"""Verbs that make an arm usable again: `recover` says what is in the way, `home` leads it home.
+
+Boundary: words to requests, results to words; the work is `service/recover.py` and `service/run.py`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
+from ident_service.cli.moving import moved
+from ident_service.cli.words import Verbs
+from ident_service.errors import UsageError
+
+if TYPE_CHECKING:
+    from ident_service.config.schema import ArmConfig
+    from ident_service.motion.plans import Destination
+    from ident_service.service.recover import Recovery
+
+_HELP_ARM = "description file, or the name of a shipped one"
+_HELP_OUT = "run folder; must not exist (default: below the state folder)"
+
+
+def add(verbs: Verbs) -> None:
+    """Register the verbs."""
+    sub = verbs.add("home", _home, "lead the arm home, at a tenth of its velocity limits at most")
+    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    sub.add_argument("--out", type=Path, metavar="DIR", help=_HELP_OUT)
+    sub = verbs.add(
+        "recover", _recover, "after a fault or a stop: what is in the way, and what to do (exit code 3: something is)"
+    )
+    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    sub.add_argument("--leave-limit", action="store_true", help="MOVE the arm: slowly back inside its position limits")
+    sub.add_argument("--out", type=Path, metavar="DIR", help=_HELP_OUT)
+
+
+def _home(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.load import load_arm
+    from ident_service.motion.plans import Destination
+
+    return _slowly(arguments, load_arm(arguments.arm), Destination.HOME)
+
+
+def _recover(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.load import load_arm
+    from ident_service.service.preflight import watch_document
+    from ident_service.service.recover import recover
+
+    config = load_arm(arguments.arm)
+    if arguments.leave_limit:
+        from ident_service.motion.plans import Destination
+
+        return _slowly(arguments, config, Destination.INSIDE)
+    if arguments.out is not None:
+        raise UsageError("--out is for the recording of --leave-limit; without it nothing moves")
+    found = recover(config, state_folder(arguments))
+    document = {
+        "arm": found.arm,
+        "usable": found.usable,
+        "faults": [asdict(one) for one in found.faults],
+        "moved_by": found.mover,
+        "seen": None if found.seen is None else watch_document(found.seen),
+        "unreachable": found.unreachable,
+        "reset": list(found.reset),
+        "tripped": found.tripped,
+        "outside": list(found.outside),
+        "steps": list(found.steps),
+    }
+    return DONE if found.usable else VERDICT_NO, _text(found), document
+
+
+def _slowly(arguments: argparse.Namespace, config: ArmConfig, destination: Destination) -> Answer:
+    from ident_service.motion.faults import HOLD
+
+    tell(arguments, f"{config.name}: keep out of its reach; where the way ends the arm is held for {HOLD:g} s,")
+    tell(arguments, "then its drives brake it: support it, an arm without brakes sinks. Ctrl-C stops.")
+    stopping = StopOnSignal()
+    with stopping:
+        return moved(arguments, config, destination, f"slowly {destination.value}", stop_requested=stopping.requested)
+
+
+def _text(found: Recovery) -> str:
+    from ident_service.service.preflight import watch_text
+
+    lines = [f"{found.arm}: {'usable' if found.usable else 'NOT USABLE YET'}", ""]
+    for one in found.faults:
+        since = datetime.fromtimestamp(one.since, UTC).isoformat(sep=" ", timespec="seconds").removesuffix("+00:00")
+        lines.append(f"  latched since {since} UTC: {one.code}: {one.cause}")
+    if not found.faults:
+        lines.append("  no fault waits for anybody")
+    if found.mover is not None:
+        lines.append(f"  process {found.mover} moves the arm")
+    if found.unreachable:
+        lines.append(f"  the arm cannot be looked at: {found.unreachable}")
+    lines += [f"  {axis}: the drive has latched: {words}" for axis, words in found.tripped.items()]
+    if found.reset:
+        lines.append(f"  reset just now: {', '.join(found.reset)}")
+    lines += [f"  outside its position limits: {words}" for words in found.outside]
+    if found.seen is not None:
+        lines += ["", watch_text(found.seen).rstrip("\n")]
+    lines += ["", "next:", *(f"  {number}. {step}" for number, step in enumerate(found.steps, 1)), ""]
+    return "\n".join(lines)

@@ -1,0 +1,121 @@
+"""What a run is to do from where the arm stands: an excitation and back, or one way to a destination.
+
+A plan is asked twice: whether it can be made at all, before anything is looked at, and for its ways from where the arm
+has been seen. Boundary: references and refusals; nothing here touches an arm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Protocol
+
+from ident_service.config.limits import MotionLimits, Vector
+from ident_service.errors import MotionRefused
+from ident_service.excitation.demands import require_within_limits
+from ident_service.excitation.excitation import Excitation
+from ident_service.model.arm_model import ArmModel
+from ident_service.motion.outside import admitting, just_inside, outside, require_near
+from ident_service.motion.reference import PathReference, Reference, rest
+from ident_service.motion.speed import Slowed
+from ident_service.motion.states import State
+from ident_service.motion.stop import require_stops_within_limits
+from ident_service.motion.surroundings import require_clear, require_ways_clear
+from ident_service.motion.way import calm_way
+
+HOMING_SPEED = 0.2  # of a calm way's speed, which is half of the limits: so at most a tenth of every velocity limit
+
+Leg = tuple[State, Reference]
+
+
+class Plan(Protocol):
+    """What a run is to do."""
+
+    @property
+    def speed(self) -> float:
+        """Share of the ways' own speed at which all of it is played, ways out of pauses too."""
+
+    @property
+    def held(self) -> bool:
+        """Whether it ends where nothing may support the arm, which is then held and braked as after a stop."""
+
+    def require_possible(self, model: ArmModel, limits: MotionLimits) -> None:
+        """Raise MotionRefused where no start makes it possible."""
+
+    def admits(self, model: ArmModel, position: Vector, limits: MotionLimits) -> MotionLimits:
+        """The limits of this run, or MotionRefused where none may begin at this position [rad or m], (joints,)."""
+
+    def legs(self, model: ArmModel, start: Vector, limits: MotionLimits) -> Sequence[Leg]:
+        """The ways from `start` [rad or m], shape (joints,), in order; MotionRefused where they lead too near."""
+
+
+@dataclass(frozen=True)
+class Excite:
+    """To an excitation, along it, and back to where the arm stood, all at one share of its speed."""
+
+    excitation: Excitation
+    speed: float = 1.0
+    held = False  # it stands again where it stood, supported, before
+
+    def require_possible(self, model: ArmModel, limits: MotionLimits) -> None:
+        """The motion was made for this arm, keeps its limits, and so does every stop out of it."""
+        if self.excitation.arm_sha256 != model.config.motion_sha256:
+            raise MotionRefused(f"the {self.excitation.name} motion was made for another description of the arm")
+        require_within_limits(self.excitation.path, model, limits)
+        require_stops_within_limits(self.excitation.path, limits, model.chain.names)
+
+    def admits(self, model: ArmModel, position: Vector, limits: MotionLimits) -> MotionLimits:
+        """From inside the position limits only."""
+        if found := outside(position, limits, model.chain.names):
+            raise MotionRefused(f"outside the position limits: {'; '.join(found)}; `ident recover` says what to do")
+        return limits
+
+    def legs(self, model: ArmModel, start: Vector, limits: MotionLimits) -> Sequence[Leg]:
+        """Approach, motion, return."""
+        exciting = PathReference(self.excitation.path)
+        begin, end = exciting.at(0.0), exciting.at(exciting.duration)
+        there, back = calm_way(rest(start), begin, limits), calm_way(end, rest(start), limits)
+        slowed = [Slowed(way, self.speed) for way in (there, exciting, back)]
+        require_clear(model, self.excitation.path, [slowed[0], slowed[-1]], limits)
+        return list(zip((State.APPROACHING, State.EXCITING, State.RETURNING), slowed, strict=True))
+
+
+class Destination(Enum):
+    """Where one way leads."""
+
+    HOME = "home"  # the description's
+    INSIDE = "inside"  # the nearest posture inside the position limits
+
+
+@dataclass(frozen=True)
+class GoTo:
+    """One straight way in joint space from rest to rest, slowly; it may begin a little outside the position limits.
+
+    All joints share one time profile (`way.py`), so that each moves from its start towards its end without turning
+    round; the end is inside the limits, and so the way of a joint that stands outside leads inwards all the time.
+    """
+
+    destination: Destination
+    speed: float = HOMING_SPEED
+    held = True  # whatever supported the arm where it stood is not where it ends
+
+    def require_possible(self, model: ArmModel, limits: MotionLimits) -> None:
+        """Home is inside the limits by the description's own check, and inside is inside."""
+
+    def admits(self, model: ArmModel, position: Vector, limits: MotionLimits) -> MotionLimits:
+        """From no farther outside than a following error; on the way in, limits begin where the arm stands."""
+        require_near(position, limits, model.chain.names)
+        if self.destination is Destination.INSIDE and not outside(position, limits, model.chain.names):
+            raise MotionRefused("the arm stands inside all its position limits; there is nothing to leave")
+        return admitting(position, limits)
+
+    def legs(self, model: ArmModel, start: Vector, limits: MotionLimits) -> Sequence[Leg]:
+        """The one way."""
+        end = limits.home if self.destination is Destination.HOME else just_inside(start, limits)
+        way = calm_way(rest(start), rest(end), admitting(start, limits))
+        try:
+            require_ways_clear(model, [(f"the way {self.destination.value}", way)], limits)
+        except MotionRefused as error:
+            raise MotionRefused(f"{error}; bring the arm by hand to where the straight way is free") from None
+        return [(State.RETURNING, Slowed(way, self.speed))]

@@ -1,0 +1,170 @@
+"""What stands between an arm and its next motion after a fault, a stop or a loss of power, and what a person does next.
+
+Looking sends no torque and changes no state. When every latched fault has been acknowledged by name, drives that have
+latched something are reset (`Arm.reset`), which energises nothing. Boundary: nothing here moves an arm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from drivers.arm import Arm
+from drivers.status import TRIPPED, AxisStatus
+from ident_service.config.limits import MotionLimits, motion_limits
+from ident_service.config.schema import ArmConfig
+from ident_service.errors import DriverError, MotionRefused, UsageError
+from ident_service.motion.control_file import ControlFile
+from ident_service.motion.factory import make_arm
+from ident_service.motion.loop import REST_SPEED
+from ident_service.motion.outside import outside, require_near
+from ident_service.motion.watch import Watched, watch
+from ident_service.service.arm_state import FaultFile, Remembered, control_path
+
+LOOK = 0.3  # s
+AT_HOME = 0.05  # rad or m
+_SUPPORT = "Support the arm, or see that it rests on something: nothing holds it up now."
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """What was found, and what to do.
+
+    Attributes:
+        arm: name.
+        faults: that nobody has acknowledged, the earliest first.
+        mover: process that moves the arm, or None.
+        seen: at the arm, after a reset if there was one; None where it could not be looked at.
+        unreachable: why not, or empty.
+        reset: axes whose drives were reset just now.
+        tripped: what drives still say, by axis.
+        outside: joints outside their position limits, in words.
+        steps: what to do next, one sentence each, in order; the last one is what a usable arm needs as well.
+        usable: whether nothing stands in the way of `ident check`.
+    """
+
+    arm: str
+    faults: tuple[Remembered, ...]
+    mover: int | None
+    seen: Watched | None
+    unreachable: str
+    reset: tuple[str, ...]
+    tripped: dict[str, str]
+    outside: tuple[str, ...]
+    steps: tuple[str, ...]
+    usable: bool
+
+
+def recover(config: ArmConfig, state: Path, arm: Arm | None = None) -> Recovery:
+    """Look at an arm, reset its drives if all faults are acknowledged, and say what is next.
+
+    Args:
+        config: of the arm.
+        state: the state folder.
+        arm: not open; the configured one when None.
+
+    Raises:
+        UsageError: the file of faults was damaged by somebody.
+        MotionRefused: the description has no position limits.
+        DriverError: nothing is installed that can reach such an arm.
+    """
+    limits = motion_limits(config)
+    faults = FaultFile(state, config.name).remembered()
+    mover = _mover(control_path(state, config.name))
+    if mover is not None:
+        stop_first = (
+            f"`ident stop {config.name}` brings it to rest; process {mover} moves it.",
+            f"`ident recover {config.name}` again, when it stands.",
+        )
+        return Recovery(config.name, faults, mover, None, "", (), {}, (), stop_first, False)
+    arm = make_arm(config) if arm is None else arm
+    seen, unreachable, refusal = None, "", ""
+    reset: tuple[str, ...] = ()
+    try:
+        seen = watch(arm, LOOK)
+        if (latched := _tripped(seen)) and not faults:
+            refusal = _reset(arm)
+            seen = watch(arm, LOOK)
+            reset = tuple(name for name in latched if name not in _tripped(seen))
+    except DriverError as error:
+        unreachable = str(error)
+    tripped = {} if seen is None else _tripped(seen)
+    out = [] if seen is None else outside(seen.position, limits, seen.joint_names)
+    before = _before(config.name, faults, seen, unreachable, tripped, refusal, limits)
+    usable = not before
+    steps = (*before, _at_last(config.name, seen, limits, bool(out)))
+    return Recovery(config.name, faults, None, seen, unreachable, reset, tripped, tuple(out), steps, usable)
+
+
+def _mover(path: Path) -> int | None:
+    try:
+        with ControlFile.reach(path) as controls:
+            return controls.pid
+    except UsageError:
+        return None
+
+
+def _tripped(seen: Watched) -> dict[str, str]:
+    """What drives have latched, in words, by axis."""
+    words = {name: AxisStatus(word) & TRIPPED for name, word in zip(seen.joint_names, seen.status, strict=False)}
+    return {
+        name: " and ".join(str(bit.name).lower().replace("_", " ") for bit in AxisStatus if bit in word)
+        for name, word in words.items()
+        if word
+    }
+
+
+def _reset(arm: Arm) -> str:
+    """Reset the drives; why they refuse, or empty."""
+    with arm:
+        arm.exchange(None)
+        try:
+            arm.reset()
+            arm.exchange(None)
+        except DriverError as error:
+            return str(error)
+    return ""
+
+
+def _before(
+    name: str,
+    faults: tuple[Remembered, ...],
+    seen: Watched | None,
+    unreachable: str,
+    tripped: dict[str, str],
+    refusal: str,
+    limits: MotionLimits,
+) -> list[str]:
+    """What must be done before the arm is usable, in order."""
+    steps = [f"`ident ack {name} {one.code}`, when you know why it came: {one.cause}." for one in faults]
+    if unreachable:
+        steps.append(f"Check power, cables, emergency stop, and that no other program has the arm: {unreachable}.")
+    if seen is None:
+        return [_SUPPORT, *steps, f"`ident recover {name}` again."]
+    silent = [joint for joint, q in zip(seen.joint_names, seen.position, strict=True) if not np.isfinite(q)]
+    if silent:
+        steps.append(f"Check power and cables of the axes that do not answer: {', '.join(silent)}.")
+    if bool((np.abs(seen.velocity) > REST_SPEED * limits.velocity).any()):
+        steps.append("Keep out of its reach until it rests: the arm moves, though nobody moves it.")
+    if tripped and refusal:
+        steps.append(f"Release the emergency stop, or read the drive's own fault code and mend its cause: {refusal}.")
+    if tripped or (faults and steps):
+        steps.append(f"`ident recover {name}` again: it resets the drives when every fault is acknowledged.")
+    if not silent and (out := outside(seen.position, limits, seen.joint_names)):
+        try:
+            require_near(seen.position, limits, seen.joint_names)
+            steps.append(
+                f"`ident check {name} --home`, then `ident recover {name} --leave-limit` leads it back inside, slowly; "
+                f"or push it by hand: {'; '.join(out)}."
+            )
+        except MotionRefused as error:
+            steps.append(f"Bring it back by hand: {error}.")
+    return [_SUPPORT, *steps] if steps else steps
+
+
+def _at_last(name: str, seen: Watched | None, limits: MotionLimits, out: bool) -> str:
+    away = seen is None or out or bool((np.abs(seen.position - limits.home) > AT_HOME).any())
+    home = f"`ident check {name} --home`, then `ident home {name}` leads it home; then " if away else ""
+    return f"{home}`ident check {name}` for the next motion."

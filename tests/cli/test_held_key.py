@@ -1,0 +1,235 @@
+"""A key that must be held: what a terminal tells of it, in virtual time, on a terminal of its own."""
+
+from __future__ import annotations
+
+import os
+import pty
+import termios
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ident_service.cli import main
+from ident_service.cli.moving import RELEASED, REPEATS, HeldKey
+from ident_service.config.load import shipped_arms
+from ident_service.motion.controls import HOLD_TO_RUN_SECONDS
+
+REPEAT = 0.033  # s, a desktop's
+SLOWEST = 0.092  # s, the Linux console's
+
+
+@dataclass
+class Keyboard:
+    """A person at a terminal, whose time is what is said here."""
+
+    master: int
+    slave: int
+    time: float = 100.0
+    key: Any = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.key = HeldKey(self.slave, lambda: self.time)
+
+    def press(self, text: bytes = b" ") -> None:
+        os.write(self.master, text)
+
+    def hold(self, times: int, period: float = REPEAT) -> None:
+        """So many repeats, each looked at."""
+        for _ in range(times):
+            self.time += period
+            self.press()
+            self.key.held()
+
+
+@pytest.fixture
+def keyboard() -> Iterator[Keyboard]:
+    master, slave = pty.openpty()
+    yield Keyboard(master, slave)
+    for fd in (master, slave):
+        try:
+            os.close(fd)
+        except OSError:
+            continue
+
+
+@pytest.fixture
+def held(keyboard: Keyboard) -> Iterator[Keyboard]:
+    with keyboard.key:
+        keyboard.hold(1)
+        keyboard.time += 0.5  # until a keyboard repeats
+        keyboard.hold(REPEATS)
+        assert keyboard.key.held()
+        yield keyboard
+
+
+def test_release_is_noticed_before_the_lease_lapses() -> None:
+    assert SLOWEST < RELEASED
+    assert RELEASED + 0.25 * HOLD_TO_RUN_SECONDS < HOLD_TO_RUN_SECONDS
+
+
+def test_presses_begin_nothing_and_repeats_do(keyboard: Keyboard) -> None:
+    with keyboard.key as key:
+        for _ in range(10):
+            keyboard.hold(1, period=0.2)
+        assert not key.held()
+        keyboard.hold(REPEATS - 2)
+        assert not key.held()
+        keyboard.hold(1)
+        assert key.held()
+        assert not key.released()
+
+
+def test_other_keys_are_not_the_key(keyboard: Keyboard) -> None:
+    with keyboard.key as key:
+        for _ in range(20):
+            keyboard.time += REPEAT
+            keyboard.press(b"x")
+            assert not key.held()
+
+
+@pytest.mark.parametrize("period", [REPEAT, SLOWEST])
+def test_it_stays_held_while_it_repeats(held: Keyboard, period: float) -> None:
+    held.hold(300, period)
+    assert held.key.held()
+
+
+def test_it_is_released_by_silence_and_stays_so(held: Keyboard) -> None:
+    for _ in range(3):
+        held.time += 0.05
+        assert not held.key.released()
+    held.time += 0.05
+    assert held.key.released()
+    held.hold(50)
+    assert held.key.released()
+    assert not held.key.held()
+
+
+def test_another_key_over_it_releases_it(held: Keyboard) -> None:
+    # A terminal repeats the key that was pressed last.
+    for _ in range(6):
+        held.time += REPEAT
+        held.press(b"x")
+        held.key.held()
+    assert held.key.released()
+
+
+def test_a_gap_that_was_looked_at_is_a_release_even_if_the_key_is_back(held: Keyboard) -> None:
+    held.time += 0.10
+    assert not held.key.released()
+    held.time += 0.06
+    held.press()
+    assert held.key.released()
+
+
+def test_keys_that_waited_while_nobody_looked_count_once(held: Keyboard) -> None:
+    held.press(b" " * 60)
+    held.time += 2.0
+    assert not held.key.released()
+    held.time += RELEASED + 0.01
+    assert held.key.released()
+
+
+def test_silence_while_nobody_looked_is_a_release(held: Keyboard) -> None:
+    held.time += 2.0
+    assert held.key.released()
+
+
+def test_a_terminal_that_is_gone_is_a_release(held: Keyboard) -> None:
+    held.time += REPEAT
+    os.close(held.master)
+    assert held.key.released()
+
+
+def test_nobody_who_holds_it_is_not_waited_for_when_asked_to_stop(keyboard: Keyboard) -> None:
+    asked: list[int] = []
+    with keyboard.key as key:
+        assert not key.wait(lambda: asked.append(1) or len(asked) > 3, seconds=0.001)
+
+
+@pytest.mark.parametrize("error", [None, KeyboardInterrupt, RuntimeError])
+def test_the_terminal_is_given_back_as_it_was(keyboard: Keyboard, error: type[BaseException] | None) -> None:
+    before = termios.tcgetattr(keyboard.slave)
+    try:
+        with keyboard.key:
+            assert not termios.tcgetattr(keyboard.slave)[3] & (termios.ICANON | termios.ECHO)
+            assert termios.tcgetattr(keyboard.slave)[3] & termios.ISIG, "Ctrl-C goes on working"
+            keyboard.press(b"   ")
+            if error is not None:
+                raise error
+    except (KeyboardInterrupt, RuntimeError):
+        assert error is not None
+    assert termios.tcgetattr(keyboard.slave) == before
+    os.set_blocking(keyboard.slave, False)
+    with pytest.raises(BlockingIOError):
+        os.read(keyboard.slave, 1)  # nothing is left for the shell
+
+
+def arm(folder: Path) -> Path:
+    """The planar arm in virtual time with short motions."""
+    path = folder / "arm.yaml"
+    motion = "{kind: seeded, seed: 1, base_frequency: 0.4, harmonics: 2, periods: 1}"
+    path.write_text(
+        f"extends: {shipped_arms()['planar2']}\nmotions: {{identification: {motion}, validation: {motion}}}\n"
+    )
+    return path
+
+
+@pytest.mark.parametrize("words", [(), ("--json",)])
+def test_without_a_terminal_a_rehearsal_needs_a_word(
+    words: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["rehearse", str(arm(tmp_path)), "--state", str(tmp_path), *words]) == 2
+    assert "--no-key" in capsys.readouterr().err
+
+
+class Hands:
+    """Somebody at the keyboard in real time: holds the space bar until told to let go."""
+
+    def __init__(self, master: int) -> None:
+        self._master, self._let_go = master, threading.Event()
+        self._thread = threading.Thread(target=self._hold, daemon=True)
+
+    def __enter__(self) -> Hands:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.let_go()
+        self._thread.join()
+
+    def let_go(self) -> None:
+        self._let_go.set()
+
+    def _hold(self) -> None:
+        while not self._let_go.is_set():
+            os.write(self._master, b" ")
+            time.sleep(REPEAT)
+
+
+@pytest.mark.slow
+def test_a_rehearsal_ends_with_the_key(
+    keyboard: Keyboard, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, state = arm(tmp_path), ["--state", str(tmp_path / "state")]
+    assert main(["check", str(path), "--confirm", "planar2", *state]) == 0
+    before = termios.tcgetattr(keyboard.slave)
+    with os.fdopen(os.dup(keyboard.slave)) as stdin, Hands(keyboard.master) as hands:
+        monkeypatch.setattr("sys.stdin", stdin)
+        said: list[str] = []
+
+        def told(_: object, line: str) -> None:
+            said.append(line)
+            if line == "approaching":
+                hands.let_go()
+
+        monkeypatch.setattr("ident_service.cli.moving.tell", told)
+        assert main(["rehearse", str(path), "--out", str(tmp_path / "run"), *state]) == 0
+    assert "stopped after" in capsys.readouterr().out
+    assert said[-2:] == ["stopping", "stopped"]
+    assert "exciting" not in said or "returning" not in said
+    assert termios.tcgetattr(keyboard.slave) == before

@@ -1,0 +1,84 @@
+"""Preflight for a way home: no motion is asked about, and the arm may stand a little outside its limits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from flight_bench import SHOULDER, Flight, FlightArm, check_of, flight_config, joint_changes, only_failure
+
+from ident_service.config.limits import motion_limits
+from ident_service.motion.preflight_check import Verdict
+from ident_service.motion.preflight_ticket import Ticket
+from sim_backend.arm import from_config
+
+UPPER, AWAY = SHOULDER["position"][1], SHOULDER["following_error"]
+
+
+def standing(shoulder: float, **changes: object) -> Flight:
+    """A preflight without a motion, of an arm that stands somewhere."""
+    flight = Flight(changes=changes)
+    flight.motion = None  # type: ignore[assignment]
+    wide = flight_config(joints=joint_changes("shoulder", position=(-4.0, 4.0), home=shoulder))
+    flight.arm = FlightArm(from_config(wide))
+    return flight
+
+
+def shown_furthest(flight: Flight) -> tuple[Ticket, float]:
+    """The ticket, and how far out the shoulder was seen."""
+    seen: list[float] = []
+    flight.arm.shown = lambda sample: seen.append(float(sample.position[0])) or sample
+    return flight.ticket(), max(seen)
+
+
+@pytest.mark.parametrize("start", [-1.0, 1.5, UPPER + 0.5 * AWAY])
+def test_an_arm_inside_or_a_little_outside_passes(start: float) -> None:
+    flight = standing(start)
+    ticket, furthest = shown_furthest(flight)
+    assert ticket.verdict is Verdict.PASSED, [check.reason for check in ticket.checks]
+    assert ticket.subject.excitation == ""
+    for code in ("motion_fits", "motion_proven"):
+        assert check_of(ticket, code).reason == "no motion is asked about"
+    assert check_of(ticket, "ways_clear").verdict is Verdict.PASSED
+    assert check_of(ticket, "direction").verdict is Verdict.PASSED
+    assert flight.arm.torques
+    if start > UPPER:
+        # What proves directions leads inwards there; outwards it only gave way to its own weight.
+        assert furthest < start + 0.02
+    else:
+        assert furthest > start + 0.03
+
+
+def test_farther_outside_nothing_is_touched() -> None:
+    flight = standing(UPPER + 1.1 * AWAY)
+    check = only_failure(flight.ticket(), "at_rest")
+    assert check.reason.startswith("shoulder: position")
+    assert flight.arm.torques == []
+    assert "enable" not in flight.arm.calls
+
+
+def test_for_a_motion_a_little_outside_is_outside() -> None:
+    flight = standing(UPPER + 0.5 * AWAY)
+    flight.motion = Flight().motion
+    only_failure(flight.ticket(), "at_rest")
+    assert flight.arm.torques == []
+
+
+def test_the_limits_that_the_description_has_stay_what_they_are() -> None:
+    flight = standing(UPPER + 0.5 * AWAY)
+    before = motion_limits(flight.model.config)
+    flight.ticket()
+    after = motion_limits(flight.model.config)
+    np.testing.assert_array_equal(after.upper, before.upper)
+
+
+def test_a_ticket_without_a_motion_is_for_this_arm_only() -> None:
+    ticket = standing(0.5).ticket()
+    subject = ticket.subject
+    now = ticket.created
+    assert ticket.valid_for(subject, now) == []
+    assert ticket.valid_for(replace(subject, excitation="identification", excitation_sha256="0" * 64), now) == [
+        "the motion has changed since"
+    ]
+    assert ticket.valid_for(replace(subject, model_sha256="0" * 64), now) != []
