@@ -6,6 +6,7 @@ Boundary: data only. Frames and their cost on the wire are `drivers/canopen`, ge
 
 from __future__ import annotations
 
+import configparser
 from collections.abc import Iterator, Sequence
 from typing import Annotated, Literal
 
@@ -24,6 +25,9 @@ from ident_service.config.recording import Transmission
 from ident_service.config.simulation import SimulatedFault
 
 NodeId = Annotated[int, Field(strict=True, ge=1, le=127)]
+Seconds = Annotated[float, Field(strict=True, ge=0.001, le=60.0)]  # whole ms of 16 bits in the drive
+InhibitTime = Annotated[float, Field(strict=True, ge=0.0001, le=6.5)]  # 100 us of 16 bits
+_MOST_PER_MILLE = 32_767  # of a torque of 16 bits
 Unsigned32 = Annotated[int, Field(strict=True, ge=0, le=0xFFFF_FFFF)]
 
 
@@ -68,14 +72,33 @@ class CanopenDrive(Section):
     max_torque: Positive
     max_speed: Positive
 
+    @model_validator(mode="after")
+    def _fits_the_objects(self) -> CanopenDrive:
+        milli = 1000.0 * self.rated_torque
+        if round(milli) < 1 or abs(milli - round(milli)) > 1e-6:
+            raise ValueError(f"rated_torque {self.rated_torque:g} is not whole mN m, which is what 6076h holds")
+        share = 1000.0 * self.max_torque / self.rated_torque
+        if not 1.0 <= share <= _MOST_PER_MILLE + 1e-6:
+            raise ValueError(
+                f"max_torque {self.max_torque:g} is {share / 1000.0:g} times rated_torque; a torque is sent in"
+                f" thousandths of it, from 1 to {_MOST_PER_MILLE}: choose another rated_torque"
+            )
+        return self
+
 
 class Heartbeats(Section):
     """Who says that it lives, how often, and how long the others wait for it [s] (1017h, 1016h)."""
 
     node: NodeId = 127
-    period: Positive = 0.1
-    drives: Positive = 0.1
-    timeout: Positive = 0.3
+    period: Seconds = 0.1
+    drives: Seconds = 0.1
+    timeout: Seconds = 0.3
+
+    @model_validator(mode="after")
+    def _patient(self) -> Heartbeats:
+        if self.timeout <= max(self.period, self.drives):
+            raise ValueError(f"a timeout of {self.timeout:g} s is not longer than the heartbeats' periods")
+        return self
 
 
 class Reactions(Section):
@@ -89,8 +112,8 @@ class Reactions(Section):
 class StatusReports(Section):
     """When a drive sends status word and torque (TPDO2) [s]: on change, not within `inhibit`, and every `period`."""
 
-    period: Positive = 0.1
-    inhibit: Positive = 0.05
+    period: Seconds = 0.1
+    inhibit: InhibitTime = 0.05
 
 
 class Emulation(Section):
@@ -116,7 +139,7 @@ class CanopenDriver(Section):
     buses: Annotated[tuple[CanBus, ...], Field(min_length=1, max_length=4)] = (CanBus(),)
     drives: Annotated[tuple[CanopenDrive, ...], Field(min_length=1)]
     torque_frames: Literal["shared", "single"] = "shared"
-    torque_deadline: Positive = 0.01
+    torque_deadline: Seconds = 0.01
     bring_up: Positive = 0.5
     zero: Literal["absolute", "at_home"] = "absolute"
     heartbeats: Heartbeats = Heartbeats()
@@ -134,7 +157,25 @@ class CanopenDriver(Section):
                 raise ValueError(f"node {node} is a drive and the host (heartbeats.node); give the host another number")
             if places.count((bus, node)) > 1:
                 raise ValueError(f"node {node} stands twice on bus {bus}")
+        used = {bus for bus, _ in places}
+        for bus in range(len(self.buses)):
+            if bus not in used:
+                raise ValueError(f"no drive is on bus {bus} (counted from 0)")
         return self
+
+
+def maps_dummies(eds: str) -> bool:
+    """Whether a drive lets 16 bits of a torque frame be another drive's: `Dummy0003=1` of its EDS (CiA 306-1).
+
+    Args:
+        eds: the EDS's text; one that cannot be read says no.
+    """
+    parser = configparser.ConfigParser(strict=False, interpolation=None)
+    try:
+        parser.read_string(eds)
+        return int(parser.get("DummyUsage", "Dummy0003", fallback="0"), 0) == 1
+    except (configparser.Error, ValueError):
+        return False
 
 
 def disagreements(
@@ -151,5 +192,14 @@ def disagreements(
         yield ("driver",), "CANopen drives need the section transmission: gear ratios from joints to motors"
     elif len(transmission.ratios) != len(driver.drives):
         yield ("driver", "drives"), f"{len(driver.drives)} drives but {len(transmission.ratios)} ratios in transmission"
+    shares = driver.torque_frames == "shared" and any(
+        sum(drive.bus == bus for drive in driver.drives) > 1 for bus in range(len(driver.buses))
+    )
+    if shares and not maps_dummies(driver.eds.text):
+        yield (
+            ("driver", "eds"),
+            f"driver.eds: {driver.eds.name} has no Dummy0003=1 under [DummyUsage], so that these drives cannot share"
+            " torque frames; set driver.torque_frames to single, at a rate that it fits",
+        )
     if joints and len(joints) != len(driver.drives):
         yield ("driver", "drives"), f"{len(driver.drives)} drives for {len(joints)} joints"
