@@ -173,7 +173,8 @@ def maps_dummies(eds: str) -> bool:
     parser = configparser.ConfigParser(strict=False, interpolation=None)
     try:
         parser.read_string(eds)
-        return int(parser.get("DummyUsage", "Dummy0003", fallback="0"), 0) == 1
+        section = next((name for name in parser.sections() if name.lower() == "dummyusage"), None)
+        return section is not None and int(parser.get(section, "Dummy0003", fallback="0"), 0) == 1
     except (configparser.Error, ValueError):
         return False
 
