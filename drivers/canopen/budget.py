@@ -25,8 +25,16 @@ from drivers.canopen import dictionary as od
 from drivers.canopen.bits import exact, unstuffed, worst
 from drivers.canopen.dictionary import Entry, Kind
 from drivers.canopen.frame import Frame
-from drivers.canopen.profile import EMERGENCY, EMERGENCY_INHIBIT, HEARTBEAT, SYNC, TPDO1, TPDO2, BusProfile
-from drivers.canopen.profile import bus_profiles as bus_profiles
+from drivers.canopen.profile import (
+    EMERGENCY,
+    EMERGENCY_INHIBIT,
+    HEARTBEAT,
+    SYNC,
+    TPDO1,
+    TPDO2,
+    BusProfile,
+    bus_profiles,
+)
 from drivers.canopen.words import NmtState
 from ident_service.config.canopen import CanBus, CanopenDriver, maps_dummies
 

@@ -27,6 +27,7 @@ from ident_service.config.simulation import SimulatedFault
 NodeId = Annotated[int, Field(strict=True, ge=1, le=127)]
 Seconds = Annotated[float, Field(strict=True, ge=0.001, le=60.0)]  # whole ms of 16 bits in the drive
 InhibitTime = Annotated[float, Field(strict=True, ge=0.0001, le=6.5)]  # 100 us of 16 bits
+_LEAST_DEADLINE = 2.0  # cycles: one frame may be late
 _MOST_PER_MILLE = 32_767  # of a torque of 16 bits
 Unsigned32 = Annotated[int, Field(strict=True, ge=0, le=0xFFFF_FFFF)]
 
@@ -40,9 +41,15 @@ class CanBus(Section):
 
     interface: Annotated[str, Field(min_length=1)] = "socketcan"
     channel: str = "can0"
-    bitrate: Count = 1_000_000
+    bitrate: Annotated[Count, Field(le=1_000_000)] = 1_000_000
     data_bitrate: Count | None = None
     options: dict[str, str | int | float | bool] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _data_not_slower(self) -> CanBus:
+        if self.data_bitrate is not None and self.data_bitrate < self.bitrate:
+            raise ValueError(f"data_bitrate {self.data_bitrate} is below bitrate {self.bitrate}; CAN FD only speeds up")
+        return self
 
 
 class DriveIdentity(Section):
@@ -157,6 +164,9 @@ class CanopenDriver(Section):
                 raise ValueError(f"node {node} is a drive and the host (heartbeats.node); give the host another number")
             if places.count((bus, node)) > 1:
                 raise ValueError(f"node {node} stands twice on bus {bus}")
+        wires = [(bus.interface, bus.channel) for bus in self.buses if bus.interface != "lock_step"]
+        if twice := next((wire for wire in wires if wires.count(wire) > 1), None):
+            raise ValueError(f"two buses are {twice[0]} {twice[1]}; give each its own channel")
         used = {bus for bus, _ in places}
         for bus in range(len(self.buses)):
             if bus not in used:
@@ -180,7 +190,7 @@ def maps_dummies(eds: str) -> bool:
 
 
 def disagreements(
-    driver: CanopenDriver, transmission: Transmission | None, joints: Sequence[str]
+    driver: CanopenDriver, transmission: Transmission | None, joints: Sequence[str], rate: float
 ) -> Iterator[tuple[tuple[str | int, ...], str]]:
     """What does not fit an arm of these joints: the place in the arm's file, and what is wrong.
 
@@ -188,7 +198,14 @@ def disagreements(
         driver: the section `driver`.
         transmission: the arm's.
         joints: names of the arm's joints; none where the file does not name them.
+        rate: cycles per second.
     """
+    if driver.torque_deadline * rate < _LEAST_DEADLINE:
+        yield (
+            ("driver", "torque_deadline"),
+            f"driver.torque_deadline: {driver.torque_deadline:g} s at {rate:g} Hz has no room for a late torque frame;"
+            f" at least {_LEAST_DEADLINE:g} cycles are needed, {_LEAST_DEADLINE / rate:g} s",
+        )
     if transmission is None:
         yield ("driver",), "CANopen drives need the section transmission: gear ratios from joints to motors"
     elif len(transmission.ratios) != len(driver.drives):

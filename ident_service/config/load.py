@@ -141,7 +141,7 @@ def _disagreements(config: ArmConfig) -> Iterator[tuple[KeyPath, str]]:
                 yield ("driver", key), f"driver.{key}: {len(given)} values for {len(names)} joints"
         yield from simulation.disagreements(config.driver, names)
     if isinstance(config.driver, CanopenDriver):
-        yield from canopen.disagreements(config.driver, config.transmission, names)
+        yield from canopen.disagreements(config.driver, config.transmission, names, config.control.rate)
     yield from recording.disagreements(config.recording, config.transmission, names)
     yield from workspace.disagreements(config.geometry, config.workspace, config.supply, names)
     yield from design.disagreements(config.design, names)

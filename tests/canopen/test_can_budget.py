@@ -125,7 +125,7 @@ def test_over_budget_is_told_with_remedies_that_hold() -> None:
     done = {
         "run at": budget(driver, 500.0),
         "let up": budget(wam_driver(), 1000.0),
-        "give the": budget(wam_driver(torque_frames="single", buses=[{}, {}], drives=drives), 1000.0),
+        "give the": budget(wam_driver(torque_frames="single", buses=[{}, {"channel": "can1"}], drives=drives), 1000.0),
         "use CAN": budget(wam_driver(torque_frames="single", buses=[{"data_bitrate": 4_000_000}]), 1000.0),
     }
     for remedy in over.remedies:

@@ -138,6 +138,10 @@ def test_the_identified_parameters_are_those_of_the_simulated_wam(arms: Path) ->
     [
         ("eds: bare.eds", "bare.eds has no Dummy0003=1 under [DummyUsage]"),
         ("buses: [{}, {channel: can1}]", "no drive is on bus 1"),
+        ("buses: [{}, {}]", "two buses are socketcan can0"),
+        ("buses: [{bitrate: 2000000}]", "less than or equal to 1000000"),
+        ("buses: [{data_bitrate: 500000}]", "data_bitrate 500000 is below bitrate 1000000"),
+        ("torque_deadline: 0.001", "at least 2 cycles are needed, 0.002 s"),
         ("heartbeats: {timeout: 0.05}", "not longer than the heartbeats' periods"),
         ("torque_deadline: 0.0001", "greater than or equal to 0.001"),
         ("status: {inhibit: 7.0}", "less than or equal to 6.5"),

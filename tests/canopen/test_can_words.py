@@ -73,18 +73,20 @@ def test_commands_lead_to_operation_enabled() -> None:
 
 
 @pytest.mark.parametrize(
-    ("word", "status"),
+    ("word", "emergency", "status"),
     [
-        (0x1637, AxisStatus.POWERED),
-        (0x0007, AxisStatus.POWERED),
-        (0x0008, AxisStatus.FAULT),
-        (0x000F, AxisStatus.FAULT),
-        (0x0250, AxisStatus(0)),
-        (0x0231, AxisStatus(0)),
+        (0x1637, 0, AxisStatus.POWERED),
+        (0x0007, 0, AxisStatus.IDLE),
+        (0x0008, 0, AxisStatus.FAULT),
+        (0x000F, 0x2310, AxisStatus.FAULT),
+        (0x0250, 0, AxisStatus(0)),
+        (0x0231, 0, AxisStatus(0)),
+        (0x0250, 0x8250, AxisStatus.WATCHDOG),
+        (0x0008, 0x8130, AxisStatus.FAULT | AxisStatus.WATCHDOG),
     ],
 )
-def test_status_words_in_the_words_of_all_fieldbuses(word: int, status: AxisStatus) -> None:
-    assert axis_status(word) == status
+def test_status_words_in_the_words_of_all_fieldbuses(word: int, emergency: int, status: AxisStatus) -> None:
+    assert axis_status(word, emergency) == status
 
 
 @pytest.mark.parametrize(
