@@ -132,6 +132,15 @@ EMERGENCIES: dict[int, str] = {
     0xFF00: "specific to the device",
 }
 
+# In quick stop the drive brakes by itself, and no torque of ours acts.
+_AXIS_STATUS: dict[DriveState, AxisStatus] = {
+    DriveState.OPERATION_ENABLED: AxisStatus.POWERED,
+    DriveState.QUICK_STOP: AxisStatus.IDLE,
+    DriveState.FAULT_REACTION: AxisStatus.FAULT,
+    DriveState.FAULT: AxisStatus.FAULT,
+}
+_WATCHDOGS = (0x8130, 0x8250)  # we fell silent: no heartbeat, no torque frame
+
 # Bits of object 1001h, from the lowest.
 ERROR_REGISTER = ("generic", "current", "voltage", "temperature", "communication", "profile", "reserved", "vendor")
 
@@ -179,12 +188,15 @@ def state_of(status: int) -> DriveState:
     return DriveState.UNKNOWN
 
 
-def axis_status(status: int) -> AxisStatus:
-    """A status word in the words of all fieldbuses; what it does not tell (emergency stop, watchdog) is not in it."""
-    state = state_of(status)
-    if state in (DriveState.FAULT, DriveState.FAULT_REACTION):
-        return AxisStatus.FAULT
-    return AxisStatus.POWERED if state in (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP) else AxisStatus(0)
+def axis_status(status: int, emergency: int = 0) -> AxisStatus:
+    """What a drive says, in the words of all fieldbuses; neither object tells of an emergency stop.
+
+    Args:
+        status: the status word.
+        emergency: error code of its latest emergency, 0 for none.
+    """
+    found = _AXIS_STATUS.get(state_of(status), AxisStatus(0))
+    return found | AxisStatus.WATCHDOG if emergency in _WATCHDOGS else found
 
 
 def emergency_words(code: int, register: int = 0, vendor: bytes = b"") -> str:

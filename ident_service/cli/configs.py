@@ -1,6 +1,7 @@
 """Verbs about arm descriptions: `config check`.
 
-Boundary: words to calls, results to words; the work is `config/load.py` and `motion/preflight_stability.py`.
+Boundary: words to calls, results to words; the work is `config/load.py`, `motion/preflight_stability.py` and
+`service/bus.py`.
 """
 
 from __future__ import annotations
@@ -31,10 +32,13 @@ def _check(arguments: argparse.Namespace) -> Answer:
     from ident_service.errors import MotionRefused
     from ident_service.model.arm_model import arm_model
     from ident_service.motion.preflight_stability import delay_of, stability
+    from ident_service.service.bus import bus_lines, require_budget
 
     model = arm_model(load_arm(arguments.file))
     config = model.config
-    head = f"{arguments.file}: {config.name}, {model.chain.joints} joints, {model.layout.size} parameters: good\n"
+    budget = require_budget(arguments.file, config)
+    head = "" if budget is None else bus_lines(budget)
+    head += f"{arguments.file}: {config.name}, {model.chain.joints} joints, {model.layout.size} parameters: good\n"
     document: dict[str, Any] = {"file": arguments.file, "arm": config.name, "sha256": config.sha256, "problems": []}
     try:
         limits = motion_limits(config)

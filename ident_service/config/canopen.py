@@ -6,6 +6,7 @@ Boundary: data only. Frames and their cost on the wire are `drivers/canopen`, ge
 
 from __future__ import annotations
 
+import configparser
 from collections.abc import Iterator, Sequence
 from typing import Annotated, Literal
 
@@ -24,6 +25,10 @@ from ident_service.config.recording import Transmission
 from ident_service.config.simulation import SimulatedFault
 
 NodeId = Annotated[int, Field(strict=True, ge=1, le=127)]
+Seconds = Annotated[float, Field(strict=True, ge=0.001, le=60.0)]  # whole ms of 16 bits in the drive
+InhibitTime = Annotated[float, Field(strict=True, ge=0.0001, le=6.5)]  # 100 us of 16 bits
+_LEAST_DEADLINE = 2.0  # cycles: one frame may be late
+_MOST_PER_MILLE = 32_767  # of a torque of 16 bits
 Unsigned32 = Annotated[int, Field(strict=True, ge=0, le=0xFFFF_FFFF)]
 
 
@@ -36,9 +41,15 @@ class CanBus(Section):
 
     interface: Annotated[str, Field(min_length=1)] = "socketcan"
     channel: str = "can0"
-    bitrate: Count = 1_000_000
+    bitrate: Annotated[Count, Field(le=1_000_000)] = 1_000_000
     data_bitrate: Count | None = None
     options: dict[str, str | int | float | bool] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _data_not_slower(self) -> CanBus:
+        if self.data_bitrate is not None and self.data_bitrate < self.bitrate:
+            raise ValueError(f"data_bitrate {self.data_bitrate} is below bitrate {self.bitrate}; CAN FD only speeds up")
+        return self
 
 
 class DriveIdentity(Section):
@@ -68,14 +79,33 @@ class CanopenDrive(Section):
     max_torque: Positive
     max_speed: Positive
 
+    @model_validator(mode="after")
+    def _fits_the_objects(self) -> CanopenDrive:
+        milli = 1000.0 * self.rated_torque
+        if round(milli) < 1 or abs(milli - round(milli)) > 1e-6:
+            raise ValueError(f"rated_torque {self.rated_torque:g} is not whole mN m, which is what 6076h holds")
+        share = 1000.0 * self.max_torque / self.rated_torque
+        if not 1.0 <= share <= _MOST_PER_MILLE + 1e-6:
+            raise ValueError(
+                f"max_torque {self.max_torque:g} is {share / 1000.0:g} times rated_torque; a torque is sent in"
+                f" thousandths of it, from 1 to {_MOST_PER_MILLE}: choose another rated_torque"
+            )
+        return self
+
 
 class Heartbeats(Section):
     """Who says that it lives, how often, and how long the others wait for it [s] (1017h, 1016h)."""
 
     node: NodeId = 127
-    period: Positive = 0.1
-    drives: Positive = 0.1
-    timeout: Positive = 0.3
+    period: Seconds = 0.1
+    drives: Seconds = 0.1
+    timeout: Seconds = 0.3
+
+    @model_validator(mode="after")
+    def _patient(self) -> Heartbeats:
+        if self.timeout <= max(self.period, self.drives):
+            raise ValueError(f"a timeout of {self.timeout:g} s is not longer than the heartbeats' periods")
+        return self
 
 
 class Reactions(Section):
@@ -89,8 +119,8 @@ class Reactions(Section):
 class StatusReports(Section):
     """When a drive sends status word and torque (TPDO2) [s]: on change, not within `inhibit`, and every `period`."""
 
-    period: Positive = 0.1
-    inhibit: Positive = 0.05
+    period: Seconds = 0.1
+    inhibit: InhibitTime = 0.05
 
 
 class Emulation(Section):
@@ -116,7 +146,7 @@ class CanopenDriver(Section):
     buses: Annotated[tuple[CanBus, ...], Field(min_length=1, max_length=4)] = (CanBus(),)
     drives: Annotated[tuple[CanopenDrive, ...], Field(min_length=1)]
     torque_frames: Literal["shared", "single"] = "shared"
-    torque_deadline: Positive = 0.01
+    torque_deadline: Seconds = 0.01
     bring_up: Positive = 0.5
     zero: Literal["absolute", "at_home"] = "absolute"
     heartbeats: Heartbeats = Heartbeats()
@@ -134,11 +164,33 @@ class CanopenDriver(Section):
                 raise ValueError(f"node {node} is a drive and the host (heartbeats.node); give the host another number")
             if places.count((bus, node)) > 1:
                 raise ValueError(f"node {node} stands twice on bus {bus}")
+        wires = [(bus.interface, bus.channel) for bus in self.buses if bus.interface != "lock_step"]
+        if twice := next((wire for wire in wires if wires.count(wire) > 1), None):
+            raise ValueError(f"two buses are {twice[0]} {twice[1]}; give each its own channel")
+        used = {bus for bus, _ in places}
+        for bus in range(len(self.buses)):
+            if bus not in used:
+                raise ValueError(f"no drive is on bus {bus} (counted from 0)")
         return self
 
 
+def maps_dummies(eds: str) -> bool:
+    """Whether a drive lets 16 bits of a torque frame be another drive's: `Dummy0003=1` of its EDS (CiA 306-1).
+
+    Args:
+        eds: the EDS's text; one that cannot be read says no.
+    """
+    parser = configparser.ConfigParser(strict=False, interpolation=None)
+    try:
+        parser.read_string(eds)
+        section = next((name for name in parser.sections() if name.lower() == "dummyusage"), None)
+        return section is not None and int(parser.get(section, "Dummy0003", fallback="0"), 0) == 1
+    except (configparser.Error, ValueError):
+        return False
+
+
 def disagreements(
-    driver: CanopenDriver, transmission: Transmission | None, joints: Sequence[str]
+    driver: CanopenDriver, transmission: Transmission | None, joints: Sequence[str], rate: float
 ) -> Iterator[tuple[tuple[str | int, ...], str]]:
     """What does not fit an arm of these joints: the place in the arm's file, and what is wrong.
 
@@ -146,10 +198,26 @@ def disagreements(
         driver: the section `driver`.
         transmission: the arm's.
         joints: names of the arm's joints; none where the file does not name them.
+        rate: cycles per second.
     """
+    if driver.torque_deadline * rate < _LEAST_DEADLINE:
+        yield (
+            ("driver", "torque_deadline"),
+            f"driver.torque_deadline: {driver.torque_deadline:g} s at {rate:g} Hz has no room for a late torque frame;"
+            f" at least {_LEAST_DEADLINE:g} cycles are needed, {_LEAST_DEADLINE / rate:g} s",
+        )
     if transmission is None:
         yield ("driver",), "CANopen drives need the section transmission: gear ratios from joints to motors"
     elif len(transmission.ratios) != len(driver.drives):
         yield ("driver", "drives"), f"{len(driver.drives)} drives but {len(transmission.ratios)} ratios in transmission"
+    shares = driver.torque_frames == "shared" and any(
+        sum(drive.bus == bus for drive in driver.drives) > 1 for bus in range(len(driver.buses))
+    )
+    if shares and not maps_dummies(driver.eds.text):
+        yield (
+            ("driver", "eds"),
+            f"driver.eds: {driver.eds.name} has no Dummy0003=1 under [DummyUsage], so that these drives cannot share"
+            " torque frames; set driver.torque_frames to single, at a rate that it fits",
+        )
     if joints and len(joints) != len(driver.drives):
         yield ("driver", "drives"), f"{len(driver.drives)} drives for {len(joints)} joints"

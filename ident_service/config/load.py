@@ -75,6 +75,18 @@ def load_recording_format(path: str | Path) -> RecordingFormat:
     return _validated(RecordingFormat, read_tree(path), path)
 
 
+def mistake(arm: str | Path, where: KeyPath, message: str) -> ConfigError:
+    """A mistake that only shows when a description is put to use, with its place.
+
+    Args:
+        arm: a YAML file, or the name of a shipped description.
+        where: keys from the top of the file; the nearest of them that stands there is the place.
+        message: what is wrong, and what to do.
+    """
+    path = find_arm(str(arm))
+    return ConfigError([read_tree(path).problem(where, f"{'.'.join(map(str, where))}: {message}", path)])
+
+
 def _validated(kind: type[_Described], tree: Tree, path: Path) -> _Described:
     try:
         return kind.model_validate(tree.value)
@@ -129,7 +141,7 @@ def _disagreements(config: ArmConfig) -> Iterator[tuple[KeyPath, str]]:
                 yield ("driver", key), f"driver.{key}: {len(given)} values for {len(names)} joints"
         yield from simulation.disagreements(config.driver, names)
     if isinstance(config.driver, CanopenDriver):
-        yield from canopen.disagreements(config.driver, config.transmission, names)
+        yield from canopen.disagreements(config.driver, config.transmission, names, config.control.rate)
     yield from recording.disagreements(config.recording, config.transmission, names)
     yield from workspace.disagreements(config.geometry, config.workspace, config.supply, names)
     yield from design.disagreements(config.design, names)

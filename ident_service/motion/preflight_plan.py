@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from drivers.canopen.budget import budget
+from ident_service.config.canopen import CanopenDriver
 from ident_service.config.limits import MotionLimits, Vector, motion_limits
 from ident_service.errors import IdentError, ModelError, MotionRefused
 from ident_service.excitation.excitation import Excitation
@@ -27,7 +29,7 @@ _POSTURES = 8  # of the motion, at which the coupled loop is judged
 
 
 def configuration_check(model: ArmModel) -> Check:
-    """Whether the description has all that moving needs: limits, gains, a prior that a real body could have."""
+    """Whether the description has all that moving needs: limits, gains, a prior of a real body, room on the bus."""
     code, remedy = "configuration", "Complete the arm's description; `ident config check` names every place."
     try:
         limits = motion_limits(model.config)
@@ -43,6 +45,10 @@ def configuration_check(model: ArmModel) -> Check:
             "the prior's mass matrix at home is not positive definite: no real body has these parameters",
             "Give prior parameters of a feasible identification or of a CAD model.",
         )
+    if isinstance(model.config.driver, CanopenDriver):
+        load = budget(model.config.driver, model.config.control.rate)
+        if not load.fits:
+            return failed(code, load.reason, load.remedy)
     return Check(code, Verdict.PASSED)
 
 
