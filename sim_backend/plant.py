@@ -9,8 +9,8 @@ direction, and unconditionally sticking where one comes to rest::
     (M(q_m) + h/2 fv) (v+ - v)/h = tau - c(q_m, v_m) - g(q_m) - fo - fv v - lambda,  lambda_i in fc_i Sgn(v+_i)
     q+ = q + h/2 (v + v+)
 
-Idle drives brake like more of `fv`, or, where a gear couples joints, like a symmetric damping matrix. A load is a point mass that moves with the last link, on which it appears without
-an impact.
+Idle drives brake like more of `fv`, or, where a gear couples joints, like a symmetric damping matrix. A load is a point
+mass that moves with the last link, on which it appears without an impact.
 
 Boundary: the only file of this room that knows pinocchio; no clock, no encoder, no noise.
 """
@@ -176,12 +176,12 @@ class Plant:
 
     def _damp(self) -> None:
         # Implicit viscous friction acts like more drive inertia, so that it costs nothing to solve for.
-        braking = self._braking
+        braking: Array = self._braking
         self._coupled: Array | None = None
         if braking.ndim == 2:
             # What couples joints does not: it is solved for as dry friction is.
             rest = braking - np.diag(np.diag(braking))
-            self._coupled, braking = (rest if rest.any() else None), np.diag(braking)
+            self._coupled, braking = (rest if rest.any() else None), np.diagonal(braking)
         self._damping = self._viscous + braking
         self._model.armature = self._armature + self._half * self._damping
 

@@ -24,11 +24,16 @@ ColumnName = Annotated[str, Field(pattern=r"^(t|(q|dq|tau)[1-9]\d{0,3})$")]
 
 
 class Transmission(Section):
-    """Gear ratios per joint (motor over joint, the sign tells the sense), coupling of joints, offsets of zero."""
+    """Gear ratios per joint (motor over joint, the sign tells the sense), coupling of joints, offsets of zero.
+
+    `drive_terms` says whose drive inertia and friction are: those of the motors, which a coupling spreads over joints,
+    or those of the joints as if there were no coupling, as in the paper's model of the WAM.
+    """
 
     ratios: Annotated[tuple[Number, ...], Field(min_length=1)]
     coupling: tuple[tuple[Number, ...], ...] | None = None
     offsets: tuple[Angle, ...] | None = None
+    drive_terms: Literal["motors", "joints"] = "motors"
 
     @field_validator("ratios")
     @classmethod

@@ -56,8 +56,9 @@ def arm_model(config: ArmConfig) -> ArmModel:
             f"{config.name}: joints are configured as {', '.join(config.joints)} "
             f"but the mechanism has {', '.join(chain.names)}, in this order"
         )
-    if config.transmission is not None and config.transmission.coupling is not None:
-        chain = replace(chain, coupling=np.array(config.transmission.coupling, dtype=float))
+    gears = config.transmission
+    if gears is not None and gears.coupling is not None and gears.drive_terms == "motors":
+        chain = replace(chain, coupling=np.array(gears.coupling, dtype=float))
     velocity = config.identification.friction.stribeck_velocity
     stribeck = np.broadcast_to(np.asarray(0.1 if velocity == "fit" else velocity, dtype=float), (chain.joints,))
     layout = Layout(chain.revolute, config.terms, tuple(stribeck.tolist()) if "stribeck" in config.terms else ())

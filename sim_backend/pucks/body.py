@@ -2,8 +2,8 @@
 
 Between two instants at which something changes, motors do the same, and the plant moves in one step; a longer silence
 is divided into steps near the nominal period, between which `watch` is called, so that whoever limits torques by
-position and speed can. A step of exactly the nominal period is the simulated arm's. Until the first torque, somebody
-holds the arm.
+position and speed can. A step of exactly the nominal period is the simulated arm's. Until all motors
+have been powered, somebody holds the arm.
 
 Boundary: motors to plant; no protocol, no clock.
 """
@@ -101,6 +101,11 @@ class Body:
             if number < steps:
                 self.watch(end)
 
+    def catch_up(self, now_ns: int) -> None:
+        """Move the plant after a silence of more than a step, before what ends the silence has any effect."""
+        if now_ns - self.now_ns > _LONGEST * self._period_ns:
+            self.advance(now_ns)
+
     def truth(self, stamp_ns: int) -> Truth:
         """What the plant does now; torques at the joints, without noise and braking."""
         plant = self.plant
@@ -137,7 +142,7 @@ class Body:
             return
         powered = np.array([power is Power.TORQUE for power, _ in outputs], dtype=float)
         self._driven = self.gears.driven(powered)
-        if powered.any():
+        if powered.all():
             self.supported = False
         braked = np.array([m.braking if m.power is Power.BRAKE else 0.0 for m in self.motors])
         damping = self.gears.joint_damping(braked)
