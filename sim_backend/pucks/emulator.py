@@ -167,6 +167,10 @@ class Emulator:
             self._to_begin.append((begin, end, fault))
         self._deadline = None
 
+    def add_configured(self, faults: Iterable[PuckFault]) -> None:
+        """Have faults come, counted from the first SYNC, as those of the configuration."""
+        self._configured += tuple(faults)
+
     def clear(self, now_ns: int) -> None:
         """End all faults that act, and forget those that have not come yet."""
         self._to_begin.clear()

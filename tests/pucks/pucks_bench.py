@@ -158,5 +158,8 @@ class Host:
 
     def emergencies(self) -> list[tuple[int, int]]:
         """Node and code of all emergency messages in `heard`."""
-        codes = [(f.identifier - 0x80, struct.unpack_from("<H", f.data)[0]) for f in self.heard if 0x80 < f.identifier < 0x100]
-        return codes
+        return [
+            (f.identifier - 0x80, struct.unpack_from("<H", f.data)[0])
+            for f in self.heard
+            if 0x80 < f.identifier < 0x100
+        ]
