@@ -9,8 +9,8 @@ direction, and unconditionally sticking where one comes to rest::
     (M(q_m) + h/2 fv) (v+ - v)/h = tau - c(q_m, v_m) - g(q_m) - fo - fv v - lambda,  lambda_i in fc_i Sgn(v+_i)
     q+ = q + h/2 (v + v+)
 
-Idle drives brake like more of `fv`. A load is a point mass that moves with the last link, on which it appears without
-an impact.
+Idle drives brake like more of `fv`, or, where a gear couples joints, like a symmetric damping matrix. A load is a point
+mass that moves with the last link, on which it appears without an impact.
 
 Boundary: the only file of this room that knows pinocchio; no clock, no encoder, no noise.
 """
@@ -49,7 +49,7 @@ class Plant:
         if position.shape != (chain.joints,):
             raise ModelError(f"{position.shape=} but the chain has {chain.joints} joints")
         self._chain, self._layout, self._delta = chain, layout, np.array(delta, dtype=float)
-        self._period = period
+        self._period = self._stepped = period
         self._half = 0.5 * period
         self._viscous = layout.term_values("viscous", delta)
         self._coulomb = layout.term_values("coulomb", delta)
@@ -96,7 +96,12 @@ class Plant:
         return np.array(np.diag(self._inverse.mass_matrix(self._position)))
 
     def brake(self, damping: Array) -> None:
-        """Add viscous friction to every step from now on [N m s/rad or N s/m], shape (joints,), none negative."""
+        """Add viscous friction to every step from now on.
+
+        Args:
+            damping: [N m s/rad or N s/m], shape (joints,), none negative; or, where drives move several joints each,
+                a symmetric matrix that is nowhere negative, shape (joints, joints).
+        """
         if damping is not self._braking:
             self._braking = damping
             self._damp()
@@ -119,26 +124,34 @@ class Plant:
         self._loads = loads
         self._build(delta)
 
-    def step(self, torque: Array) -> None:
-        """Advance by one period under a constant torque.
+    def step(self, torque: Array, period: float | None = None) -> None:
+        """Advance under a constant torque.
 
         Args:
             torque: [N m or N], shape (joints,).
+            period: by how much [s]; None for `period`, to which the error of a step belongs: keep near or below it.
 
         Raises:
             DriverError: the state is no longer finite; it stays what it was before the step.
         """
+        h = self._period if period is None else period
+        if h != self._stepped:
+            self._stepped, self._half = h, 0.5 * h
+            self._damp()
         v = self._velocity
         sign = np.sign(v)
         q_m = self._position + self._half * v
         # A joint at rest is predicted to stay there: its last mean acceleration is the impact that stopped it.
         v_m = v + self._half * (self._acceleration * np.abs(sign))
         smooth = torque - self._offset - self._damping * v
-        a = pin.aba(self._model, self._data, q_m, v_m, smooth - self._coulomb * sign)
-        v_next = v + self._period * a
-        if not (v_next * sign > self._keeps_on).all():
-            v_next = self._stick_or_slip(q_m, v_m, smooth)
-        self._set(self._position + self._half * (v + v_next), v_next, (v_next - v) / self._period)
+        if self._coupled is None:
+            a = pin.aba(self._model, self._data, q_m, v_m, smooth - self._coulomb * sign)
+            v_next = v + h * a
+            if not (v_next * sign > self._keeps_on).all():
+                v_next = self._stick_or_slip(q_m, v_m, smooth)
+        else:
+            v_next = self._stick_or_slip(q_m, v_m, smooth - self._coupled @ v)
+        self._set(self._position + self._half * (v + v_next), v_next, (v_next - v) / h)
 
     def inverse_dynamics(self, position: Array, velocity: Array, acceleration: Array) -> Array:
         """The torque the true parameters ask for at one state, free of noise: the truth to score against.
@@ -163,16 +176,24 @@ class Plant:
 
     def _damp(self) -> None:
         # Implicit viscous friction acts like more drive inertia, so that it costs nothing to solve for.
-        self._damping = self._viscous + self._braking
+        braking: Array = self._braking
+        self._coupled: Array | None = None
+        if braking.ndim == 2:
+            # What couples joints does not: it is solved for as dry friction is.
+            rest = braking - np.diag(np.diag(braking))
+            self._coupled, braking = (rest if rest.any() else None), np.diagonal(braking)
+        self._damping = self._viscous + braking
         self._model.armature = self._armature + self._half * self._damping
 
     def _stick_or_slip(self, q_m: Array, v_m: Array, smooth: Array) -> Array:
         A = np.array(pin.crba(self._model, self._data, q_m))
+        if self._coupled is not None:
+            A += self._half * self._coupled
         rest = pin.nonLinearEffects(self._model, self._data, q_m, v_m)
-        b = A @ self._velocity + self._period * (smooth - rest)
+        b = A @ self._velocity + self._stepped * (smooth - rest)
         if not np.isfinite(b).all():
             raise DriverError("the simulated arm ran away: its state is no longer finite")
-        return stick_slip_velocity(A, b, self._period * self._coulomb, self._velocity)
+        return stick_slip_velocity(A, b, self._stepped * self._coulomb, self._velocity)
 
     def _set(self, position: Array, velocity: Array, acceleration: Array) -> None:
         # Replaced, never written into, so that whoever holds an old state keeps it.

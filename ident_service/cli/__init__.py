@@ -13,14 +13,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ident_service import __version__
-from ident_service.cli import arm, bus, commission, configs, motions, parameters, recovery
+from ident_service.cli import arm, bus, commission, configs, emulate, motions, parameters, recovery
 from ident_service.cli.answer import DONE, FAILED, FAULTED, USAGE, VERDICT_NO, Answer, print_answer, print_error
 from ident_service.cli.words import Parser, Verbs, WrongWords, asks_for_json
 from ident_service.errors import ArmFault, ConfigError, IdentError, MotionRefused, UsageError
 
 __all__ = ["DONE", "FAILED", "FAULTED", "USAGE", "VERDICT_NO", "main"]
 
-GROUPS = (commission, motions, arm, recovery, parameters, configs, bus)
+GROUPS = (commission, motions, arm, recovery, parameters, configs, bus, emulate)
 _EXIT_CODES: tuple[tuple[type[IdentError], int], ...] = (
     (ConfigError, USAGE),
     (UsageError, USAGE),

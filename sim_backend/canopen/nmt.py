@@ -1,0 +1,150 @@
+"""The NMT state machine of an emulated node and its heartbeats, sent and awaited (CiA 301, 7.2.8, 7.3.2).
+
+Boundary: states and their frames; what a node does in a state, and about a heartbeat that stays away, is `drive.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import IntEnum
+
+from drivers.canopen.frame import Frame
+from sim_backend.canopen.node import Node
+
+_MS = 1_000_000
+_PRODUCER = "heartbeat"
+_CONSUMER = "heartbeat of "
+_BOOT = "boot"
+_CONSUMERS = range(1, 5)
+
+
+class State(IntEnum):
+    """As a heartbeat tells it; INITIALISING is told once, as the boot-up message."""
+
+    INITIALISING = 0x00
+    STOPPED = 0x04
+    OPERATIONAL = 0x05
+    PRE_OPERATIONAL = 0x7F
+
+
+class Command(IntEnum):
+    """First byte of an NMT message."""
+
+    START = 0x01
+    STOP = 0x02
+    PRE_OPERATIONAL = 0x80
+    RESET_NODE = 0x81
+    RESET_COMMUNICATION = 0x82
+
+
+_TARGETS = {
+    Command.START: State.OPERATIONAL,
+    Command.STOP: State.STOPPED,
+    Command.PRE_OPERATIONAL: State.PRE_OPERATIONAL,
+}
+
+
+class Nmt:
+    """State and heartbeats of one node.
+
+    Attributes:
+        state: the present one.
+        silent_nodes: whose heartbeats stay away.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        *,
+        boot_ns: int,
+        entered: Callable[[State], None],
+        reset: Callable[[Command], None],
+        lost: Callable[[int], None],
+        found: Callable[[int], None],
+    ) -> None:
+        """A node without power.
+
+        Args:
+            node: whose state it is.
+            boot_ns: from a reset to the boot-up message [ns].
+            entered: called with the state before, after a change.
+            reset: called when a reset has been asked for, before anything else happens.
+            lost: called with a node whose heartbeat stays away.
+            found: called with a node whose heartbeat has come back.
+        """
+        self._node = node
+        self._boot_ns = boot_ns
+        self._entered, self._reset, self._lost, self._found = entered, reset, lost, found
+        self.state = State.INITIALISING
+        self.silent_nodes: set[int] = set()
+
+    def boot(self, delay_ns: int) -> None:
+        """Initialise, and say so after a while."""
+        self._to(State.INITIALISING)
+        self._node.stop(_PRODUCER)
+        self.configure_consumers()
+        self._node.after(_BOOT, delay_ns)
+
+    def command(self, data: bytes) -> None:
+        """An NMT message has come; one of a wrong length, or for another node, does nothing."""
+        if len(data) != 2 or data[1] not in (0, self._node.number) or self.state is State.INITIALISING:
+            return
+        if data[0] in (Command.RESET_NODE, Command.RESET_COMMUNICATION):
+            self.reset(Command(data[0]))
+        elif data[0] in tuple(_TARGETS):
+            self._to(_TARGETS[Command(data[0])])
+
+    def reset(self, command: Command) -> None:
+        """Start again: the whole node, or its communication."""
+        self._reset(command)
+        self.boot(self._boot_ns)
+
+    def leave_operational(self) -> None:
+        """What a communication error does where object 1029h:01 does not say otherwise."""
+        self._to(State.PRE_OPERATIONAL)
+
+    def configure_producer(self) -> None:
+        """Object 1017h has changed; a new heartbeat begins at once."""
+        self._node.stop(_PRODUCER)
+        if self.state is not State.INITIALISING:
+            self._beat()
+
+    def configure_consumers(self) -> None:
+        """Object 1016h has changed; awaiting begins with the next heartbeat heard (CiA 301, 7.2.8.2.2.3)."""
+        for number in range(128):
+            self._node.stop(f"{_CONSUMER}{number}")
+        self.silent_nodes.clear()
+
+    def heard(self, frame: Frame) -> None:
+        """A heartbeat of another node."""
+        number = frame.identifier - 0x700
+        for subindex in _CONSUMERS:
+            entry = self._node.objects.number(0x1016, subindex)
+            if entry >> 16 == number and entry & 0xFFFF:
+                self._node.after(f"{_CONSUMER}{number}", (entry & 0xFFFF) * _MS)
+                if number in self.silent_nodes:
+                    self.silent_nodes.discard(number)
+                    self._found(number)
+
+    def due(self, name: str) -> None:
+        """A timer of this name is due."""
+        if name == _BOOT:
+            self._node.send(0x700 + self._node.number, b"\0")
+            self._to(State.PRE_OPERATIONAL)
+            self._beat()
+        elif name == _PRODUCER:
+            self._beat()
+        elif name.startswith(_CONSUMER):
+            number = int(name.removeprefix(_CONSUMER))
+            self.silent_nodes.add(number)
+            self._lost(number)
+
+    def _beat(self) -> None:
+        if period := self._node.objects.number(0x1017):
+            self._node.send(0x700 + self._node.number, bytes([self.state]))
+            self._node.after(_PRODUCER, period * _MS)
+
+    def _to(self, state: State) -> None:
+        if state is not self.state:
+            before, self.state = self.state, state
+            self._entered(before)

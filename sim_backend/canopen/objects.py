@@ -1,0 +1,202 @@
+"""The object dictionary of an emulated drive: every value, who may touch it, and within which limits (CiA 301, 7.4).
+
+It is made from an EDS (CiA 306). Values are integers, or bytes for strings; a key is `index << 8 | subindex`.
+
+Boundary: storage and its rules. What a value does is its reader's; `veto` and `written` let the drive know of a host's
+writes.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes, eds
+
+from ident_service.errors import DriverError
+
+Value = int | bytes
+
+_FORMATS = {
+    datatypes.BOOLEAN: "?",
+    datatypes.INTEGER8: "b",
+    datatypes.INTEGER16: "h",
+    datatypes.INTEGER32: "i",
+    datatypes.UNSIGNED8: "B",
+    datatypes.UNSIGNED16: "H",
+    datatypes.UNSIGNED32: "I",
+}
+_LAST_DUMMY = 0x0007
+
+
+class SdoAbort(Exception):
+    """A transfer that the drive refuses; `code` is one of CiA 301, 7.2.4.3.17."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(f"0x{code:08X}")
+        self.code = code
+
+
+TOGGLE = 0x05030000
+COMMAND = 0x05040001
+WRITE_ONLY = 0x06010001
+READ_ONLY = 0x06010002
+NO_OBJECT = 0x06020000
+NOT_MAPPABLE = 0x06040041
+PDO_LENGTH = 0x06040042
+TOO_LONG = 0x06070012
+TOO_SHORT = 0x06070013
+NO_SUBINDEX = 0x06090011
+WRONG_VALUE = 0x06090030
+TOO_HIGH = 0x06090031
+TOO_LOW = 0x06090032
+WRONG_STATE = 0x08000022
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One value of the dictionary.
+
+    Attributes:
+        form: its struct format character; None for a string.
+        size: bytes; 0 for a string.
+        readable: by a host.
+        writable: by a host.
+        mappable: into a PDO.
+        low: least value, where the EDS says one.
+        high: greatest value, where the EDS says one.
+        default: after power-up.
+    """
+
+    form: str | None
+    size: int
+    readable: bool
+    writable: bool
+    mappable: bool
+    low: int | None
+    high: int | None
+    default: Value
+
+
+class Objects:
+    """All values of one node.
+
+    Attributes:
+        entries: by key.
+        values: by key; the firmware reads and writes here, past all rules.
+        dummies: sizes [bytes] of the dummy objects by index (CiA 301, 7.4.7.1).
+        before_read: called with the key before a host reads.
+        veto: called with key and value before a host's write; raises SdoAbort to refuse.
+        written: called with the key after it.
+    """
+
+    def __init__(self, text: str, node: int) -> None:
+        """Read an EDS.
+
+        Args:
+            text: of the file.
+            node: its number, for defaults that depend on it.
+
+        Raises:
+            DriverError: not an EDS, or types that the emulator does not have.
+        """
+        try:
+            dictionary: ObjectDictionary = eds.import_eds(io.StringIO(text), node)  # type: ignore[no-untyped-call]
+        except Exception as error:  # noqa: BLE001 the library lets whatever its parser meets through
+            raise DriverError(f"not an EDS: {error}") from None
+        self.entries: dict[int, Entry] = {}
+        self.dummies: dict[int, int] = {}
+        for index in dictionary:
+            item = dictionary[index]
+            for variable in [item] if isinstance(item, ODVariable) else item.values():
+                if index <= _LAST_DUMMY:
+                    self.dummies[index] = struct.calcsize(_FORMATS[index])
+                else:
+                    self.entries[index << 8 | variable.subindex] = _entry(variable)
+        self._indices = {key >> 8 for key in self.entries}
+        self.values: dict[int, Value] = {}
+        self.before_read: Callable[[int], None] = lambda key: None
+        self.veto: Callable[[int, int], None] = lambda key, value: None
+        self.written: Callable[[int], None] = lambda key: None
+        self.reset()
+
+    def reset(self, first: int = 0x1000, last: int = 0xFFFF) -> None:
+        """Give the objects of these indices their values after power-up."""
+        for key, entry in self.entries.items():
+            if first <= key >> 8 <= last:
+                self.values[key] = entry.default
+
+    def number(self, index: int, subindex: int = 0) -> int:
+        """A value that is a number; 0 where the EDS has no such object."""
+        value = self.values.get(index << 8 | subindex, 0)
+        return value if isinstance(value, int) else 0
+
+    def put(self, index: int, value: int, subindex: int = 0) -> None:
+        """Set a number from inside, cut off at what its type holds; nothing where the EDS has no such object."""
+        key = index << 8 | subindex
+        entry = self.entries.get(key)
+        if entry is None or entry.form is None:
+            return
+        bits = 8 * entry.size
+        low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if entry.form.islower() else (0, (1 << bits) - 1)
+        self.values[key] = min(max(value, low), high)
+
+    def read(self, index: int, subindex: int) -> bytes:
+        """What a host gets; raises SdoAbort."""
+        key = index << 8 | subindex
+        entry = self._entry(index, subindex)
+        if not entry.readable:
+            raise SdoAbort(WRITE_ONLY)
+        self.before_read(key)
+        value = self.values[key]
+        return value if isinstance(value, bytes) else struct.pack(f"<{entry.form}", value)
+
+    def write(self, index: int, subindex: int, data: bytes) -> None:
+        """What a host sets; raises SdoAbort, and nothing has changed then."""
+        key = index << 8 | subindex
+        entry = self._entry(index, subindex)
+        if not entry.writable:
+            raise SdoAbort(READ_ONLY)
+        if entry.form is None:
+            self.values[key] = data
+            self.written(key)
+            return
+        if len(data) != entry.size:
+            raise SdoAbort(TOO_LONG if len(data) > entry.size else TOO_SHORT)
+        value = int(struct.unpack(f"<{entry.form}", data)[0])
+        if entry.high is not None and value > entry.high:
+            raise SdoAbort(TOO_HIGH)
+        if entry.low is not None and value < entry.low:
+            raise SdoAbort(TOO_LOW)
+        self.veto(key, value)
+        self.values[key] = value
+        self.written(key)
+
+    def size(self, index: int, subindex: int) -> int:
+        """Bytes of an object, 0 for a string; raises SdoAbort when there is none."""
+        return self._entry(index, subindex).size
+
+    def _entry(self, index: int, subindex: int) -> Entry:
+        entry = self.entries.get(index << 8 | subindex)
+        if entry is None:
+            raise SdoAbort(NO_SUBINDEX if index in self._indices else NO_OBJECT)
+        return entry
+
+
+def _entry(variable: ODVariable) -> Entry:
+    form = None if variable.data_type is None else _FORMATS.get(variable.data_type)
+    if form is None and variable.data_type != datatypes.VISIBLE_STRING:
+        raise DriverError(f"EDS: {variable.name}: type 0x{variable.data_type:X} is not emulated")
+    default: Value = int(variable.default or 0) if form else str(variable.default or "").encode("ascii", "replace")
+    return Entry(
+        form=form,
+        size=struct.calcsize(f"<{form}") if form else 0,
+        readable=variable.access_type != "wo",
+        writable=variable.access_type in ("rw", "rww", "rwr", "wo"),
+        mappable=bool(variable.pdo_mappable),
+        low=variable.min,
+        high=variable.max,
+        default=default,
+    )

@@ -1,0 +1,197 @@
+"""The power drive system's state machine of an emulated drive (CiA 402-2, 6.2): states, commands, transitions.
+
+`TRANSITIONS` is the standard's table, `_LEAVING` says what the motor does when the drive function ends. A quick stop,
+and a fault reaction by ramp, brake with shorted windings for as long as the configured deceleration would take; this
+drive has no other way to slow down.
+
+Boundary: states and what the power stage does in them; torque while enabled is `torque.py`.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import Enum, IntEnum
+
+from sim_backend.canopen.node import Node
+from sim_backend.pucks.motor import Motor
+
+_RAMP = "ramp"
+_MS = 1_000_000
+
+
+class PowerState(IntEnum):
+    """As bits 0 to 3, 5 and 6 of the statusword tell it."""
+
+    NOT_READY = 0x00
+    SWITCH_ON_DISABLED = 0x40
+    READY_TO_SWITCH_ON = 0x21
+    SWITCHED_ON = 0x23
+    OPERATION_ENABLED = 0x27
+    QUICK_STOP_ACTIVE = 0x07
+    FAULT_REACTION_ACTIVE = 0x0F
+    FAULT = 0x08
+
+
+class Command(Enum):
+    """What bits 0 to 3 of the controlword ask for."""
+
+    DISABLE_VOLTAGE = 0
+    QUICK_STOP = 1
+    SHUTDOWN = 2
+    SWITCH_ON = 3
+    ENABLE_OPERATION = 4
+
+
+_S, _C = PowerState, Command
+# With the numbers of the standard's figure; 3 and 4 in one go where operation is asked for at once.
+TRANSITIONS: dict[tuple[PowerState, Command], PowerState] = {
+    (_S.SWITCH_ON_DISABLED, _C.SHUTDOWN): _S.READY_TO_SWITCH_ON,  # 2
+    (_S.READY_TO_SWITCH_ON, _C.SWITCH_ON): _S.SWITCHED_ON,  # 3
+    (_S.READY_TO_SWITCH_ON, _C.ENABLE_OPERATION): _S.OPERATION_ENABLED,  # 3, 4
+    (_S.SWITCHED_ON, _C.ENABLE_OPERATION): _S.OPERATION_ENABLED,  # 4
+    (_S.OPERATION_ENABLED, _C.SWITCH_ON): _S.SWITCHED_ON,  # 5
+    (_S.SWITCHED_ON, _C.SHUTDOWN): _S.READY_TO_SWITCH_ON,  # 6
+    (_S.READY_TO_SWITCH_ON, _C.QUICK_STOP): _S.SWITCH_ON_DISABLED,  # 7
+    (_S.READY_TO_SWITCH_ON, _C.DISABLE_VOLTAGE): _S.SWITCH_ON_DISABLED,  # 7
+    (_S.OPERATION_ENABLED, _C.SHUTDOWN): _S.READY_TO_SWITCH_ON,  # 8
+    (_S.OPERATION_ENABLED, _C.DISABLE_VOLTAGE): _S.SWITCH_ON_DISABLED,  # 9
+    (_S.SWITCHED_ON, _C.DISABLE_VOLTAGE): _S.SWITCH_ON_DISABLED,  # 10
+    (_S.SWITCHED_ON, _C.QUICK_STOP): _S.SWITCH_ON_DISABLED,  # 10
+    (_S.OPERATION_ENABLED, _C.QUICK_STOP): _S.QUICK_STOP_ACTIVE,  # 11
+    (_S.QUICK_STOP_ACTIVE, _C.DISABLE_VOLTAGE): _S.SWITCH_ON_DISABLED,  # 12
+    (_S.QUICK_STOP_ACTIVE, _C.ENABLE_OPERATION): _S.OPERATION_ENABLED,  # 16, where the drive stays in quick stop
+}
+POWERED = (_S.SWITCHED_ON, _S.OPERATION_ENABLED, _S.QUICK_STOP_ACTIVE, _S.FAULT_REACTION_ACTIVE)
+_FAULTS = (_S.FAULT_REACTION_ACTIVE, _S.FAULT)
+# Which option code chooses between coasting (0) and braking (else) when the drive function ends (605Bh, 605Ch).
+_LEAVING = {_S.READY_TO_SWITCH_ON: 0x605B, _S.SWITCHED_ON: 0x605C}
+_RESET = 0x80
+
+
+def command_of(word: int) -> Command:
+    """The command in a controlword (CiA 402-2, table 27)."""
+    if not word & 2:
+        return Command.DISABLE_VOLTAGE
+    if not word & 4:
+        return Command.QUICK_STOP
+    if not word & 1:
+        return Command.SHUTDOWN
+    return Command.ENABLE_OPERATION if word & 8 else Command.SWITCH_ON
+
+
+class PowerStage:
+    """State of one drive.
+
+    Attributes:
+        state: the present one.
+        voltage: whether there is power to switch on.
+    """
+
+    def __init__(self, node: Node, motor: Motor) -> None:
+        """Before self-test."""
+        self._node, self._motor = node, motor
+        self._word = 0
+        self.state = PowerState.NOT_READY
+        self.voltage = True
+
+    def start(self) -> None:
+        """Self-test is over (transitions 0 and 1)."""
+        self._word = 0
+        self.state = PowerState.SWITCH_ON_DISABLED
+
+    def down(self) -> None:
+        """The firmware stops."""
+        self._node.stop(_RAMP)
+        self.state = PowerState.NOT_READY
+
+    def control(self, word: int) -> bool:
+        """A controlword has come; returns whether it resets a fault."""
+        before, self._word = self._word, word
+        rising = bool(word & _RESET and not before & _RESET)
+        if self.state is PowerState.FAULT:
+            return rising
+        command = command_of(word)
+        target = TRANSITIONS.get((self.state, command))
+        if target is None or (target in POWERED and not self.voltage):
+            return False
+        if self.state is PowerState.QUICK_STOP_ACTIVE and command is Command.ENABLE_OPERATION and not self._stays():
+            return False
+        if target is PowerState.QUICK_STOP_ACTIVE:
+            self.quick_stop()
+        else:
+            self._to(target)
+        return False
+
+    def reset_fault(self) -> None:
+        """Transition 15: the cause is gone, and somebody has seen it."""
+        self.state = PowerState.SWITCH_ON_DISABLED
+
+    def disable_voltage(self) -> None:
+        """As the command of that name."""
+        if (target := TRANSITIONS.get((self.state, Command.DISABLE_VOLTAGE))) is not None:
+            self._to(target)
+
+    def quick_stop(self) -> None:
+        """Transition 11, or what a quick stop is in another state; option code 605Ah."""
+        if self.state is PowerState.OPERATION_ENABLED:
+            if self._node.objects.number(0x605A) == 0:
+                self._to(PowerState.SWITCH_ON_DISABLED)
+            else:
+                self.state = PowerState.QUICK_STOP_ACTIVE
+                self._brake()
+        elif (target := TRANSITIONS.get((self.state, Command.QUICK_STOP))) is not None:
+            self._to(target)
+
+    def trip(self, *, coasting: bool = False) -> None:
+        """Transitions 13 and 14; option code 605Eh, which a power stage that failed does not heed (`coasting`)."""
+        if self.state in (*_FAULTS, PowerState.NOT_READY):
+            return
+        if coasting or self._node.objects.number(0x605E) == 0:
+            self._motor.coast(self._node.now_ns)
+            self._node.stop(_RAMP)
+            self.state = PowerState.FAULT
+        elif self.state in (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE):
+            self.state = PowerState.FAULT_REACTION_ACTIVE
+            self._brake()
+        else:
+            self.state = PowerState.FAULT
+
+    def supply(self, on: bool) -> None:
+        """Power comes, or is taken from outside: the relay then shorts the windings."""
+        self.voltage = on
+        if not on:
+            self._motor.brake(self._node.now_ns)
+            if self.state in POWERED:
+                self._node.stop(_RAMP)
+                faulty = self.state is PowerState.FAULT_REACTION_ACTIVE
+                self.state = PowerState.FAULT if faulty else PowerState.SWITCH_ON_DISABLED
+
+    def due(self, name: str) -> None:
+        """A timer of this name is due."""
+        if name != _RAMP:
+            return
+        if self.state is PowerState.FAULT_REACTION_ACTIVE:
+            self.state = PowerState.FAULT  # 14; the windings stay shorted
+        elif self.state is PowerState.QUICK_STOP_ACTIVE and not self._stays():
+            self.state = PowerState.SWITCH_ON_DISABLED  # 12
+
+    def _stays(self) -> bool:
+        return self._node.objects.number(0x605A) >= 5
+
+    def _to(self, target: PowerState) -> None:
+        self._node.stop(_RAMP)
+        if self.state is PowerState.OPERATION_ENABLED and target is not PowerState.OPERATION_ENABLED:
+            option = _LEAVING.get(target)
+            if option is not None and self._node.objects.number(option):
+                self._motor.brake(self._node.now_ns)
+            else:
+                self._motor.coast(self._node.now_ns)
+        elif self.state is PowerState.QUICK_STOP_ACTIVE and target is PowerState.SWITCH_ON_DISABLED:
+            self._motor.coast(self._node.now_ns)
+        self.state = target
+
+    def _brake(self) -> None:
+        now = self._node.now_ns
+        counts = abs(self._motor.speed(now)) * self._motor.counts_per_turn / (2.0 * math.pi)
+        self._motor.brake(now)
+        self._node.after(_RAMP, max(_MS, round(1e9 * counts / self._node.objects.number(0x6085))))

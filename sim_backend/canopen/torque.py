@@ -1,0 +1,63 @@
+"""The torque loop of an emulated drive in cyclic synchronous torque mode (CiA 402-2, 14): demand, limits, what is told.
+
+Demand is target plus offset, in whole thousandths of the rated torque, cut off at 6072h and 6073h. At a software
+position limit (607Dh) no torque acts that leads further out, above the speed limit (6080h) none that leads faster; the
+target is ignored then, and the statusword says so (bit 12). Current is told as torque, since the motor is linear.
+
+Boundary: one evaluation; when there is one is `drive.py`.
+"""
+
+from __future__ import annotations
+
+import math
+
+from sim_backend.canopen.objects import Objects
+from sim_backend.pucks.motor import Motor
+
+CYCLIC_TORQUE = 10
+_LARGEST = 0x7FFF
+_RPM = 60.0 / (2.0 * math.pi)
+
+
+class TorqueLoop:
+    """Demand and limits of one motor.
+
+    Attributes:
+        limited: whether a limit of the drive holds the torque back (bit 11 of the statusword).
+        follows: whether the target acts (bit 12).
+    """
+
+    def __init__(self, objects: Objects, motor: Motor) -> None:
+        """A loop that is not closed."""
+        self._objects, self._motor = objects, motor
+        self.limited = self.follows = False
+
+    def release(self) -> None:
+        """The drive function has ended; what the motor does now is the power stage's."""
+        self.limited = self.follows = False
+        for index in (0x6074, 0x6077, 0x6078):
+            self._objects.values[index << 8] = 0
+
+    def evaluate(self, now_ns: int) -> None:
+        """Make the motor do what is asked for, as far as limits let it."""
+        number = self._objects.number
+        values = self._objects.values
+        cyclic = number(0x6061) == CYCLIC_TORQUE
+        asked = number(0x6071) + number(0x60B2) if cyclic else 0
+        reach = min(number(0x6072), number(0x6073), _LARGEST)
+        reach = int(reach * self._motor.defects.torque_share)
+        demand = min(max(asked, -reach), reach)
+        self.follows = cyclic
+        self.limited = demand != asked
+        if demand and self._leads_out(demand, now_ns):
+            demand, self.limited, self.follows = 0, True, False
+        values[0x607400] = values[0x607700] = values[0x607800] = demand
+        self._motor.drive(demand * number(0x6076) * 1e-6, now_ns)
+
+    def _leads_out(self, demand: int, now_ns: int) -> bool:
+        number = self._objects.number
+        position = number(0x6064)
+        if position >= number(0x607D, 2) if demand > 0 else position <= number(0x607D, 1):
+            return True
+        speed = self._motor.speed(now_ns)
+        return speed * demand > 0.0 and abs(speed) * _RPM > number(0x6080)

@@ -1,0 +1,156 @@
+"""The arm behind emulated motors: the simulated arm's plant, moved to whatever time somebody looks at it.
+
+Between two instants at which something changes, motors do the same, and the plant moves in one step; a longer silence
+is divided into steps near the nominal period, between which `watch` is called, so that whoever limits torques by
+position and speed can. A step of exactly the nominal period is the simulated arm's. Until all motors
+have been powered, somebody holds the arm.
+
+Boundary: motors to plant; no protocol, no clock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import ceil
+
+import numpy as np
+
+from drivers.arm import Vector
+from sim_backend.machine import Truth
+from sim_backend.plant import Plant
+from sim_backend.pucks.gears import Gears
+from sim_backend.pucks.motor import Motor, Power
+
+# An interval of up to this many nominal periods is one step.
+_LONGEST = 1.5
+
+
+class Body:
+    """A plant, gears and motors.
+
+    Attributes:
+        plant: what moves.
+        gears: between motors and joints.
+        motors: in the order of the configuration.
+        now_ns: the time that the plant has been moved to.
+        watch: called after each step but the last of a longer silence, with the time.
+        supported: whether somebody still holds the arm.
+    """
+
+    def __init__(self, plant: Plant, gears: Gears, noise: Vector, seed: int) -> None:
+        """Put the arm at rest at time 0.
+
+        Args:
+            plant: what moves; its period is the nominal one.
+            gears: between motors and joints.
+            noise: standard deviation per cycle of what acts on powered joints besides the torque, shape (joints,).
+            seed: of the noise.
+        """
+        self.plant, self.gears = plant, gears
+        self.motors: tuple[Motor, ...] = ()
+        self.now_ns = 0
+        self.watch: Callable[[int], None] = lambda now_ns: None
+        self.supported = True
+        self._period_ns = round(plant.period * 1e9)
+        self._noise_level = noise
+        self._random = np.random.default_rng(seed) if noise.any() else None
+        self._noise: Vector | None = None
+        self._drawn_ns = -self._period_ns
+        self._angles: list[float] = []
+        self._speeds: list[float] = []
+        self._seen: Vector | None = None
+        self._outputs: tuple[tuple[Power, float], ...] = ()
+        self._torque = np.zeros(plant.chain.joints)
+        self._driven = np.zeros(plant.chain.joints)
+
+    def start(self, now_ns: int) -> None:
+        """Begin at this time, before anything has happened."""
+        self.now_ns = now_ns
+        self._drawn_ns = now_ns - self._period_ns
+
+    def angle(self, motor: int, now_ns: int) -> float:
+        """Of a motor [rad]."""
+        self.advance(now_ns)
+        self._look()
+        return self._angles[motor]
+
+    def speed(self, motor: int, now_ns: int) -> float:
+        """Of a motor [rad/s]."""
+        self.advance(now_ns)
+        self._look()
+        return self._speeds[motor]
+
+    def changes(self, now_ns: int) -> None:
+        """A motor, or a load, changes at this time: what went before acts until then."""
+        self.advance(now_ns)
+
+    def advance(self, now_ns: int) -> None:
+        """Move the plant to this time; nothing when it is there.
+
+        Raises:
+            DriverError: the plant ran away.
+        """
+        begun = self.now_ns
+        interval = now_ns - begun
+        if interval <= 0:
+            return
+        steps = ceil(interval / (_LONGEST * self._period_ns))
+        for number in range(1, steps + 1):
+            end = begun + interval * number // steps
+            self._step(end)
+            if number < steps:
+                self.watch(end)
+
+    def catch_up(self, now_ns: int) -> None:
+        """Move the plant after a silence of more than a step, before what ends the silence has any effect."""
+        if now_ns - self.now_ns > _LONGEST * self._period_ns:
+            self.advance(now_ns)
+
+    def truth(self, stamp_ns: int) -> Truth:
+        """What the plant does now; torques at the joints, without noise and braking."""
+        plant = self.plant
+        self._collect()
+        return Truth(stamp_ns, plant.position, plant.velocity, plant.acceleration, self._torque)
+
+    def _step(self, end_ns: int) -> None:
+        interval, begun = end_ns - self.now_ns, self.now_ns
+        self.now_ns = end_ns
+        self._collect()
+        if self.supported:
+            return
+        torque = self._torque
+        if self._random is not None and self._driven.any():
+            # Once per cycle, however a cycle is divided: two buses have their SYNCs a little apart.
+            if 2 * (begun - self._drawn_ns) >= self._period_ns or self._noise is None:
+                self._noise = self._noise_level * self._random.standard_normal(torque.size)
+                self._drawn_ns = begun
+            torque = torque + self._noise * self._driven
+        if interval == self._period_ns:
+            self.plant.step(torque)
+        else:
+            self.plant.step(torque, interval * 1e-9)
+
+    def _collect(self) -> None:
+        """What the motors do, at the joints; computed again only when one of them changed."""
+        outputs = tuple([(motor.power, motor.torque) for motor in self.motors])
+        if outputs == self._outputs:
+            return
+        before, self._outputs = self._outputs, outputs
+        self._torque = self.gears.joint_torque(np.array([torque for _, torque in outputs]))
+        self._torque.setflags(write=False)
+        if [power for power, _ in before] == [power for power, _ in outputs]:
+            return
+        powered = np.array([power is Power.TORQUE for power, _ in outputs], dtype=float)
+        self._driven = self.gears.driven(powered)
+        if powered.all():
+            self.supported = False
+        braked = np.array([m.braking if m.power is Power.BRAKE else 0.0 for m in self.motors])
+        damping = self.gears.joint_damping(braked)
+        self.plant.brake(damping if (damping != np.diag(np.diag(damping))).any() else np.diag(damping).copy())
+
+    def _look(self) -> None:
+        """The motors where the plant is; its arrays are replaced, never written into."""
+        if self._seen is not self.plant.position:
+            self._seen = self.plant.position
+            self._angles = self.gears.motor_position(self.plant.position).tolist()
+            self._speeds = self.gears.motor_velocity(self.plant.velocity).tolist()

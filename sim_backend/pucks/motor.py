@@ -1,0 +1,144 @@
+"""One emulated motor with its encoder and power stage, as the firmware in front of it sees it.
+
+A power stage makes a torque, leaves the windings open (the motor coasts), or shorts them (it brakes, as idle WAM pucks
+do). Boundary: no protocol; the firmware says what the power stage does, `body.py` moves the rotor, and `faults.py`
+sets the defects.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from enum import Enum
+from typing import Protocol
+
+_HISTORY = 4096  # encoder readings kept for an encoder that answers late
+_COUNTS = 1 << 32
+
+
+class Power(Enum):
+    """What the power stage does."""
+
+    COAST = "coasts"
+    BRAKE = "brakes"
+    TORQUE = "has torque"
+
+
+class Rotor(Protocol):
+    """What turns, at whatever time it is asked about."""
+
+    def angle(self, motor: int, now_ns: int) -> float:
+        """Angle of a motor [rad]."""
+
+    def speed(self, motor: int, now_ns: int) -> float:
+        """Speed of a motor [rad/s]."""
+
+    def changes(self, now_ns: int) -> None:
+        """Something that moves the arm changes at this time: bring the arm there first."""
+
+
+@dataclass
+class Defects:
+    """What is wrong with a motor; nothing at first.
+
+    Attributes:
+        reversed: the torque acts the other way round.
+        stuck: the power stage goes on doing what it does.
+        torque_share: of the largest torque, which is all the power stage can make.
+        frozen: the encoder shows what it showed.
+        mirrored: the encoder counts the wrong way.
+        shift: counts added to what the encoder shows.
+        delay_ns: how old what the encoder shows is [ns].
+    """
+
+    reversed: bool = False
+    stuck: bool = False
+    torque_share: float = 1.0
+    frozen: bool = False
+    mirrored: bool = False
+    shift: int = 0
+    delay_ns: int = 0
+
+
+class Motor:
+    """A motor, encoder and power stage.
+
+    Attributes:
+        power: what the power stage does.
+        torque: that acts when `power` is TORQUE, at the motor [N m].
+        braking: with what it brakes when `power` is BRAKE [N m s/rad].
+        defects: what is wrong with it.
+    """
+
+    def __init__(
+        self, rotor: Rotor, index: int, *, counts: int, scale: float, braking: float, relative: bool = False
+    ) -> None:
+        """Take the place on the arm.
+
+        Args:
+            rotor: what turns.
+            index: of the motor.
+            counts: of the encoder per turn.
+            scale: torque that acts for one that is asked for.
+            braking: with shorted windings [N m s/rad].
+            relative: whether the encoder counts from where it was when power came, instead of from angle zero.
+        """
+        self._rotor = rotor
+        self._index = index
+        self._per_radian = counts / (2.0 * math.pi)
+        self._scale = scale
+        self._relative = relative
+        self._origin = 0
+        self._shown = 0
+        self._history: deque[tuple[int, int]] = deque(maxlen=_HISTORY)
+        self.counts_per_turn = counts
+        self.braking = braking
+        self.power = Power.BRAKE
+        self.torque = 0.0
+        self.defects = Defects()
+
+    def power_up(self, now_ns: int) -> None:
+        """The firmware starts: the windings are shorted, a relative encoder counts from here."""
+        if self._relative:
+            self._origin = round(self._rotor.angle(self._index, now_ns) * self._per_radian)
+        self.brake(now_ns)
+
+    def encoder(self, now_ns: int) -> int:
+        """What the encoder shows [counts], in 32 bits with sign."""
+        counts = round(self._rotor.angle(self._index, now_ns) * self._per_radian) - self._origin
+        self._history.append((now_ns, counts))
+        defects = self.defects
+        if defects.frozen:
+            return self._shown
+        if defects.delay_ns:
+            wanted = now_ns - defects.delay_ns
+            counts = next((old for at, old in reversed(self._history) if at <= wanted), self._history[0][1])
+        counts = (-counts if defects.mirrored else counts) + defects.shift
+        self._shown = (counts + _COUNTS // 2) % _COUNTS - _COUNTS // 2
+        return self._shown
+
+    def speed(self, now_ns: int) -> float:
+        """True speed [rad/s]."""
+        return self._rotor.speed(self._index, now_ns)
+
+    def drive(self, torque: float, now_ns: int) -> None:
+        """Make a torque from now on [N m at the motor]."""
+        self._do(Power.TORQUE, torque * self._scale, now_ns)
+
+    def coast(self, now_ns: int) -> None:
+        """Open the windings."""
+        self._do(Power.COAST, 0.0, now_ns)
+
+    def brake(self, now_ns: int) -> None:
+        """Short the windings."""
+        self._do(Power.BRAKE, 0.0, now_ns)
+
+    def _do(self, power: Power, torque: float, now_ns: int) -> None:
+        if self.defects.stuck:
+            return
+        if self.defects.reversed:
+            torque = -torque
+        if power is not self.power or torque != self.torque:
+            self._rotor.changes(now_ns)
+            self.power, self.torque = power, torque

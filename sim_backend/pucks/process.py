@@ -1,0 +1,196 @@
+"""Emulated drives on real interfaces, in real time: the work of `ident emulate`.
+
+The arm behind them goes on falling or braking when the host is gone. While it runs, lines on `commands` inject faults:
+a fault as `parse_fault` has it, `clear` to end all of them, `state` to be told everything again, `quit`.
+
+Boundary: time and interfaces; the drives are `emulator.py`.
+"""
+
+from __future__ import annotations
+
+import gc
+import heapq
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.clock import RealClock
+from ident_service.config.canopen import CanopenDriver
+from ident_service.config.schema import ArmConfig
+from ident_service.errors import DriverError
+from sim_backend.pucks.build import build_emulator
+from sim_backend.pucks.emulator import Emulator
+from sim_backend.pucks.faults import PuckFault, parse_fault
+from sim_backend.pucks.injection import Sent
+from sim_backend.pucks.lock_step import INTERFACE
+from sim_backend.pucks.station import Station
+
+_POLL_NS = 20_000_000  # commands, stop and states are looked at this often
+_RESTING = 1e-3  # speed below which an arm is said to rest [rad/s or m/s]
+
+
+@dataclass(frozen=True)
+class Emulated:
+    """What has been done.
+
+    Attributes:
+        seconds: how long.
+        heard: frames received.
+        sent: frames sent.
+        unsent: frames that an interface did not take.
+        states: of the drives at the end, in words.
+        at_rest: whether the arm stood still.
+    """
+
+    seconds: float
+    heard: int
+    sent: int
+    unsent: int
+    states: tuple[str, ...]
+    at_rest: bool
+
+
+def emulate(
+    config: ArmConfig,
+    *,
+    faults: Sequence[str] = (),
+    seconds: float | None = None,
+    tell: Callable[[str], None] = lambda line: None,
+    stop_requested: Callable[[], bool] = lambda: False,
+    commands: Callable[[], str | None] = lambda: None,
+) -> Emulated:
+    """Run the drives of an arm on its configured interfaces until told to stop.
+
+    Args:
+        config: of the arm.
+        faults: to inject besides those of the configuration, as people write them; they count from the first SYNC.
+        seconds: how long; None until asked to stop.
+        tell: called with a line whenever a drive changes its state, a fault comes or goes, or the arm comes to rest.
+        stop_requested: asked all the time.
+        commands: gives the next line of commands, None while there is none; never waits.
+
+    Returns:
+        What has been done.
+
+    Raises:
+        DriverError: as `build_emulator`, an interface that cannot be had or is lost, a fault that nobody understands.
+    """
+    driver = config.driver
+    if isinstance(driver, CanopenDriver) and any(bus.interface == INTERFACE for bus in driver.buses):
+        raise DriverError(
+            f"{config.name}: {INTERFACE} drives live in the process that moves them; "
+            "name an interface such as socketcan, udp_multicast or ident_wire"
+        )
+    emulator = build_emulator(config)
+    emulator.add_configured(parse_fault(text, emulator.names) for text in faults)
+    assert isinstance(driver, CanopenDriver)  # noqa: S101 or there would be no emulator
+    station = Station(driver.buses)
+    try:
+        return _Run(emulator, station, tell, commands).until(seconds, stop_requested)
+    finally:
+        station.close()
+
+
+class _Run:
+    def __init__(
+        self, emulator: Emulator, station: Station, tell: Callable[[str], None], commands: Callable[[], str | None]
+    ) -> None:
+        self._emulator, self._station = emulator, station
+        self._tell, self._commands = tell, commands
+        self._clock = RealClock()
+        self._later: list[tuple[int, int, Sent]] = []
+        self._heard = self._sent = 0
+        self._told: tuple[str, ...] = ("",) * len(emulator.faces)
+        self._faults: tuple[PuckFault, ...] = ()
+        self._rested = True
+        self._quit = False
+
+    def until(self, seconds: float | None, stop_requested: Callable[[], bool]) -> Emulated:
+        emulator, clock = self._emulator, self._clock
+        begun = looked = clock.now_ns()
+        end = None if seconds is None else begun + round(seconds * 1e9)
+        # What has been built stays; the collector need not look at it again in the middle of a cycle.
+        gc.collect()
+        gc.freeze()
+        emulator.power_up(begun)
+        try:
+            while not self._quit:
+                now = clock.now_ns()
+                if now - looked >= _POLL_NS:
+                    looked = now
+                    self._look(now)
+                    if stop_requested() or (end is not None and now >= end):
+                        break
+                for bus, frame in self._station.receive(self._patience(now, looked)):
+                    self._heard += 1
+                    self._pass_on(emulator.receive(bus, frame, clock.now_ns()))
+                # What was due while frames waited comes after them: a drive's firmware would have had them in time.
+                self._pass_on(emulator.tick(clock.now_ns()))
+        finally:
+            gc.unfreeze()
+        now = clock.now_ns()
+        self._look(now)
+        return Emulated(
+            (now - begun) * 1e-9, self._heard, self._sent, self._station.unsent, emulator.states, self._resting()
+        )
+
+    def _patience(self, now_ns: int, looked_ns: int) -> float:
+        due = [looked_ns + _POLL_NS, *(item[0] for item in self._later[:1])]
+        if (deadline := self._emulator.next_deadline_ns) is not None:
+            due.append(deadline)
+        return max(0, min(due) - now_ns) * 1e-9
+
+    def _pass_on(self, sent: Sequence[Sent]) -> None:
+        """Send what is ready, the lowest identifiers first, as a bus would."""
+        now = self._clock.now_ns()
+        ready = []
+        for item in sent:
+            if item.ready_ns <= now:
+                ready.append(item)
+            else:
+                heapq.heappush(self._later, (item.ready_ns, id(item), item))
+        while self._later and self._later[0][0] <= now:
+            ready.append(heapq.heappop(self._later)[2])
+        if ready:
+            ready.sort(key=lambda item: item.frame.identifier)
+            self._station.send([(item.bus, item.frame) for item in ready])
+            self._sent += len(ready)
+
+    def _look(self, now_ns: int) -> None:
+        while (line := self._commands()) is not None:
+            self._obey(line.strip(), now_ns)
+        emulator = self._emulator
+        states = emulator.states
+        for drive, (state, told) in enumerate(zip(states, self._told, strict=True)):
+            if state != told:
+                self._tell(f"{emulator.names[drive]}, node {emulator.faces[drive].number}: {state}")
+        self._told = states
+        if emulator.active != self._faults:
+            self._faults = emulator.active
+            self._tell("faults: " + (", ".join(self._named(fault) for fault in emulator.active) or "none"))
+        if (resting := self._resting()) != self._rested:
+            self._rested = resting
+            self._tell("the arm is at rest" if resting else "the arm moves")
+
+    def _named(self, fault: PuckFault) -> str:
+        return fault.kind if fault.drive is None else f"{fault.kind} of {self._emulator.names[fault.drive]}"
+
+    def _resting(self) -> bool:
+        return bool((np.abs(self._emulator.body.plant.velocity) < _RESTING).all())
+
+    def _obey(self, line: str, now_ns: int) -> None:
+        match line:
+            case "":
+                pass
+            case "quit":
+                self._quit = True
+            case "clear":
+                self._emulator.clear(now_ns)
+            case "state":
+                self._told = ("",) * len(self._told)
+            case _:
+                try:
+                    self._emulator.inject([parse_fault(line, self._emulator.names)], now_ns)
+                except DriverError as error:
+                    self._tell(f"not understood: {error}")
