@@ -10,6 +10,7 @@ import select
 import time
 from collections import deque
 from collections.abc import Sequence
+from contextlib import suppress
 
 from drivers.canopen.bus_errors import BusError, BusOffWatch, kind_of
 from drivers.canopen.frame import Frame
@@ -65,7 +66,8 @@ class Connection:
         self._socket = address.connect(channel)
         self._socket.settimeout(_WELCOME_S)
         try:
-            self._socket.send(packets.pack_hello(hello))
+            with suppress(BrokenPipeError):  # the wire may have refused already, and says why
+                self._socket.send(packets.pack_hello(hello))
             self.welcome = packets.unpack_welcome(self._socket.recv(packets.MAX_BYTES))
         except (OSError, DriverError) as error:
             self._socket.close()
