@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import IO, Any, Final
 
 from drivers.canopen.frame import Frame
 from drivers.canopen.kernel_frame import ERROR
@@ -91,11 +91,14 @@ def _read_candump(path: Path) -> Iterator[LoggedFrame]:
 def _read_other(path: Path) -> Iterator[LoggedFrame]:
     import can  # heavy, and not needed for candump's format
 
-    if path.suffix.lower() not in (".asc", ".blf"):
+    suffix = path.suffix.lower()
+    if suffix not in (".asc", ".blf"):
         raise RecordingError(path, "a log of CAN frames ends in .log, .asc or .blf")
-    try:
-        with can.LogReader(path) as reader:
-            for message in reader:
+    # Opened here, since a reader that refuses a file leaves it open.
+    stream: IO[Any] = path.open("rb") if suffix == ".blf" else path.open(encoding="utf-8", errors="replace")
+    with stream:
+        try:
+            for message in can.BLFReader(stream) if suffix == ".blf" else can.ASCReader(stream):
                 frame = Frame(
                     0 if message.is_error_frame and not message.data else message.arbitration_id,
                     b"" if message.is_remote_frame else bytes(message.data),
@@ -106,10 +109,10 @@ def _read_other(path: Path) -> Iterator[LoggedFrame]:
                 )
                 bus = message.channel if isinstance(message.channel, int) else 0
                 yield LoggedFrame(bus, not message.is_rx, frame)
-    except OSError:
-        raise
-    except Exception as error:  # python-can's readers raise whatever the bytes lead them to
-        raise RecordingError(path, f"not a log of CAN frames: {error}") from error
+        except OSError:
+            raise
+        except Exception as error:  # python-can's readers raise whatever the bytes lead them to
+            raise RecordingError(path, f"not a log of CAN frames: {error}") from error
 
 
 class ReplayLink:

@@ -273,6 +273,13 @@ def test_a_crowded_wire_says_so(wire: Wire) -> None:
     end_of(wire.name).close()
 
 
+def test_an_end_of_another_version_is_told_so(wire: Wire) -> None:
+    with address.connect(wire.name) as sock:
+        sock.settimeout(PATIENCE)
+        sock.send(packets.pack_hello(Hello("old"))[:4] + b"\0" + bytes(40))
+        assert packets.unpack_welcome(sock.recv(packets.MAX_BYTES)).answer == packets.OTHER_VERSION
+
+
 def test_something_else_at_the_address_is_told_from_a_wire(name: str) -> None:
     with address.listen(name) as listener:
         listener.setblocking(True)

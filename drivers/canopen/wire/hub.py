@@ -162,14 +162,11 @@ class Wire:
         except OSError:
             return
         sock.setblocking(False)
-        if not address.trusted(sock):
-            sock.close()
-        elif len(self._ends) >= MOST_ENDS:
-            with suppress(OSError):
-                sock.send(packets.pack_welcome(packets.Welcome(packets.CROWDED)))
-            sock.close()
-        else:
+        # Who comes in vain is told in answer to its greeting: closed before, its unread greeting would hide the answer.
+        if address.trusted(sock) and len(self._ends) < 2 * MOST_ENDS:
             self._ends[sock.fileno()] = _End(sock)
+        else:
+            sock.close()
 
     def _read(self, end: _End, now: int) -> None:
         try:
@@ -191,18 +188,25 @@ class Wire:
                 # The queue had room for a whole packet.
                 self.medium.offer(end.port, frame, now)
         except DriverError:
+            if end.port is None and data.startswith(packets.MAGIC):
+                self._answer(end, packets.OTHER_VERSION)
             self.expelled += 1
             self._drop(end)
 
     def _greet(self, end: _End, hello: packets.Hello) -> None:
-        answer = packets.pack_welcome(packets.Welcome(packets.ACCEPTED, self.bitrate, self.fd))
-        try:
-            end.socket.send(answer)
-        except OSError:
+        crowded = sum(other.port is not None for other in self._ends.values()) >= MOST_ENDS
+        if not self._answer(end, packets.CROWDED if crowded else packets.ACCEPTED) or crowded:
             self._drop(end)
             return
         end.port = Port(hello.label, address.peer_pid(end.socket), own=hello.own, filters=hello.filters)
         self.medium.add(end.port)
+
+    def _answer(self, end: _End, answer: int) -> bool:
+        try:
+            end.socket.send(packets.pack_welcome(packets.Welcome(answer, self.bitrate, self.fd)))
+        except OSError:
+            return False
+        return True
 
     def _deliver(self, end: _End, port: Port, now: int) -> None:
         frames = port.take()

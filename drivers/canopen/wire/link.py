@@ -10,7 +10,6 @@ import select
 import time
 from collections import deque
 from collections.abc import Sequence
-from contextlib import suppress
 
 from drivers.canopen.bus_errors import BusError, BusOffWatch, kind_of
 from drivers.canopen.frame import Frame
@@ -66,8 +65,7 @@ class Connection:
         self._socket = address.connect(channel)
         self._socket.settimeout(_WELCOME_S)
         try:
-            with suppress(BrokenPipeError):  # the wire may have refused already, and says why
-                self._socket.send(packets.pack_hello(hello))
+            self._socket.send(packets.pack_hello(hello))
             self.welcome = packets.unpack_welcome(self._socket.recv(packets.MAX_BYTES))
         except (OSError, DriverError) as error:
             self._socket.close()
