@@ -73,8 +73,14 @@ class BusError(DriverError):
 
 
 def kind_of(code: int | None, otherwise: Kind = "refused") -> Kind:
-    """What an errno means for a bus."""
-    return _KINDS.get(code or 0, otherwise)
+    """What an errno means for a bus.
+
+    Args:
+        code: the errno, None where there is none.
+        otherwise: what any other one means; `gone` says that the bus is in use, so that it was there before.
+    """
+    kind = _KINDS.get(code or 0, otherwise)
+    return "gone" if (kind, otherwise) == ("absent", "gone") else kind
 
 
 class BusOffWatch:

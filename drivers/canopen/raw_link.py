@@ -6,6 +6,7 @@ by their age. Frames that the kernel dropped because nobody read them are told a
 
 from __future__ import annotations
 
+import os
 import select
 import socket
 import struct
@@ -13,6 +14,7 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
+from pathlib import Path
 
 from drivers.canopen.bus_errors import CONTROLLER, RX_OVERFLOW, BusError, BusOffWatch, kind_of
 from drivers.canopen.frame import Frame
@@ -48,6 +50,11 @@ def from_config(config: ArmConfig, bus_number: int) -> RawLink:
     if bus.options:
         raise DriverError(f"driver.buses.{bus_number}.options: interface raw has none, found {', '.join(bus.options)}")
     fd = bus.data_bitrate is not None
+    if fd and not _carries_fd(bus.channel):
+        remedy = f"carries no CAN FD: `ip link set {bus.channel} up type can bitrate {bus.bitrate} " + (
+            f"dbitrate {bus.data_bitrate} fd on`, or leave data_bitrate out"
+        )
+        raise BusError("refused", bus.channel, remedy=remedy)
     return RawLink(open_socket(bus.channel, bus.bitrate, fd=fd), bus.channel, bus.bitrate, fd=fd)
 
 
@@ -81,10 +88,21 @@ def open_socket(channel: str, bitrate: int = 1_000_000, *, fd: bool = False) -> 
         with suppress(OSError):
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
         sock.bind((channel,))
+        # The bind succeeds on an interface that is down; the error waits.
+        if code := sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
+            raise OSError(code, os.strerror(code))
     except OSError as error:
         sock.close()
         raise BusError(kind_of(error.errno), channel, bitrate, error.strerror or str(error)) from None
     return sock
+
+
+def _carries_fd(channel: str) -> bool:
+    """False where an interface is known to carry classic frames only; its largest packet is then 16 bytes."""
+    try:
+        return int((Path("/sys/class/net") / channel / "mtu").read_text()) >= FD_BYTES
+    except (OSError, ValueError):
+        return True
 
 
 class RawLink:

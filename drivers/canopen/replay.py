@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import Any, Final
 
 from drivers.canopen.frame import Frame
 from drivers.canopen.kernel_frame import ERROR
@@ -95,7 +95,7 @@ def _read_other(path: Path) -> Iterator[LoggedFrame]:
     if suffix not in (".asc", ".blf"):
         raise RecordingError(path, "a log of CAN frames ends in .log, .asc or .blf")
     # Opened here, since a reader that refuses a file leaves it open.
-    stream: IO[Any] = path.open("rb") if suffix == ".blf" else path.open(encoding="utf-8", errors="replace")
+    stream: Any = path.open("rb") if suffix == ".blf" else path.open(encoding="utf-8", errors="replace")
     with stream:
         try:
             for message in can.BLFReader(stream) if suffix == ".blf" else can.ASCReader(stream):

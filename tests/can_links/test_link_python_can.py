@@ -164,8 +164,7 @@ def test_after_bus_off_sending_is_refused_until_a_restart() -> None:
         (can.CanOperationError("Failed to transmit", errno.ENETDOWN), "down", "ip link set can3 up type can bitrate 5"),
         (can.CanOperationError("Failed to transmit", errno.ENOBUFS), "full", "nobody acknowledges"),
         (can.CanOperationError("Transmit buffer full"), "full", "nobody acknowledges"),
-        (OSError(errno.ENODEV, "No such device"), "absent", "no such CAN interface"),
-        (can.CanOperationError("Failed to receive", errno.ENODEV), "absent", "No such device|Failed to receive"),
+        (can.CanOperationError("Failed to receive", errno.ENODEV), "gone", "the interface has gone.*Failed to receive"),
         (can.CanOperationError("something new"), "gone", "something new"),
         (can.CanInterfaceNotImplementedError("no library", errno.ENODEV), "gone", "no library"),
     ],
@@ -175,6 +174,12 @@ def test_errors_of_python_can_become_ours_with_a_remedy(error: Exception, kind: 
     assert found.kind == kind
     with pytest.raises(DriverError, match=says):
         raise found
+
+
+def test_a_device_that_was_never_there_is_absent() -> None:
+    found = bus_error(OSError(errno.ENODEV, "No such device"), CanBus(channel="can3"), "refused")
+    assert found.kind == "absent"
+    assert "no such CAN interface" in str(found)
 
 
 def test_an_interface_that_nobody_has_is_refused() -> None:

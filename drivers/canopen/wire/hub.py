@@ -27,6 +27,7 @@ from drivers.canopen.wire.medium import Medium, Port, overflow
 from ident_service.errors import DriverError
 
 MOST_ENDS: Final = 32
+_SELECT_LIMIT: Final = 1024  # descriptors that select, whose timeout alone is finer than milliseconds, can watch
 
 
 class _End:
@@ -163,7 +164,7 @@ class Wire:
             return
         sock.setblocking(False)
         # Who comes in vain is told in answer to its greeting: closed before, its unread greeting would hide the answer.
-        if address.trusted(sock) and len(self._ends) < 2 * MOST_ENDS:
+        if address.trusted(sock) and len(self._ends) < 2 * MOST_ENDS and sock.fileno() < _SELECT_LIMIT:
             self._ends[sock.fileno()] = _End(sock)
         else:
             sock.close()

@@ -153,7 +153,7 @@ class Medium:
 
     def destroy(self, count: int, port: Port | None = None) -> None:
         """Let the next `count` frames, of one port or of any, be destroyed by an error; they are sent again."""
-        self._to_destroy[port] = self._to_destroy.get(port, 0) + count
+        self._to_destroy[port] = count
 
     def set_counters(self, port: Port, sending: int, receiving: int, now_ns: int) -> None:
         """Set a controller's error counters, with what follows from them; 256 sending is bus-off."""
