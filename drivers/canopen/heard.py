@@ -14,6 +14,10 @@ from typing import Final
 HEARD: Final = ((0x000, 0x400), (0x400, 0x700), (0x500, 0x780), (0x680, 0x780), (0x700, 0x700))
 
 
+# Frames of one drain: a flood, which no bus but a local socket can bring, must not hold the loop.
+MOST_AT_ONCE: Final = 4096
+
+
 def is_heard(identifier: int, filters: tuple[tuple[int, int], ...] = HEARD) -> bool:
     """Whether any filter lets an 11-bit identifier pass; all do where there are none."""
     return not filters or any(identifier & mask == wanted & mask for wanted, mask in filters)

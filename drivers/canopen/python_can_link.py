@@ -21,7 +21,7 @@ import can
 
 from drivers.canopen.bus_errors import BusError, BusOffWatch, Kind, kind_of
 from drivers.canopen.frame import Frame
-from drivers.canopen.heard import HEARD
+from drivers.canopen.heard import HEARD, MOST_AT_ONCE
 from drivers.canopen.sendable import check_sendable
 from drivers.clock import RealClock
 from ident_service.config.canopen import CanBus, CanopenDriver
@@ -31,7 +31,6 @@ from ident_service.errors import DriverError
 _OURS = ("interface", "channel", "bitrate", "data_bitrate", "fd", "receive_own_messages", "can_filters")
 _HEARS_ITSELF = "udp_multicast"
 _PLAUSIBLE_S = 1.0
-_MOST_AT_ONCE = 4096  # frames of one drain; a bus at full load cannot refill a queue as fast
 
 
 def from_config(config: ArmConfig, bus_number: int) -> PythonCanLink:
@@ -148,14 +147,14 @@ class PythonCanLink:
                 return frame
 
     def drain(self) -> Sequence[Frame]:
-        """All frames that wait; returns at once.
+        """All frames that wait, at most `MOST_AT_ONCE`; returns at once.
 
         Raises:
             BusError: interface down or gone.
         """
         frames = list(self._waiting)
         self._waiting.clear()
-        while len(frames) < _MOST_AT_ONCE and (message := self._message(0.0)) is not None:
+        while len(frames) < MOST_AT_ONCE and (message := self._message(0.0)) is not None:
             if (frame := self._frame(message)) is not None:
                 frames.append(frame)
         return frames

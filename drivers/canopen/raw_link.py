@@ -18,7 +18,7 @@ from pathlib import Path
 
 from drivers.canopen.bus_errors import CONTROLLER, RX_OVERFLOW, BusError, BusOffWatch, kind_of
 from drivers.canopen.frame import Frame
-from drivers.canopen.heard import HEARD
+from drivers.canopen.heard import HEARD, MOST_AT_ONCE
 from drivers.canopen.kernel_frame import EXTENDED, FD_BYTES, from_kernel, to_kernel
 from drivers.canopen.sendable import check_sendable
 from drivers.clock import RealClock
@@ -160,12 +160,12 @@ class RawLink:
                 raise self._failure(error) from None
 
     def drain(self) -> Sequence[Frame]:
-        """All frames that wait; returns at once.
+        """All frames that wait, at most `MOST_AT_ONCE`; returns at once.
 
         Raises:
             BusError: interface down or gone.
         """
-        while (frame := self._take()) is not None:
+        while len(self._waiting) < MOST_AT_ONCE and (frame := self._take()) is not None:
             self._waiting.append(frame)
         frames = tuple(self._waiting)
         self._waiting.clear()

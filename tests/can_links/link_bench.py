@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from drivers.canopen.frame import Frame
 from drivers.canopen.sendable import FD_LENGTHS
+from drivers.canopen.wire.hub import Wire
 from drivers.canopen.wire.link import Connection, WireLink
 from drivers.canopen.wire.packets import Hello
 from ident_service.config.load import load_arm
@@ -32,6 +33,15 @@ def wait_for(condition: Callable[[], bool]) -> None:
     while not condition():
         assert time.monotonic() < end, "waited in vain"
         time.sleep(0.002)
+
+
+def content(frame: Frame | None) -> Frame | None:
+    return None if frame is None else frame._replace(stamp_ns=0)
+
+
+def greeted(wire: Wire, count: int) -> None:
+    """Wait until so many ends are on the wire."""
+    wait_for(lambda: len(wire.medium.ports) == count)
 
 
 @st.composite

@@ -16,6 +16,7 @@ from link_bench import arm_on_bus, frames, soon
 from drivers.canopen import python_can_link
 from drivers.canopen.bus_errors import BUS_OFF, RESTARTED, BusError
 from drivers.canopen.frame import Frame
+from drivers.canopen.heard import MOST_AT_ONCE
 from drivers.canopen.link import Link, open_links
 from drivers.canopen.python_can_link import PythonCanLink, bus_error
 from ident_service.config.canopen import CanBus
@@ -97,6 +98,15 @@ def test_drain_takes_all_and_never_waits(pair: tuple[Link, Link]) -> None:
         heard += [frame.identifier for frame in other.drain()]
     assert heard == [0x181, 0x182, 0x183, 0x184]
     assert other.drain() == []
+
+
+def test_a_flood_does_not_hold_a_drain() -> None:
+    one, other = virtual("flood"), virtual("flood")
+    for _ in range(MOST_AT_ONCE + 7):
+        one.send(Frame(0x080))
+    assert [len(other.drain()) for _ in range(3)] == [MOST_AT_ONCE, 7, 0]
+    one.close()
+    other.close()
 
 
 def test_anything_sent_to_the_multicast_group_stops_nobody() -> None:

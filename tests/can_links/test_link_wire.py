@@ -8,7 +8,6 @@ import stat
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
@@ -16,7 +15,7 @@ import can
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from link_bench import PATIENCE, arm_on_bus, end_of, frames, process, soon, wait_for
+from link_bench import PATIENCE, arm_on_bus, content, end_of, frames, greeted, process, soon
 
 from drivers.canopen.bus_errors import BUS_OFF, CONTROLLER, RESTARTED, RX_OVERFLOW, BusError
 from drivers.canopen.frame import Frame
@@ -27,30 +26,6 @@ from drivers.canopen.wire.hub import MOST_ENDS, Wire
 from drivers.canopen.wire.link import Connection, WireLink
 from drivers.canopen.wire.packets import Hello
 from ident_service.errors import DriverError
-
-_WIRES = iter(range(10**9))
-
-
-@pytest.fixture
-def name() -> str:
-    """A wire that nobody else has."""
-    return f"test-{os.getpid()}-{next(_WIRES)}"
-
-
-@pytest.fixture
-def wire(name: str) -> Iterator[Wire]:
-    """A wire without pace in a thread."""
-    with WireThread(Wire(name)) as thread:
-        yield thread.wire
-
-
-def content(frame: Frame | None) -> Frame | None:
-    return None if frame is None else frame._replace(stamp_ns=0)
-
-
-def greeted(wire: Wire, count: int) -> None:
-    """Wait until so many ends are on the wire."""
-    wait_for(lambda: len(wire.medium.ports) == count)
 
 
 @given(drawn=st.lists(frames(), min_size=1, max_size=30))
@@ -359,73 +334,6 @@ def test_bus_off_is_heard_then_sending_is_refused_until_a_restart(wire: Wire) ->
     assert content(drive.receive(soon())) == Frame(0x080)
     driver.close()
     drive.close()
-
-
-def test_python_can_talks_over_the_wire(wire: Wire) -> None:
-    link = end_of(wire.name)
-    with can.Bus(interface="ident_wire", channel=wire.name, bitrate=1_000_000) as bus:
-        before = time.time()
-        link.send(Frame(0x181, b"\1\2"))
-        message = bus.recv(PATIENCE)
-        assert message is not None
-        assert (message.arbitration_id, bytes(message.data), message.is_extended_id) == (0x181, b"\1\2", False)
-        assert before - 1.0 < message.timestamp <= time.time()
-        for frame in (Frame(0x80), Frame(0x1234567, b"\3", extended=True), Frame(0x701, remote=True)):
-            bus.send(
-                can.Message(
-                    arbitration_id=frame.identifier,
-                    data=None if frame.remote else frame.data,
-                    is_extended_id=frame.extended,
-                    is_remote_frame=frame.remote,
-                )
-            )
-            assert content(link.receive(soon())) == frame
-        assert bus.recv(0.0) is None
-        bus.set_filters([{"can_id": 0x200, "can_mask": 0x7FF, "extended": False}])
-        link.send_all([Frame(0x181), Frame(0x200)])
-        message = bus.recv(PATIENCE)
-        assert message is not None
-        assert message.arbitration_id == 0x200
-        with pytest.raises(can.CanOperationError):
-            bus.send(can.Message(arbitration_id=1, is_extended_id=False, is_fd=True, data=bytes(12)))
-    link.close()
-
-
-def test_python_can_hears_itself_when_it_asks_for_it(name: str) -> None:
-    with (
-        can.Bus(interface="ident_wire", channel=name, host=True) as host,
-        can.Bus(interface="ident_wire", channel=name, receive_own_messages=True) as bus,
-    ):
-        host.send(can.Message(arbitration_id=0x100, is_extended_id=False))
-        first = bus.recv(PATIENCE)
-        bus.send(can.Message(arbitration_id=0x101, is_extended_id=False))
-        second = bus.recv(PATIENCE)
-        assert first is not None
-        assert second is not None
-        assert [(m.arbitration_id, m.is_rx) for m in (first, second)] == [(0x100, True), (0x101, False)]
-        heard = host.recv(PATIENCE)
-        assert heard is not None
-        assert heard.arbitration_id == 0x101
-    with pytest.raises(can.CanInitializationError):
-        can.Bus(interface="ident_wire", channel=name)
-
-
-@pytest.mark.slow
-def test_the_logger_of_python_can_sees_the_wire(wire: Wire, tmp_path: Path) -> None:
-    link, path = end_of(wire.name), tmp_path / "seen.log"
-    command = [sys.executable, "-m", "can.logger", "-i", "ident_wire", "-c", wire.name, "-f", str(path)]
-    child = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-    try:
-        greeted(wire, 2)
-        for k in range(10):
-            link.send(Frame(0x181, bytes([k])))
-        wait_for(lambda: all(not port.inbox for port in wire.medium.ports))
-        time.sleep(0.5)  # what the logger has heard it writes in a thread of its own
-    finally:
-        child.send_signal(signal.SIGINT)
-        child.wait(PATIENCE)
-    assert [line.split()[2] for line in path.read_text().splitlines()] == [f"181#{k:02X}" for k in range(10)]
-    link.close()
 
 
 def test_a_connection_is_of_one_user_only(name: str) -> None:

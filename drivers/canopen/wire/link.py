@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 from drivers.canopen.bus_errors import BusError, BusOffWatch, kind_of
 from drivers.canopen.frame import Frame
-from drivers.canopen.heard import HEARD
+from drivers.canopen.heard import HEARD, MOST_AT_ONCE
 from drivers.canopen.sendable import check_sendable
 from drivers.canopen.wire import address, packets
 from drivers.clock import RealClock
@@ -170,12 +170,12 @@ class WireLink:
         return self._waiting.popleft() if self._waiting else None
 
     def drain(self) -> Sequence[Frame]:
-        """All frames that wait; returns at once.
+        """All frames that wait, hardly more than `MOST_AT_ONCE`; returns at once.
 
         Raises:
             BusError: the wire is gone.
         """
-        while taken := self._connection.take():
+        while len(self._waiting) < MOST_AT_ONCE and (taken := self._connection.take()):
             self._keep(taken)
         frames = tuple(self._waiting)
         self._waiting.clear()
