@@ -1,0 +1,189 @@
+"""A logged session played into a driver, in virtual time: what the drives said then, they say again.
+
+What was heard after the k-th SYNC of the log is heard after the driver's k-th SYNC, as much later as it was then. So
+a driver that computes faster or slower than the logged one still meets every answer in its cycle.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from drivers.canopen.frame import Frame
+from drivers.canopen.kernel_frame import ERROR
+from drivers.canopen.sendable import check_sendable
+from drivers.clock import Clock, VirtualClock
+from ident_service.errors import RecordingError
+
+SYNC: Final = 0x080
+_MOST_FRAMES = 20_000_000
+# candump -L: (seconds) interface identifier#data, ##flags for CAN FD, R for a remote frame; then R or T, or nothing.
+_LINE = re.compile(
+    r"\((\d+)\.(\d{1,9})\) (\S*?)(\d*) ([0-9A-F]{3}|[0-9A-F]{8})#"
+    r"(?:(R)\d?|(?:#[0-9A-F])?((?:[0-9A-F]{2}){0,64}))(?: ([RT]))?",
+    re.IGNORECASE,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class LoggedFrame:
+    """One frame of a log: on which bus, whether we sent it, and when [ns after the first one]."""
+
+    bus: int
+    sent: bool
+    frame: Frame
+
+
+def read_session(path: Path | str) -> list[LoggedFrame]:
+    """All frames of a log, stamped from the first one on.
+
+    Args:
+        path: a `.log` of candump or of this package, an `.asc` or `.blf`.
+
+    Raises:
+        RecordingError: a file that cannot be read as such, with the line where it is text.
+    """
+    path = Path(path)
+    try:
+        frames = _read_candump(path) if path.suffix.lower() == ".log" else _read_other(path)
+        found: list[LoggedFrame] = []
+        for logged in frames:
+            if len(found) >= _MOST_FRAMES:
+                raise RecordingError(path, f"more than {_MOST_FRAMES} frames; cut it")
+            found.append(logged)
+    except OSError as error:
+        raise RecordingError(path, error.strerror or str(error)) from None
+    found.sort(key=lambda logged: logged.frame.stamp_ns)
+    if not found:
+        return found
+    start = found[0].frame.stamp_ns
+    return [
+        LoggedFrame(logged.bus, logged.sent, logged.frame._replace(stamp_ns=logged.frame.stamp_ns - start))
+        for logged in found
+    ]
+
+
+def _read_candump(path: Path) -> Iterator[LoggedFrame]:
+    with path.open(encoding="utf-8", errors="replace") as lines:
+        for number, line in enumerate(lines, 1):
+            text = line.strip()
+            if not text:
+                continue
+            if (match := _LINE.fullmatch(text)) is None:
+                raise RecordingError(path, f"line {number}: not a frame as candump -L writes it: {text[:60]!r}")
+            seconds, fraction, _, bus, identifier, remote, data, direction = match.groups()
+            word = int(identifier, 16)
+            error = len(identifier) == 8 and bool(word & ERROR)
+            frame = Frame(
+                word & 0x1FFF_FFFF,
+                bytes.fromhex(data or ""),
+                remote is not None,
+                error,
+                len(identifier) == 8 and not error,
+                int(seconds) * 1_000_000_000 + int(fraction.ljust(9, "0")),
+            )
+            yield LoggedFrame(int(bus or 0), (direction or "R").upper() == "T", frame)
+
+
+def _read_other(path: Path) -> Iterator[LoggedFrame]:
+    import can  # heavy, and not needed for candump's format
+
+    suffix = path.suffix.lower()
+    if suffix not in (".asc", ".blf"):
+        raise RecordingError(path, "a log of CAN frames ends in .log, .asc or .blf")
+    # Opened here, since a reader that refuses a file leaves it open.
+    stream: Any = path.open("rb") if suffix == ".blf" else path.open(encoding="utf-8", errors="replace")
+    with stream:
+        try:
+            for message in can.BLFReader(stream) if suffix == ".blf" else can.ASCReader(stream):
+                frame = Frame(
+                    0 if message.is_error_frame and not message.data else message.arbitration_id,
+                    b"" if message.is_remote_frame else bytes(message.data),
+                    message.is_remote_frame,
+                    message.is_error_frame,
+                    message.is_extended_id and not message.is_error_frame,
+                    round(message.timestamp * 1e9),
+                )
+                bus = message.channel if isinstance(message.channel, int) else 0
+                yield LoggedFrame(bus, not message.is_rx, frame)
+        except OSError:
+            raise
+        except Exception as error:  # python-can's readers raise whatever the bytes lead them to
+            raise RecordingError(path, f"not a log of CAN frames: {error}") from error
+
+
+class ReplayLink:
+    """A Link that plays one bus of a log.
+
+    Attributes:
+        sent: what the driver sent, stamped.
+        logged: what was sent in the log, to compare with.
+    """
+
+    def __init__(self, session: Sequence[LoggedFrame], bus: int = 0, clock: Clock | None = None) -> None:
+        """Rewind.
+
+        Args:
+            session: from `read_session`.
+            bus: which one to play.
+            clock: shared among the buses of an arm; a virtual one of its own by default.
+        """
+        self.clock: Clock = clock or VirtualClock()
+        self.sent: list[Frame] = []
+        mine = [logged for logged in session if logged.bus == bus]
+        self.logged = [logged.frame for logged in mine if logged.sent]
+        self._syncs = [frame.stamp_ns for frame in self.logged if frame.identifier == SYNC and not frame.extended]
+        self._heard: list[tuple[int, Frame]] = []  # after how many SYNCs, and what
+        cycle = 0
+        for logged in mine:
+            if not logged.sent:
+                self._heard.append((cycle, logged.frame))
+            elif logged.frame.identifier == SYNC and not logged.frame.extended:
+                cycle += 1
+        self._next = 0
+        self._shift_ns = [self.clock.now_ns()]  # from the log's time to ours, by cycle
+
+    @property
+    def finished(self) -> bool:
+        """Whether everything that was heard has been heard again."""
+        return self._next >= len(self._heard)
+
+    def send(self, frame: Frame) -> None:
+        """Keep the frame; a SYNC releases the answers to it.
+
+        Raises:
+            DriverError: a frame that cannot exist.
+        """
+        check_sendable(frame, fd=True)
+        now = self.clock.now_ns()
+        self.sent.append(frame._replace(stamp_ns=now))
+        if frame.identifier == SYNC and not frame.extended and len(self._shift_ns) <= len(self._syncs):
+            self._shift_ns.append(now - self._syncs[len(self._shift_ns) - 1])
+
+    def receive(self, deadline_ns: int) -> Frame | None:
+        """The next frame of the log, None when none is due until the deadline [ns of the clock]."""
+        frame = self._due(deadline_ns)
+        self.clock.sleep_until_ns(deadline_ns if frame is None else frame.stamp_ns)
+        return frame
+
+    def drain(self) -> Sequence[Frame]:
+        """All frames that are due."""
+        frames = []
+        while (frame := self._due(self.clock.now_ns())) is not None:
+            frames.append(frame)
+        return frames
+
+    def close(self) -> None:
+        """Nothing to give back."""
+
+    def _due(self, until_ns: int) -> Frame | None:
+        if self.finished:
+            return None
+        cycle, frame = self._heard[self._next]
+        if cycle >= len(self._shift_ns) or frame.stamp_ns + self._shift_ns[cycle] > until_ns:
+            return None
+        self._next += 1
+        return frame._replace(stamp_ns=frame.stamp_ns + self._shift_ns[cycle])

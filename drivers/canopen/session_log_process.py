@@ -1,0 +1,142 @@
+"""The process that writes a session log: packets of frames on its standard input, a file of python-can's writers out.
+
+Frames come in batches per bus, and a received one is stamped before it was read; they are put in the order of their
+stamps over half a second. The end of the input is the end of the file, whoever caused it.
+"""
+
+from __future__ import annotations
+
+import heapq
+import json
+import socket
+import sys
+from contextlib import suppress
+from itertools import count
+from pathlib import Path
+from typing import IO, Any, Final, Protocol, cast
+
+import can
+from can.io.canutils import CanutilsLogWriter
+
+from drivers.canopen.frame import Frame
+from drivers.canopen.kernel_frame import ERROR
+from drivers.canopen.wire.packets import MAX_BYTES, unpack_frames
+from ident_service.errors import DriverError
+
+_WINDOW_NS: Final = 500_000_000
+
+
+class _Writer(Protocol):
+    file: IO[Any]
+
+    def on_message_received(self, msg: can.Message) -> None: ...
+
+    def stop(self) -> None: ...
+
+
+class CandumpWriter(CanutilsLogWriter):
+    """python-can's writer, but error frames keep what they tell, as `candump -L` writes them."""
+
+    def on_message_received(self, msg: can.Message) -> None:
+        """Write one frame."""
+        if msg.is_error_frame:
+            word, data = msg.arbitration_id | ERROR, bytes(msg.data).hex().upper()
+            self.file.write(f"({msg.timestamp:f}) can{msg.channel} {word:08X}#{data}\n")
+        else:
+            super().on_message_received(msg)
+
+
+def message(frame: Frame, bus: int, sent: bool, utc_offset_ns: int) -> can.Message:
+    """A frame as python-can's writers take it."""
+    return can.Message(
+        timestamp=(frame.stamp_ns + utc_offset_ns) * 1e-9,
+        arbitration_id=frame.identifier,
+        is_extended_id=frame.extended,
+        is_remote_frame=frame.remote,
+        is_error_frame=frame.error,
+        is_fd=len(frame.data) > 8,
+        data=None if frame.remote else frame.data,
+        channel=bus,
+        is_rx=not sent,
+    )
+
+
+class OrderedLog:
+    """A file whose frames are in the order of their stamps.
+
+    Attributes:
+        written: frames in the file.
+    """
+
+    def __init__(self, path: Path, utc_offset_ns: int) -> None:
+        """Create the file, which must not exist.
+
+        Raises:
+            OSError: it cannot be created.
+        """
+        suffix = path.suffix.lower()
+        kind = {".asc": can.ASCWriter, ".blf": can.BLFWriter, ".log": CandumpWriter}[suffix]
+        stream: IO[Any] = path.open("xb") if suffix == ".blf" else path.open("x", encoding="utf-8")
+        self._writer = cast(_Writer, kind(cast(Any, stream)))
+        self._utc_offset_ns = utc_offset_ns
+        self._heap: list[tuple[int, int, Frame, int, bool]] = []
+        self._numbers = count()
+        self.written = 0
+
+    def add(self, bus: int, frames: list[tuple[Frame, bool]]) -> None:
+        """Take frames of one bus, and write what no earlier one can come before."""
+        for frame, sent in frames:
+            heapq.heappush(self._heap, (frame.stamp_ns, next(self._numbers), frame, bus, sent))
+        newest = max(frame.stamp_ns for frame, _ in frames)
+        self._write_until(newest - _WINDOW_NS)
+
+    def close(self) -> None:
+        """Write the rest and finish the file."""
+        self._write_until(None)
+        self._writer.stop()
+
+    def _write_until(self, stamp_ns: int | None) -> None:
+        before = self.written
+        while self._heap and (stamp_ns is None or self._heap[0][0] <= stamp_ns):
+            _, _, frame, bus, sent = heapq.heappop(self._heap)
+            self._writer.on_message_received(message(frame, bus, sent, self._utc_offset_ns))
+            self.written += 1
+        if self.written != before:
+            self._writer.file.flush()
+
+
+def main() -> int:
+    """Write one log; 0 when it is whole."""
+    with socket.socket(fileno=sys.stdin.fileno()) as source:
+        return _serve(source)
+
+
+def _serve(source: socket.socket) -> int:
+    log: OrderedLog | None = None
+    error = ""
+    try:
+        request = json.loads(source.recv(65536))
+        log = OrderedLog(Path(request["path"]), request["utc_offset_ns"])
+        _say(source, {"error": ""})
+        while packet := source.recv(MAX_BYTES + 1):
+            log.add(packet[0], unpack_frames(packet[1:]))
+    except FileExistsError:
+        error = "exists already; take another name"
+    except (OSError, DriverError) as found:
+        error = getattr(found, "strerror", None) or str(found)
+    if log is not None:
+        try:
+            log.close()
+        except OSError as found:
+            error = error or found.strerror or str(found)
+    _say(source, {"error": error, "written": 0 if log is None else log.written})
+    return 1 if error else 0
+
+
+def _say(source: socket.socket, answer: dict[str, object]) -> None:
+    with suppress(OSError):  # whoever asked may be gone
+        source.send(json.dumps(answer).encode())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,130 @@
+"""Two ways to host a wire within a process: in one's own loop, with a port on it, or in a thread.
+
+A thread shares Python's interpreter lock with everything else in its process and so disturbs a loop that must be on
+time; for that, host the wire in the drives' process or in one of its own.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from types import TracebackType
+from typing import Self
+
+from drivers.canopen.bus_errors import BusError
+from drivers.canopen.frame import Frame
+from drivers.canopen.sendable import check_sendable
+from drivers.canopen.wire.hub import Wire
+from drivers.canopen.wire.medium import Port
+from drivers.clock import RealClock
+
+_LOOK_NS = 1_000_000_000
+
+
+class LocalPort:
+    """A Link of the process that hosts the wire: waiting for a frame is what moves the wire.
+
+    One thread hosts the wire and uses its local ports; there may be several.
+    """
+
+    def __init__(self, wire: Wire, label: str) -> None:
+        """Put a port on an entered wire.
+
+        Args:
+            wire: to be on.
+            label: who this is, for people.
+        """
+        self.clock = RealClock()
+        self.port = Port(label)
+        self._wire = wire
+        wire.medium.add(self.port)
+        self._waiting: list[Frame] = []
+
+    def send(self, frame: Frame) -> None:
+        """Queue one frame; it is on its way when this returns.
+
+        Raises:
+            BusError: bus-off, or the queue is full.
+            DriverError: a frame that cannot exist.
+        """
+        self.send_all((frame,))
+
+    def send_all(self, frames: Sequence[Frame]) -> None:
+        """Queue several at once, which costs hardly more than one; raises as `send` does."""
+        now = time.monotonic_ns()
+        for frame in frames:
+            check_sendable(frame, fd=self._wire.fd)
+            if self.port.counters.state == "off":
+                raise BusError("off", f"ident_wire {self._wire.name}", self._wire.bitrate)
+            if not self._wire.medium.offer(self.port, frame, now):
+                raise BusError("full", f"ident_wire {self._wire.name}", self._wire.bitrate)
+        self._wire.turn(now)
+
+    def receive(self, deadline_ns: int) -> Frame | None:
+        """The next frame, None when there is none until the deadline [ns of the clock].
+
+        Raises:
+            BusError: the wire is closed.
+        """
+        while not self._waiting:
+            self._wire.poll(deadline_ns)
+            self._waiting = [frame for frame, _ in reversed(self.port.take())]
+            if not self._waiting and time.monotonic_ns() >= deadline_ns:
+                return None
+        return self._waiting.pop()
+
+    def drain(self) -> Sequence[Frame]:
+        """All frames that wait; returns at once.
+
+        Raises:
+            BusError: the wire is closed.
+        """
+        self._wire.poll(0)
+        frames = [*reversed(self._waiting), *(frame for frame, _ in self.port.take())]
+        self._waiting = []
+        return frames
+
+    def close(self) -> None:
+        """Take the port off the wire, which goes on."""
+        self._wire.medium.remove(self.port)
+
+
+class WireThread:
+    """Hosts a wire in a thread; a context manager."""
+
+    def __init__(self, wire: Wire) -> None:
+        """Take a wire that is not entered yet."""
+        self.wire = wire
+        self._ended = False
+        self._thread = threading.Thread(target=self._run, name=f"ident_wire {wire.name}", daemon=True)
+
+    def __enter__(self) -> Self:
+        """Open the wire and host it.
+
+        Raises:
+            BusError: another process runs this wire, or its address cannot be had.
+        """
+        self.wire.__enter__()
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Cut everybody off."""
+        self.close()
+
+    def close(self) -> None:
+        """Cut everybody off; any number of times."""
+        self._ended = True
+        self.wire.wake()
+        if self._thread.is_alive():
+            self._thread.join()
+        self.wire.close()
+
+    def _run(self) -> None:
+        with suppress(BusError):
+            while not self._ended:
+                self.wire.poll(time.monotonic_ns() + _LOOK_NS)

@@ -1,0 +1,230 @@
+"""The wire itself: takes connections, moves frames between their sockets and the medium.
+
+Whoever hosts a wire calls `poll` in its loop: emulated drives, which also have a `LocalPort` on it without any socket;
+a thread (`WireThread`); or a process of its own (`python -m drivers.canopen.wire NAME`). An end that sends nonsense is
+thrown out, one that vanishes is forgotten, one that does not read loses frames and is told so; none can stop the wire.
+
+Boundary: sockets only; order, pace and errors are the medium's.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from threading import RLock
+from types import TracebackType
+from typing import Final, Self
+
+from drivers.canopen.bus_errors import BusError
+from drivers.canopen.frame import Frame
+from drivers.canopen.wire import address, packets
+from drivers.canopen.wire.frame_bits import ERROR_BITS, frame_bits
+from drivers.canopen.wire.medium import Medium, Port, overflow
+from ident_service.errors import DriverError
+
+MOST_ENDS: Final = 32
+_SELECT_LIMIT: Final = 1024  # descriptors that select, whose timeout alone is finer than milliseconds, can watch
+
+
+class _End:
+    """A connection, and the port it has once it has greeted."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        self.socket, self.dropped = sock, False
+        self.port: Port | None = None
+
+
+class Wire:
+    """A CAN bus for the processes of one user; a context manager.
+
+    Attributes:
+        medium: ports, counters of frames, and the errors that can be injected (under `lock`, from another thread).
+        lock: held whenever the medium is touched.
+        expelled: ends that were thrown out because they sent nonsense.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        bitrate: int = 0,
+        *,
+        fd: bool = False,
+        duration_ns: Callable[[Frame], int] | None = None,
+    ) -> None:
+        """Describe a wire; nobody can connect before the context is entered.
+
+        Args:
+            name: channel that ends connect to: a name, or the path of a socket file.
+            bitrate: pace to keep [bit/s]; 0: none.
+            fd: whether frames may be CAN FD's.
+            duration_ns: how long a frame occupies the wire, instead of its classic bits at the bit rate.
+
+        Raises:
+            DriverError: a pace for CAN FD without `duration_ns`.
+        """
+        if fd and bitrate and duration_ns is None:
+            raise DriverError(f"ident_wire {name}: the pace of CAN FD needs duration_ns")
+        self.name, self.bitrate, self.fd = name, bitrate, fd
+        error_ns = 0
+        if bitrate:
+            duration_ns = duration_ns or (lambda frame: frame_bits(frame) * 1_000_000_000 // bitrate)
+            error_ns = ERROR_BITS * 1_000_000_000 // bitrate
+        self.medium = Medium(duration_ns, error_ns)
+        self.lock = RLock()
+        self.expelled = 0
+        self._ends: dict[int, _End] = {}
+        self._listener: socket.socket | None = None
+        self._wake = -1
+
+    def __enter__(self) -> Self:
+        """Take connections from now on.
+
+        Raises:
+            BusError: another process runs this wire, or its address cannot be had.
+        """
+        self._listener = address.listen(self.name)
+        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Cut everybody off."""
+        self.close()
+
+    def close(self) -> None:
+        """Cut everybody off; any number of times."""
+        with self.lock:
+            if self._listener is None:
+                return
+            for end in list(self._ends.values()):
+                self._drop(end)
+            address.forget(self.name, self._listener)
+            self._listener = None
+            os.close(self._wake)
+
+    def wake(self) -> None:
+        """Let a `poll` that waits in another thread return."""
+        with suppress(OSError):
+            os.eventfd_write(self._wake, 1)
+
+    def poll(self, deadline_ns: int) -> None:
+        """Take what has come, move frames, hand out what was heard; once.
+
+        Args:
+            deadline_ns: how long to wait for something to do [ns, monotonic]; one in the past only looks.
+
+        Raises:
+            BusError: the wire is closed.
+        """
+        if self._listener is None:
+            raise BusError("gone", f"ident_wire {self.name}", remedy="this wire is closed")
+        listener = self._listener.fileno()
+        with self.lock:
+            watched: list[int] = [listener, self._wake]
+            # A port whose queue is full is not read: its socket fills up, and its sender is told.
+            watched += [
+                number
+                for number, end in self._ends.items()
+                if end.port is None or self.medium.room(end.port) >= packets.MAX_FRAMES
+            ]
+            end_ns = self.medium.end_ns
+        until = deadline_ns if end_ns is None else min(deadline_ns, end_ns)
+        remaining = max(0, until - time.monotonic_ns())
+        ready = select.select(watched, [], [], remaining * 1e-9)[0]
+        with self.lock:
+            now = time.monotonic_ns()
+            for number in ready:
+                if number == listener:
+                    self._accept()
+                elif number == self._wake:
+                    with suppress(BlockingIOError):
+                        os.eventfd_read(self._wake)
+                elif (end := self._ends.get(number)) is not None:
+                    self._read(end, now)
+            self.turn(time.monotonic_ns())
+
+    def turn(self, now_ns: int) -> None:
+        """Move frames and hand out what was heard, without taking anything from a socket."""
+        self.medium.advance(now_ns)
+        for end in list(self._ends.values()):
+            if end.port is not None and end.port.inbox:
+                self._deliver(end, end.port, now_ns)
+
+    def _accept(self) -> None:
+        if self._listener is None:
+            return
+        try:
+            sock = self._listener.accept()[0]
+        except OSError:
+            return
+        sock.setblocking(False)
+        # Who comes in vain is told in answer to its greeting: closed before, its unread greeting would hide the answer.
+        if address.trusted(sock) and len(self._ends) < 2 * MOST_ENDS and sock.fileno() < _SELECT_LIMIT:
+            self._ends[sock.fileno()] = _End(sock)
+        else:
+            sock.close()
+
+    def _read(self, end: _End, now: int) -> None:
+        try:
+            data = end.socket.recv(packets.MAX_BYTES + 1)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self._drop(end)
+            return
+        try:
+            if end.port is None:
+                self._greet(end, packets.unpack_hello(data))
+                return
+            for frame, _ in packets.unpack_frames(data):
+                if frame.error or (len(frame.data) > 8 and not self.fd):
+                    raise DriverError("a frame that no controller sends")
+                # The queue had room for a whole packet.
+                self.medium.offer(end.port, frame, now)
+        except DriverError:
+            if end.port is None and data.startswith(packets.MAGIC):
+                self._answer(end, packets.OTHER_VERSION)
+            self.expelled += 1
+            self._drop(end)
+
+    def _greet(self, end: _End, hello: packets.Hello) -> None:
+        crowded = sum(other.port is not None for other in self._ends.values()) >= MOST_ENDS
+        if not self._answer(end, packets.CROWDED if crowded else packets.ACCEPTED) or crowded:
+            self._drop(end)
+            return
+        end.port = Port(hello.label, address.peer_pid(end.socket), own=hello.own, filters=hello.filters)
+        self.medium.add(end.port)
+
+    def _answer(self, end: _End, answer: int) -> bool:
+        try:
+            end.socket.send(packets.pack_welcome(packets.Welcome(answer, self.bitrate, self.fd)))
+        except OSError:
+            return False
+        return True
+
+    def _deliver(self, end: _End, port: Port, now: int) -> None:
+        frames = port.take()
+        if end.dropped:
+            frames.insert(0, (overflow(now), False))
+        try:
+            for first in range(0, len(frames), packets.MAX_FRAMES):
+                end.socket.send(packets.pack_frames(frames[first : first + packets.MAX_FRAMES]))
+                end.dropped = False
+        except BlockingIOError:
+            port.lost += len(frames) - first
+            end.dropped = True
+        except OSError:
+            self._drop(end)
+
+    def _drop(self, end: _End) -> None:
+        self._ends.pop(end.socket.fileno(), None)
+        end.socket.close()
+        if end.port is not None:
+            self.medium.remove(end.port)

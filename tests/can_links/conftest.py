@@ -1,0 +1,26 @@
+"""A wire of one's own for each test."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+import pytest
+
+from drivers.canopen.wire.host import WireThread
+from drivers.canopen.wire.hub import Wire
+
+_WIRES = iter(range(10**9))
+
+
+@pytest.fixture
+def name() -> str:
+    """A wire that nobody else has."""
+    return f"test-{os.getpid()}-{next(_WIRES)}"
+
+
+@pytest.fixture
+def wire(name: str) -> Iterator[Wire]:
+    """A wire without pace in a thread."""
+    with WireThread(Wire(name)) as thread:
+        yield thread.wire
