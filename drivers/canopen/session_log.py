@@ -36,7 +36,7 @@ _FINISH_S: Final = 60.0
 
 @dataclass(frozen=True)
 class LogReport:
-    """How a log ended: frames in the file, frames that the loop had to drop, and what went wrong, if anything."""
+    """How a log ended: frames in the file, frames that are not, and what went wrong, if anything."""
 
     written: int
     lost: int
@@ -119,7 +119,7 @@ class SessionLog:
         answer = self._answer(_FINISH_S)
         self.report = LogReport(
             int(str(answer.get("written", 0))),
-            self.lost,
+            self.lost + int(str(answer.get("lost", 0))),
             str(answer.get("error", "the process that writes the log has died; the file may be torn")),
         )
         self._end()

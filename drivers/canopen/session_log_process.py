@@ -11,7 +11,7 @@ import json
 import socket
 import sys
 from contextlib import suppress
-from itertools import count
+from itertools import count as numbers_from
 from pathlib import Path
 from typing import IO, Any, Final, Protocol, cast
 
@@ -80,7 +80,7 @@ class OrderedLog:
         self._writer = cast(_Writer, kind(cast(Any, stream)))
         self._utc_offset_ns = utc_offset_ns
         self._heap: list[tuple[int, int, Frame, int, bool]] = []
-        self._numbers = count()
+        self._numbers = numbers_from()
         self.written = 0
 
     def add(self, bus: int, frames: list[tuple[Frame, bool]]) -> None:
@@ -96,13 +96,14 @@ class OrderedLog:
         self._writer.stop()
 
     def _write_until(self, stamp_ns: int | None) -> None:
-        before = self.written
+        count = 0
         while self._heap and (stamp_ns is None or self._heap[0][0] <= stamp_ns):
             _, _, frame, bus, sent = heapq.heappop(self._heap)
             self._writer.on_message_received(message(frame, bus, sent, self._utc_offset_ns))
-            self.written += 1
-        if self.written != before:
+            count += 1
+        if count:
             self._writer.file.flush()
+            self.written += count  # only now, since the disk may have refused
 
 
 def main() -> int:
@@ -113,23 +114,30 @@ def main() -> int:
 
 def _serve(source: socket.socket) -> int:
     log: OrderedLog | None = None
-    error = ""
+    error, taken = "", 0
     try:
         request = json.loads(source.recv(65536))
         log = OrderedLog(Path(request["path"]), request["utc_offset_ns"])
         _say(source, {"error": ""})
         while packet := source.recv(MAX_BYTES + 1):
-            log.add(packet[0], unpack_frames(packet[1:]))
+            frames = unpack_frames(packet[1:])
+            taken += len(frames)
+            log.add(packet[0], frames)
     except FileExistsError:
         error = "exists already; take another name"
     except (OSError, DriverError) as found:
         error = getattr(found, "strerror", None) or str(found)
     if log is not None:
+        if error:  # what is left unread when the socket closes would hide the answer
+            with suppress(OSError, DriverError):
+                while packet := source.recv(MAX_BYTES + 1):
+                    taken += len(unpack_frames(packet[1:]))
         try:
             log.close()
         except OSError as found:
             error = error or found.strerror or str(found)
-    _say(source, {"error": error, "written": 0 if log is None else log.written})
+    written = 0 if log is None else log.written
+    _say(source, {"error": error, "written": written, "lost": taken - written})
     return 1 if error else 0
 
 

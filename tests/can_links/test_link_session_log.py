@@ -195,6 +195,8 @@ def test_what_the_disk_refuses_is_reported_and_holds_nobody_up(tmp_path: Path) -
     log.close()
     assert log.report is not None
     assert log.report.error == "File too large"
+    assert log.report.lost > 800  # 4096 bytes hold about a hundred lines
+    assert log.report.written + log.report.lost == 1000
 
 
 def test_a_replay_answers_each_sync_as_the_log_did_however_late_it_is(tmp_path: Path) -> None:
