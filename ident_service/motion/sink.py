@@ -10,6 +10,10 @@ from drivers.arm import Counts, Flags, Vector
 class Sink(Protocol):
     """Keeps the disk away from the loop."""
 
+    @property
+    def error(self) -> str:
+        """Why nothing is recorded any more; empty as long as something is, or nobody knows."""
+
     def put(
         self,
         stamp_ns: int,

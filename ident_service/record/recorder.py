@@ -68,6 +68,11 @@ class Recorder:
                 raise
             error.add_note(f"the recording failed too: {second}")
 
+    @property
+    def error(self) -> str:
+        """Why nothing is recorded any more, empty as long as something is."""
+        return "" if self._error is None else str(self._error)
+
     def put(
         self,
         stamp_ns: int,

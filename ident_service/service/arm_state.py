@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import json
-import time
 from pathlib import Path
 
-from ident_service.errors import UsageError
-from ident_service.results.files import write_atomically
+from ident_service.motion.fault_file import CONTROLS, FaultFile
 
 
 def arm_folder(state: Path, arm: str) -> Path:
@@ -17,7 +14,7 @@ def arm_folder(state: Path, arm: str) -> Path:
 
 def control_path(state: Path, arm: str) -> Path:
     """The arm's control file (`motion/control_file.py`)."""
-    return arm_folder(state, arm) / "control"
+    return arm_folder(state, arm) / CONTROLS
 
 
 def ticket_path(state: Path, arm: str) -> Path:
@@ -25,46 +22,6 @@ def ticket_path(state: Path, arm: str) -> Path:
     return arm_folder(state, arm) / "ticket.json"
 
 
-class FaultFile:
-    """Faults that ended runs, until a person acknowledges each by its name."""
-
-    def __init__(self, state: Path, arm: str) -> None:
-        self._arm = arm
-        self._path = arm_folder(state, arm) / "faults.json"
-
-    def latched(self) -> dict[str, str]:
-        """Cause by code, the earliest first.
-
-        Raises:
-            UsageError: the file was damaged by somebody.
-        """
-        try:
-            content = json.loads(self._path.read_text(encoding="utf-8"))
-            return {str(one["code"]): str(one["cause"]) for one in content["faults"]}
-        except FileNotFoundError:
-            return {}
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise UsageError(f"{self._path}: cannot be read ({error}); look at the arm, then remove the file") from None
-
-    def latch(self, code: str, cause: str) -> None:
-        """Remember a fault; one that is latched already keeps its first cause."""
-        self._write({**self.latched(), code: self.latched().get(code, cause)})
-
-    def acknowledge(self, code: str) -> str:
-        """Forget a fault; returns its cause.
-
-        Raises:
-            UsageError: no fault of this name is latched.
-        """
-        faults = self.latched()
-        if code not in faults:
-            known = ", ".join(faults) or "none"
-            raise UsageError(f"{self._arm}: no fault {code!r} is latched (latched: {known})")
-        cause = faults.pop(code)
-        self._write(faults)
-        return cause
-
-    def _write(self, faults: dict[str, str]) -> None:
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        rows = [{"code": code, "cause": cause, "written": time.time()} for code, cause in faults.items()]
-        write_atomically(self._path, json.dumps({"faults": rows}, indent=1) + "\n")
+def fault_file(state: Path, arm: str) -> FaultFile:
+    """The arm's faults, until a person acknowledges them (`motion/fault_file.py`)."""
+    return FaultFile(arm_folder(state, arm))

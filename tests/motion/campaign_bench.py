@@ -160,6 +160,10 @@ class _Both:
     def __init__(self, story: Story, recorder: Recorder) -> None:
         self._story, self._recorder = story, recorder
 
+    @property
+    def error(self) -> str:
+        return self._recorder.error
+
     def put(self, *arguments: Any) -> bool:
         self._story.put(*arguments)
         return self._recorder.put(*arguments)

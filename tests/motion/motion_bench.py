@@ -115,6 +115,7 @@ class Story:
     events: list[tuple[int, int, str]] = field(default_factory=list)
     misbehave: Callable[[int], bool] = lambda count: True
     at_event: Callable[[str], None] = lambda message: None
+    error: str = ""
 
     def put(
         self,
