@@ -22,11 +22,13 @@ import pytest
 from ident_service.cli import main
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.errors import DriverError, RecordingError
+from ident_service.record.mcap_file import McapRecording
 from ident_service.record.open import open_recording
 from ident_service.service.arm_state import fault_file
 from sim_backend.plant_status import PlantStatus, read_status
 
 PATIENCE = 90.0  # s of the machine's time; nothing is judged by it but what never happens
+STARTING = 4.0  # s that a run takes before it moves, about
 TAG = "IDENT_KILL_TAG"
 VICTIMS = {"parent": "ident_service", "recorder": "record.recorder_loop", "motion": "motion.process"}
 # What the next run is told of a victim that was killed while the arm moved.
@@ -75,7 +77,9 @@ def kills(seed: int, count: int, longest: float) -> list[Kill]:
     found = []
     for index in range(count):
         word = words[index // len(VICTIMS) % len(words)]
-        found.append(Kill(list(VICTIMS)[index % len(VICTIMS)], word, draw.random() * (4.0 if word is None else longest)))
+        found.append(
+            Kill(list(VICTIMS)[index % len(VICTIMS)], word, draw.random() * (4.0 if word is None else longest))
+        )
     return found
 
 
@@ -145,7 +149,7 @@ class Lane:
             assert process.returncode == 0, err
             assert json.loads((run / "ended.json").read_text())["state"] == "done"
             _check_manifest(run)
-            assert open_recording(run / "run.mcap").metadata["complete"] == "true"  # type: ignore[attr-defined]
+            assert McapRecording(run / "run.mcap").metadata["complete"] == "true"
 
     def kill(self, kill: Kill, capsys: pytest.CaptureFixture[str]) -> Outcome:
         """Kill somebody, and see to it that all is as it must be."""
@@ -168,7 +172,7 @@ class Lane:
             wait_for(lambda: not tagged(tag), f"{kill}: left behind: {tagged(tag)}")
         sockets = Path("/proc/net/unix").read_text()
         assert not any(f"ident-plant-{os.getuid()}-{one}-" in sockets for one in family)
-        assert not [name for name in os.listdir("/dev/shm") if "ident" in name]
+        assert not list(Path("/dev/shm").glob("*ident*"))  # noqa: S108 - looked at, not written
         if kill.victim == "parent":
             assert process.returncode == -signal.SIGKILL
         else:
@@ -221,11 +225,11 @@ class Lane:
         code, err = main(words), capsys.readouterr().err
         try:
             recording = open_recording(path, tuple(self.config.joints))
-            stamps = np.concatenate([block.stamp_ns for block in recording.blocks()])
         except RecordingError as error:
-            assert "no message on /joint_states" in str(error)
-            assert (code, err.count("\n")) == (1, 1), err
+            nothing = "no message on /joint_states" in str(error)
+            assert (nothing, code, err.count("\n")) == (True, 1, 1), err
             return 0, 0
+        stamps = np.concatenate([block.stamp_ns for block in recording.blocks()])
         if code == 0:
             assert ("torn" in err) == recording.torn, err
         else:

@@ -20,6 +20,7 @@ import pytest
 
 from ident_service.cli import main
 from ident_service.config.load import load_arm
+from ident_service.record.mcap_file import McapRecording
 from ident_service.record.open import open_recording
 from sim_backend.plant_status import read_status
 
@@ -114,7 +115,7 @@ def checked(arm: Path, state: Path) -> list[str]:
     return ["--state", str(state)]
 
 
-@pytest.mark.campaign
+@pytest.mark.slow
 def test_a_run_in_virtual_time_is_the_run_that_was_asked_for(virtual_arm: Path, tmp_path: Path) -> None:
     words = checked(virtual_arm, tmp_path / "state")
     assert main(["run", str(virtual_arm), "--out", str(tmp_path / "run"), *words]) == 0
@@ -124,9 +125,12 @@ def test_a_run_in_virtual_time_is_the_run_that_was_asked_for(virtual_arm: Path, 
     assert ended["state"] == "done"
     assert readable(tmp_path / "run") == ended["lateness"]["count"]
     assert 0 < ended["lateness"]["count"] <= ended["cycles"]
+    recording = open_recording(tmp_path / "run" / "run.mcap")
+    assert isinstance(recording, McapRecording)
+    assert recording.metadata["complete"] == "true"
 
 
-@pytest.mark.campaign
+@pytest.mark.slow
 def test_a_rehearsal_is_the_same_way_at_a_fifth_of_the_speed(virtual_arm: Path, tmp_path: Path) -> None:
     words = ["--out", str(tmp_path / "run"), *checked(virtual_arm, tmp_path / "state")]
     assert main(["rehearse", str(virtual_arm), *words]) == 0
