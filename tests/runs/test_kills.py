@@ -5,8 +5,6 @@ Some kills in virtual time for every change; random ones, seventy-two of them, b
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from kill_bench import REAL, Kill, Lane, Outcome, kills
@@ -34,27 +32,21 @@ def wam(tmp_path_factory: pytest.TempPathFactory) -> Lane:
     return Lane(tmp_path_factory.mktemp("kills") / "wam", "wam7_sim", "time: virtual")
 
 
-@pytest.fixture
-def noted(record_property: Callable[[str, object], None]) -> Callable[[Outcome], Outcome]:
-    """Keeps the figures of a kill in the report of the tests."""
-
-    def note(outcome: Outcome) -> Outcome:
-        record_property("samples", outcome.samples)
-        record_property("moved", outcome.moved)
-        record_property("unsaved_s", outcome.unsaved)
-        if outcome.status is not None:
-            record_property("rest_s", outcome.status.silent_time)
-            record_property("state", outcome.status.state.name)
-            record_property("speed", np.abs(outcome.status.velocity).max())
-        return outcome
-
-    return note
+def noted(kill: Kill, outcome: Outcome) -> Outcome:
+    """Prints the figures of a kill, for `pytest -rP`."""
+    status = outcome.status
+    rest = "no plant yet"
+    if status is not None:
+        speed = np.abs(status.velocity).max()
+        rest = f"{status.state.name} after {status.silent_time:.3f} s at {speed:.2e}"
+    print(f"kill: {kill} moved={outcome.moved} samples={outcome.samples} unsaved={outcome.unsaved:.3f} {rest}")
+    return outcome
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kill", [kills(1, 9, 0.5)[index] for index in (0, 1, 2, 4, 6, 8)], ids=str)
 def test_some_kills(kill: Kill, virtual: Lane, capsys: pytest.CaptureFixture[str]) -> None:
-    outcome = virtual.kill(kill, capsys)
+    outcome = noted(kill, virtual.kill(kill, capsys))
     assert outcome.status is None or outcome.status.came_to_rest
 
 
@@ -65,19 +57,15 @@ def test_an_arm_whose_runs_were_killed_runs(virtual: Lane) -> None:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("kill", kills(11, 36, 1.0), ids=str)
-def test_kills_in_virtual_time(
-    kill: Kill, virtual: Lane, noted: Callable[[Outcome], Outcome], capsys: pytest.CaptureFixture[str]
-) -> None:
-    outcome = noted(virtual.kill(kill, capsys))
+def test_kills_in_virtual_time(kill: Kill, virtual: Lane, capsys: pytest.CaptureFixture[str]) -> None:
+    outcome = noted(kill, virtual.kill(kill, capsys))
     assert outcome.status is None or outcome.status.came_to_rest
 
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("kill", kills(12, 27, 3.0), ids=str)
-def test_kills_in_real_time(
-    kill: Kill, real: Lane, noted: Callable[[Outcome], Outcome], capsys: pytest.CaptureFixture[str]
-) -> None:
-    outcome = noted(real.kill(kill, capsys))
+def test_kills_in_real_time(kill: Kill, real: Lane, capsys: pytest.CaptureFixture[str]) -> None:
+    outcome = noted(kill, real.kill(kill, capsys))
     assert outcome.status is None or outcome.status.came_to_rest
     if kill.victim == "recorder" and outcome.samples:
         assert outcome.unsaved <= LOST
@@ -85,10 +73,8 @@ def test_kills_in_real_time(
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("kill", kills(13, 9, 2.0), ids=str)
-def test_kills_of_an_arm_without_brakes(
-    kill: Kill, wam: Lane, noted: Callable[[Outcome], Outcome], capsys: pytest.CaptureFixture[str]
-) -> None:
-    status = noted(wam.kill(kill, capsys)).status
+def test_kills_of_an_arm_without_brakes(kill: Kill, wam: Lane, capsys: pytest.CaptureFixture[str]) -> None:
+    status = noted(kill, wam.kill(kill, capsys)).status
     if status is not None and not status.came_to_rest:
         assert status.state is PlantState.ENDED_MOVING
         limits = np.array([joint.velocity for joint in wam.config.joints.values()])

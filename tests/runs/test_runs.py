@@ -20,8 +20,13 @@ import pytest
 
 from ident_service.cli import main
 from ident_service.config.load import load_arm
+from ident_service.excitation.plan import excitation
+from ident_service.model.arm_model import arm_model
+from ident_service.motion.preflight_ticket import read_ticket
 from ident_service.record.mcap_file import McapRecording
 from ident_service.record.open import open_recording
+from ident_service.service.arm_state import fault_file, ticket_path
+from ident_service.service.run import run_motion
 from sim_backend.plant_status import read_status
 
 Command = "subprocess.Popen[str]"
@@ -128,6 +133,33 @@ def test_a_run_in_virtual_time_is_the_run_that_was_asked_for(virtual_arm: Path, 
     recording = open_recording(tmp_path / "run" / "run.mcap")
     assert isinstance(recording, McapRecording)
     assert recording.metadata["complete"] == "true"
+
+
+@pytest.mark.slow
+def test_a_machine_that_stalls_in_virtual_time_loses_no_lease(virtual_arm: Path, tmp_path: Path) -> None:
+    state = tmp_path / "state"
+    checked(virtual_arm, state)
+    config = load_arm(virtual_arm)
+    motion = excitation(arm_model(config), "identification")
+    ticket = read_ticket(ticket_path(state, config.name))
+    # Every switch between two processes is longer than this lease.
+    ran = run_motion(config, motion, tmp_path / "run", state, ticket, lease=1e-3)
+    assert ran.report["state"] == "done"
+
+
+@pytest.mark.campaign
+def test_a_parent_that_hangs_loses_its_lease(started: Started, tmp_path: Path) -> None:
+    started.reaches("exciting")
+    faults = fault_file(tmp_path / "state", "planar2")
+    started.process.send_signal(signal.SIGSTOP)
+    try:
+        wait_for(lambda: "lease_lost" in faults.latched())
+    finally:
+        started.process.send_signal(signal.SIGCONT)
+    code, _, err = started.end()
+    assert code == 4
+    assert err.startswith("ident: lease_lost: ")
+    assert set(faults.latched()) == {"lease_lost"}
 
 
 @pytest.mark.slow
