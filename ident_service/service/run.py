@@ -219,8 +219,10 @@ def _watched(
             process.stdin.close()  # nobody asks for this motion any more
             if controls is not None:
                 controls.ask_stop()
-            with suppress(subprocess.TimeoutExpired):
+            try:
                 process.wait(_LAST_WORDS)
+            except subprocess.TimeoutExpired:
+                process.kill()  # it hangs, and the drives have heard nothing for as long
             raise
         finally:
             if controls is not None:
