@@ -36,6 +36,9 @@ FAULT = {"parent": "lease_lost", "recorder": "recorder_behind", "motion": "motio
 MOTION = "{kind: seeded, seed: 1, base_frequency: 0.2, harmonics: 5, periods: 2}"
 # Drives that put up with a machine that stalls; what a watchdog does is tested in virtual time.
 REAL = "time: real, watchdog: 0.5, deadline: 2.0"
+# What a machine that stalls does to an arm in real time; a kill that this came before is played again.
+STALLS = {"late_cycles", "repeated_warnings", "bus_silent", "clock_jump", "driver", "drive_watchdog", "lease_lost"}
+TRIES = 6
 
 
 def tagged(tag: str) -> dict[int, str]:
@@ -83,6 +86,10 @@ def kills(seed: int, count: int, longest: float) -> list[Kill]:
     return found
 
 
+class StalledError(Exception):
+    """The machine was too busy for a run in real time."""
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What came of a kill.
@@ -91,7 +98,7 @@ class Outcome:
         moved: whether the arm had been taken, so that a fault was latched.
         status: the plant's last words, None when there was none yet.
         samples: that can be read.
-        unsaved: from the last of them to the kill [s]; of meaning in real time only.
+        unsaved: from the last of them to the kill [s], 0 without any and in virtual time.
     """
 
     moved: bool
@@ -112,6 +119,7 @@ class Lane:
             f"driver: {{process: separate, {driver}, status: {self._status}}}\n"
         )
         self.config = load_arm(self.arm)
+        self._real = "time: real" in driver
         self.faults = fault_file(self.state, self.config.name)
 
     def check(self) -> None:
@@ -119,7 +127,7 @@ class Lane:
         if time.monotonic() > self._expires:
             self._expires = time.monotonic() + 600.0
             words = ["check", str(self.arm), "--confirm", self.config.name, "--state", str(self.state)]
-            assert main(words) == 0
+            assert any(main(words) == 0 for _ in range(TRIES if self._real else 1))
 
     @contextmanager
     def started(self) -> Iterator[tuple[subprocess.Popen[str], str, Path]]:
@@ -153,14 +161,23 @@ class Lane:
 
     def kill(self, kill: Kill, capsys: pytest.CaptureFixture[str]) -> Outcome:
         """Kill somebody, and see to it that all is as it must be."""
+        for again in range(TRIES):
+            try:
+                return self._killed(kill, capsys)
+            except StalledError:
+                if not self._real or again + 1 == TRIES:
+                    raise
+        raise AssertionError
+
+    def _killed(self, kill: Kill, capsys: pytest.CaptureFixture[str]) -> Outcome:
         with self.started() as (process, tag, run):
             if kill.word is not None:
-                _reach(process, kill.word)
+                self._reach(process, kill)
             time.sleep(kill.delay)
 
             def doomed() -> int | None:
                 if process.poll() is not None:
-                    raise AssertionError(f"{kill}: the run ended first: {process.communicate()}")
+                    raise self._ended_first(process, kill)
                 if kill.victim == "parent":
                     return process.pid
                 return next((pid for pid, words in tagged(tag).items() if VICTIMS[kill.victim] in words), None)
@@ -187,7 +204,21 @@ class Lane:
         if kill.victim != "parent":
             assert "error" in json.loads((run / "ended.json").read_text())
             _check_manifest(run)
-        return Outcome(moved, status, samples, (killed_ns - last_ns) * 1e-9)
+        return Outcome(moved, status, samples, (killed_ns - last_ns) * 1e-9 if self._real and samples else 0.0)
+
+    def _reach(self, process: subprocess.Popen[str], kill: Kill) -> None:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if line.strip() == kill.word:
+                return
+        raise self._ended_first(process, kill)
+
+    def _ended_first(self, process: subprocess.Popen[str], kill: Kill) -> StalledError:
+        latched, said = self.faults.latched(), process.communicate()
+        for code in latched:
+            self.faults.acknowledge(code)
+        assert set(latched) & STALLS, f"{kill}: the run ended first: {said}"
+        return StalledError(f"{kill}: {latched}")
 
     def _at_rest(self) -> PlantStatus | None:
         """The plant has ended, at rest, and was never too fast nor too strong."""
@@ -204,6 +235,11 @@ class Lane:
     def _faults(self, kill: Kill, run: Path) -> bool:
         """What is latched says who was killed; a person acknowledges it. Whether there was something."""
         latched = self.faults.latched()
+        if self._real and not set(latched) <= {FAULT[kill.victim]}:
+            for code in latched:
+                self.faults.acknowledge(code)
+            assert set(latched) & STALLS, latched
+            raise StalledError(f"{kill}: {latched}")
         assert set(latched) <= {FAULT[kill.victim]}, latched
         if latched and kill.victim == "parent":  # nobody but the motion process was there to write it
             assert json.loads((run / "ended.json").read_text())["error"].startswith("lease_lost: ")
@@ -236,14 +272,6 @@ class Lane:
             assert err.startswith("ident: ")
             assert len([line for line in err.splitlines() if line.startswith("ident: ")]) == 1
         return len(stamps), int(stamps[-1])
-
-
-def _reach(process: subprocess.Popen[str], word: str) -> None:
-    assert process.stdout is not None
-    for line in process.stdout:
-        if line.strip() == word:
-            return
-    raise AssertionError(f"never {word}: {process.stderr.read() if process.stderr else ''}")
 
 
 def _check_manifest(run: Path) -> None:
