@@ -125,9 +125,9 @@ class Lane:
     def check(self) -> None:
         """Preflight, unless the last one still counts."""
         if time.monotonic() > self._expires:
-            self._expires = time.monotonic() + 600.0
             words = ["check", str(self.arm), "--confirm", self.config.name, "--state", str(self.state)]
             assert any(main(words) == 0 for _ in range(TRIES if self._real else 1))
+            self._expires = time.monotonic() + 600.0
 
     @contextmanager
     def started(self) -> Iterator[tuple[subprocess.Popen[str], str, Path]]:
