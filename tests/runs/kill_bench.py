@@ -221,14 +221,15 @@ class Lane:
         return StalledError(f"{kill}: {latched}")
 
     def _at_rest(self) -> PlantStatus | None:
-        """The plant has ended, at rest, and was never too fast nor too strong."""
+        """The plant's last words; it was never too strong nor, with the usual watchdog, too fast."""
         try:
             status = read_status(self._status)
         except DriverError:  # killed before there was one
             return None
         limits = self.config.joints.values()
-        assert status.ended
-        assert (np.abs(status.peak_velocity) < 1.3 * np.array([joint.velocity for joint in limits])).all()
+        assert status.ended, status
+        if not self._real:  # the wide watchdog of real time lets the last torque act for half a second
+            assert (np.abs(status.peak_velocity) < 1.3 * np.array([joint.velocity for joint in limits])).all(), status
         assert (np.abs(status.peak_torque) <= np.array([joint.torque for joint in limits]) + 1e-9).all()
         return status
 
