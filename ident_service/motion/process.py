@@ -105,6 +105,7 @@ def main() -> int:
     request = json.loads(line)
     os.set_blocking(sys.stdout.fileno(), False)
     code, answer = _ended(request)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # there is nothing left to stop
     with suppress(UsageError):  # the parent will find the same disk full
         write_ending(
             Path(request["folder"]), answer["report"] if "report" in answer else {"error": answer["error"]["message"]}
