@@ -96,7 +96,7 @@ class FaultFile:
                 pid, run = int(mark["pid"]), str(mark["run"])
             except (KeyError, TypeError, ValueError) as error:
                 raise self._damaged(self._mark, error) from None
-            found.setdefault(UNFINISHED, f"process {pid} died while it moved the arm, in the run {run}")
+            found.setdefault(UNFINISHED, f"process {pid} died while it had the arm, in the run {run}")
         return found
 
     def _rows(self) -> list[dict[str, Any]]:

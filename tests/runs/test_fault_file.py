@@ -48,7 +48,7 @@ def test_who_is_killed_while_the_arm_moves_leaves_a_fault(folder: Path) -> None:
     subprocess.run([sys.executable, "-c", KILLED, str(folder)], check=False)
     faults = FaultFile(folder)
     (cause,) = faults.latched().values()
-    assert cause.endswith("died while it moved the arm, in the run runs/7")
+    assert cause.endswith("died while it had the arm, in the run runs/7")
     with ControlFile.take(folder / CONTROLS, None), pytest.raises(MotionRefused, match="motion_process"):
         faults.began(Path("runs/8"))
     assert faults.acknowledge("motion_process") == cause
