@@ -36,6 +36,9 @@ FAULT = {"parent": "lease_lost", "recorder": "recorder_behind", "motion": "motio
 MOTION = "{kind: seeded, seed: 1, base_frequency: 0.2, harmonics: 5, periods: 2}"
 # Drives that put up with a machine that stalls; what a watchdog does is tested in virtual time.
 REAL = "time: real, watchdog: 0.5, deadline: 2.0"
+# A rate that a busy machine keeps, and gains that are stable at it.
+_GAINS = "{kp: 100, kd: 16, following_error: 0.4}"
+SLOW = f"control: {{rate: 50}}\njoints: {{shoulder: {_GAINS}, elbow: {_GAINS}}}\n"
 # What a machine that stalls does to an arm in real time; a kill that this came before is played again.
 STALLS = {"late_cycles", "repeated_warnings", "bus_silent", "clock_jump", "driver", "drive_watchdog", "lease_lost"}
 TRIES = 6

@@ -7,13 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from kill_bench import REAL, Kill, Lane, Outcome, kills
+from kill_bench import REAL, SLOW, Kill, Lane, Outcome, kills
 
 from sim_backend.plant_status import PlantState
 
-# A rate that a busy machine keeps, and gains that are stable at it.
-_GAINS = "{kp: 100, kd: 16, following_error: 0.4}"
-SLOW = f"control: {{rate: 50}}\njoints: {{shoulder: {_GAINS}, elbow: {_GAINS}}}\n"
 LOST = 0.2  # s of samples that may be lost with the recorder
 # Share of the velocity limit. The WAM has no brakes: its idle drives resist like friction, and a joint sinks as fast as
 # gravity drives it against them, the more slowly the nearer it is to hanging down. After a minute it at most creeps.
