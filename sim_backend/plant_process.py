@@ -39,7 +39,8 @@ from sim_backend.plant_status import PlantState
 from sim_backend.plant_story import PlantStory
 
 PATIENCE = 60.0  # simulated seconds that an abandoned arm is given; sinking against its brakes takes its time
-# rad/s or m/s. An arm without brakes sinks towards its lowest place ever more slowly; slower than this is at rest.
+# rad/s or m/s. An arm without brakes sinks as fast as gravity drives it against its idle drives, ever more slowly
+# towards its lowest place; slower than this counts as at rest. Near its highest place that may be before it sinks.
 REST_SPEED = 1e-2
 REST_TIME = 0.1  # simulated seconds that nothing may be faster
 _AT_ONCE = 100  # periods to make up for between two looks at the sockets

@@ -162,10 +162,10 @@ def _ask(arguments: argparse.Namespace) -> Answer:
 
 def _ack(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
-    from ident_service.service.arm_state import FaultFile
+    from ident_service.service.arm_state import fault_file
 
     name = load_arm(arguments.arm).name
-    cause = FaultFile(state_folder(arguments), name).acknowledge(arguments.fault)
+    cause = fault_file(state_folder(arguments), name).acknowledge(arguments.fault)
     return DONE, f"{name}: acknowledged {arguments.fault} ({cause})\n", {"arm": name, "acknowledged": arguments.fault}
 
 

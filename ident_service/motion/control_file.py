@@ -14,7 +14,8 @@ Every word is written by one side at a time and read whole. The loop reads memor
 can make it wait. Whoever moves the arm holds an exclusive lock on the file, which vanishes with the process: a second
 one is refused, and a file without a lock is nobody's.
 
-The lease is measured on the machine's clock, in virtual time too: it is about a process that lives, not about the arm.
+The lease is measured on the machine's clock: it is about a process that hangs, not about the arm. `lifeline.py` says
+when it counts.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from ident_service.errors import DriverError, UsageError
 
 _MAGIC, _VERSION, _SIZE = b"identctl", 1, 64
 _PID, _STOP, _PAUSE, _RENEWED, _LENGTH = 12, 16, 17, 24, 32
+_TRIES, _TRY_AGAIN = 20, 0.005  # s; who looks whether the file is in use holds it for a moment
 
 
 class ControlFile:
@@ -55,12 +57,10 @@ class ControlFile:
         """
         path.parent.mkdir(parents=True, exist_ok=True)
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        try:
-            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        if not _locked(fd):
             pid = _pid_in(fd)
             os.close(fd)
-            raise DriverError(f"the arm is in use by process {pid}; `ident stop` stops it") from None
+            raise DriverError(f"the arm is in use by process {pid}; `ident stop` stops it")
         os.ftruncate(fd, _SIZE)
         memory = mmap.mmap(fd, _SIZE)
         length = 0 if lease_seconds is None else round(lease_seconds * 1e9)
@@ -132,6 +132,33 @@ class ControlFile:
     ) -> None:
         """Close."""
         self.close()
+
+
+def in_use(path: Path) -> bool:
+    """Whether a process moves the arm whose control file this is."""
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return False
+    try:
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(fd)
+    return False
+
+
+def _locked(fd: int) -> bool:
+    """Take the exclusive lock, unless somebody keeps it."""
+    for again in range(_TRIES):
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            time.sleep(_TRY_AGAIN if again + 1 < _TRIES else 0.0)
+        else:
+            return True
+    return False
 
 
 def _pid_in(fd: int) -> int:

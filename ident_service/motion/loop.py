@@ -217,7 +217,7 @@ class Loop:
     def _lapse(self, stamp_ns: int) -> None:
         """The lease is lost; a stop that is under way already does not become a fault by it."""
         if self.states.state not in (State.STOPPING, State.STOPPED):
-            self._react(self.guard.findings.found("lease_lost", "the lease was not renewed in time"), stamp_ns)
+            self._react(self.guard.findings.found("lease_lost", "the lease has ended"), stamp_ns)
 
     def _record(self, sample: Sample, reference: Setpoint, compute_ns: int) -> Fault | None:
         try:
@@ -237,10 +237,9 @@ class Loop:
                     sample.lost,
                 )
             )
+            why = "" if kept else self.sink.error or "the recorder cannot keep up"
         except Exception as error:  # noqa: BLE001 - whatever a recorder died of, the arm must not fall for it
             why = f"the recorder failed ({error})"
-        else:
-            why = "" if kept else "the recorder cannot keep up"
         if not why or self.states.state in (State.STOPPING, State.STOPPED):
             return None
         return self.guard.findings.found("recorder_behind", why)

@@ -2,8 +2,9 @@
 
 It gets one JSON object on its standard input and says in lines of JSON on its standard output which state it enters and
 how the run ended; samples and story go through the ring to the recorder's process. It takes the arm's control file and
-holds its lock, so that `ident stop` reaches it whatever became of its parent; a parent that is gone lets the lease
-lapse, which stops the arm.
+holds its lock, so that `ident stop` reaches it whatever became of its parent. A parent that is gone has closed the
+standard input, and one that hangs lets the lease lapse: either stops the arm (`lifeline.py`). What is to be known
+afterwards does not need a parent: faults are latched, and the ending is written into the run folder, from here.
 
 A pipe that nobody reads must not make the loop wait: lines that do not fit are dropped.
 """
@@ -14,6 +15,7 @@ import json
 import os
 import signal
 import sys
+import traceback
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,16 +24,20 @@ from typing import Any
 import numpy as np
 
 from ident_service.config.schema import ArmConfig
-from ident_service.errors import ArmFault, IdentError, MotionRefused
+from ident_service.errors import ArmFault, IdentError, MotionRefused, UsageError
 from ident_service.excitation.excitation import excitation_from_json
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.control_file import ControlFile
+from ident_service.motion.ending import write_ending
 from ident_service.motion.factory import make_arm
+from ident_service.motion.fault_file import CONTROLS, FaultFile
 from ident_service.motion.histogram import Histogram
+from ident_service.motion.latch import Latch
+from ident_service.motion.lifeline import Lifeline
 from ident_service.motion.plans import Destination, Excite, GoTo, Plan
 from ident_service.motion.preflight_ticket import subject_of, ticket_from_json
 from ident_service.motion.realtime import ask
-from ident_service.motion.run import RunReport, follow
+from ident_service.motion.run import follow
 from ident_service.motion.states import State
 from ident_service.record.cycle import Cycle
 from ident_service.record.ring_sink import RingSink, SinkEnds
@@ -79,48 +85,60 @@ def main() -> int:
     """Do what standard input asks for; 0 when the run ended in DONE or STOPPED."""
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the terminal's Ctrl-C is for the parent, which asks for a stop
-    request = json.loads(sys.stdin.readline())
+    line = sys.stdin.readline()
+    if not line.endswith("\n"):
+        return 1  # whoever wanted to ask is gone already
+    request = json.loads(line)
     os.set_blocking(sys.stdout.fileno(), False)
-    try:
-        with ControlFile.take(Path(request["controls"]), request["lease"]) as controls:
-            signal.signal(signal.SIGTERM, lambda *_: controls.ask_stop())
-            say({"pid": os.getpid()})
-            report, sink, sentence = _moved(request, controls)
-    except ArmFault as fault:
-        return _ended({"kind": "ArmFault", "code": fault.code, "message": str(fault)}, 4)
-    except IdentError as error:
-        return _ended({"kind": type(error).__name__, "message": str(error)}, 1)
+    code, answer = _ended(request)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # there is nothing left to stop
+    with suppress(UsageError):  # the parent will find the same disk full
+        write_ending(
+            Path(request["folder"]), answer["report"] if "report" in answer else {"error": answer["error"]["message"]}
+        )
     os.set_blocking(sys.stdout.fileno(), True)
-    say(
-        {
-            "report": {
-                "state": report.state.value,
-                "cycles": report.cycles,
-                "peak_following_error": np.asarray(report.peak_following_error).tolist(),
-                "peak_torque": np.asarray(report.peak_torque).tolist(),
-                "warnings": report.warnings,
-                "real_time": sentence,
-                "lateness": sink.lateness.document(),
-                "compute": sink.compute.document(),
-            }
-        }
-    )
-    return 0
-
-
-def _ended(error: dict[str, str], code: int) -> int:
-    os.set_blocking(sys.stdout.fileno(), True)
-    say({"error": error})
+    say(answer)
     return code
 
 
-def _moved(request: dict[str, Any], controls: ControlFile) -> tuple[RunReport, TimedSink, str]:
+def _ended(request: dict[str, Any]) -> tuple[int, dict[str, Any]]:
+    """Do it; the exit code, and the last line for the parent."""
+    try:
+        with ControlFile.take(Path(request["arm_folder"]) / CONTROLS, request["lease"]) as controls:
+            signal.signal(signal.SIGTERM, lambda *_: controls.ask_stop())
+            say({"pid": os.getpid()})
+            return 0, {"report": _latching(request, controls)}
+    except ArmFault as fault:
+        return 4, {"error": {"kind": "ArmFault", "code": fault.code, "message": str(fault)}}
+    except IdentError as error:
+        return 1, {"error": {"kind": type(error).__name__, "message": str(error)}}
+    except Exception as error:  # noqa: BLE001 - a mistake of ours, too, has a message besides its traceback
+        traceback.print_exc()
+        return 1, {"error": {"kind": "ArmError", "message": f"the motion process failed: {error!r}"}}
+
+
+def _latching(request: dict[str, Any], controls: ControlFile) -> dict[str, Any]:
+    """Move the arm; whatever happens to this process or its parent, what went wrong is latched on the disk."""
+    faults, latch = FaultFile(Path(request["arm_folder"])), Latch()
+    faults.began(Path(request["folder"]))
+    try:
+        return _moved(request, controls, latch)
+    finally:
+        for fault in latch.faults:
+            faults.latch(fault.code, fault.cause)
+        faults.ended()
+
+
+def _moved(request: dict[str, Any], controls: ControlFile, latch: Latch) -> dict[str, Any]:
+    """The report, as JSON values."""
     config = ArmConfig.model_validate(request["config"])
     motion = None if request["excitation"] is None else excitation_from_json(request["excitation"])
     plan: Plan = GoTo(Destination(request["destination"])) if motion is None else Excite(motion, request["speed"])
     model = arm_model(config)
     arm = make_arm(config)
-    sink = TimedSink(RingSink(SinkEnds(*request["ends"]), request["recording"], lock_step=arm.clock.lock_step))
+    ring = RingSink(SinkEnds(*request["ends"]), request["recording"], lock_step=arm.clock.lock_step)
+    sink = TimedSink(ring)
+    lifeline = Lifeline(controls, sys.stdin.fileno(), lock_step=arm.clock.lock_step)
     # Last, so that everything it freezes and locks is loaded.
     sentence = "virtual time" if arm.clock.lock_step else ask().sentence()
     with arm:
@@ -130,8 +148,23 @@ def _moved(request: dict[str, Any], controls: ControlFile) -> tuple[RunReport, T
             raise MotionRefused(
                 f"the preflight ticket does not allow this: {'; '.join(why)}; `ident check` makes a new one"
             )
-        sink.event(arm.clock.now_ns(), 20, sentence)
-        return follow(arm, model, plan, sink, controls), sink, sentence
+        if not sink.event(arm.clock.now_ns(), 20, sentence):
+            raise MotionRefused(f"nothing would be recorded: {sink.error or 'the recorder cannot keep up'}")
+        if lifeline.cut:
+            raise MotionRefused("whoever asked for the motion is gone")
+        report = follow(arm, model, plan, sink, lifeline, latch=latch)
+    # A ring that is not closed is one whose writer died: its recording would be called incomplete.
+    ring.close()
+    return {
+        "state": report.state.value,
+        "cycles": report.cycles,
+        "peak_following_error": np.asarray(report.peak_following_error).tolist(),
+        "peak_torque": np.asarray(report.peak_torque).tolist(),
+        "warnings": report.warnings,
+        "real_time": sentence,
+        "lateness": sink.lateness.document(),
+        "compute": sink.compute.document(),
+    }
 
 
 if __name__ == "__main__":

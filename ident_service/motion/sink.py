@@ -10,6 +10,10 @@ from ident_service.record.cycle import Cycle
 class Sink(Protocol):
     """Keeps the disk away from the loop."""
 
+    @property
+    def error(self) -> str:
+        """Why nothing is recorded any more; empty as long as something is, or nobody knows."""
+
     def put(self, cycle: Cycle) -> bool:
         """Take one cycle; False when the sink cannot keep up."""
 

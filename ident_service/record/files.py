@@ -1,8 +1,10 @@
-"""What every reader asks of a file before it looks inside: that it is there, and its hash."""
+"""What every reader asks of a file before it looks inside: that it is there, and its hash; and writing one whole."""
 
 from __future__ import annotations
 
 import hashlib
+import os
+import secrets
 from pathlib import Path
 from typing import Final
 
@@ -32,3 +34,23 @@ def sha256(path: Path, size: int) -> str:
     except OSError as error:
         raise RecordingError(path, f"cannot be read: {error.strerror}") from error
     return digest.hexdigest()
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Write UTF-8 text under its final name only when all of it is on the disk.
+
+    Raises:
+        UsageError: the folder does not exist or cannot be written.
+    """
+    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
+    try:
+        with partial.open("x", encoding="utf-8") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
+        partial.replace(path)
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
+    finally:
+        # After the replacement there is none.
+        partial.unlink(missing_ok=True)

@@ -95,7 +95,7 @@ class Quality:
         """What a person should know, in words; empty for a good recording."""
         found = []
         if self.torn:
-            found.append("the file is torn; it was read up to there")
+            found.append(f"the file is torn; it was read up to {self.duration_s:.4g} s after its first sample")
         if self.gaps:
             longest = max(self.gaps, key=lambda gap: gap.duration_s)
             after = (longest.first_ns - self.first_ns) * 1e-9

@@ -10,26 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ident_service.errors import UsageError
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """Write UTF-8 text under its final name only when all of it is on the disk.
-
-    Raises:
-        UsageError: the folder does not exist or cannot be written.
-    """
-    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
-    try:
-        with partial.open("x", encoding="utf-8") as stream:
-            stream.write(text)
-            stream.flush()
-            os.fsync(stream.fileno())
-        partial.replace(path)
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
-    finally:
-        # After the replacement there is none.
-        partial.unlink(missing_ok=True)
+from ident_service.record.files import write_atomically as write_atomically  # what motion writes, too, appears whole
 
 
 def require_place(folder: Path) -> None:

@@ -18,10 +18,11 @@ from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError, MotionRefused, UsageError
 from ident_service.motion.control_file import ControlFile
 from ident_service.motion.factory import make_arm
+from ident_service.motion.fault_file import Remembered
 from ident_service.motion.loop import REST_SPEED
 from ident_service.motion.outside import outside, require_near
 from ident_service.motion.watch import Watched, watch
-from ident_service.service.arm_state import FaultFile, Remembered, control_path
+from ident_service.service.arm_state import control_path, fault_file
 
 LOOK = 0.3  # s
 AT_HOME = 0.05  # rad or m
@@ -71,7 +72,7 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None) -> Recovery:
         DriverError: nothing is installed that can reach such an arm.
     """
     limits = motion_limits(config)
-    faults = FaultFile(state, config.name).remembered()
+    faults = fault_file(state, config.name).remembered()
     mover = _mover(control_path(state, config.name))
     if mover is not None:
         stop_first = (

@@ -1,8 +1,8 @@
 """A run on an arm: recorder and motion each in a process of their own, watched from here, everything kept in a folder.
 
-This process holds the lease: it says twice a second that somebody is still there. Whatever ends it, the lease lapses
-and the motion process stops the arm by itself. The folder is there from the beginning and keeps what was recorded,
-whether the run ended well or not.
+This process holds the pipe and the lease of the motion process: what ends it closes the pipe, and what makes it hang
+lets the lease lapse; either stops the arm. The folder is there from the beginning and keeps what was recorded, whether
+the run ended well or not. How it ended is written by the motion process, and from here where that could not.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 import select
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -25,13 +26,15 @@ from ident_service.model.arm_model import arm_model
 from ident_service.model.urdf import urdf_text
 from ident_service.motion.control_file import ControlFile
 from ident_service.motion.controls import LEASE_SECONDS
+from ident_service.motion.ending import write_ending
 from ident_service.motion.factory import make_arm
+from ident_service.motion.fault_file import CONTROLS, UNFINISHED, FaultFile
 from ident_service.motion.plans import HOMING_SPEED, Destination
 from ident_service.motion.preflight_ticket import Ticket
 from ident_service.record.recorder_process import RecorderProcess
 from ident_service.results.files import write_atomically
 from ident_service.results.run_folder import write_manifest
-from ident_service.service.arm_state import FaultFile, control_path
+from ident_service.service.arm_state import arm_folder, fault_file
 from ident_service.service.preflight import write_ticket
 
 _RENEW_SHARE = 0.25  # of the lease
@@ -86,10 +89,8 @@ def run_motion(
         DriverError: the arm cannot be had.
         RecordingError: the recording failed, which has stopped the arm.
     """
-    faults = FaultFile(state, config.name)
-    if waiting := faults.latched():
-        words = "; ".join(f"{code} ({cause})" for code, cause in waiting.items())
-        raise MotionRefused(f"{config.name}: faults that nobody has acknowledged: {words}; `ident ack FAULT`")
+    faults = fault_file(state, config.name)
+    faults.require_none(faults.latched())
     if folder.exists():
         raise UsageError(f"{folder}: exists already; give a folder that does not")
     model = arm_model(config)
@@ -122,7 +123,8 @@ def run_motion(
         "excitation": excitation,
         "destination": None if isinstance(motion, Excitation) else motion.value,
         "recording": str(recording),
-        "controls": str(control_path(state, config.name)),
+        "folder": str(folder),
+        "arm_folder": str(arm_folder(state, config.name)),
         "lease": lease,
         "ticket": ticket.to_json(),
         "speed": speed,
@@ -131,12 +133,11 @@ def run_motion(
         with recorder:
             ending = _watched(request, astuple(recorder.ends), lease, tell, stop_requested)
             ending.raise_for(faults)
+    except BaseException as error:
+        write_ending(folder, {"error": str(error) or type(error).__name__})
+        raise
     finally:
-        if (error := sys.exception()) is not None:
-            write_atomically(folder / "ended.json", json.dumps({"error": str(error)}, indent=1) + "\n")
         write_manifest(folder)
-    write_atomically(folder / "ended.json", json.dumps(ending.report, indent=1) + "\n")
-    write_manifest(folder)
     return Ran(folder, ending.report)
 
 
@@ -155,14 +156,20 @@ class _Ending:
         kind, message = self.error.get("kind"), self.error.get("message", "")
         if kind == ArmFault.__name__:
             code = self.error["code"]
-            faults.latch(code, message)
             raise ArmFault(code, message.removeprefix(f"{code}: "))
         if kind is not None:
             raise _KINDS.get(kind, ArmError)(message)
-        faults.latch("motion_process", f"the motion process died (exit code {self.code})")
+        died = f"the motion process died without a word ({self._how()})"
+        if UNFINISHED not in faults.latched():
+            raise ArmError(f"{died} before it took the arm; nothing has moved")
         raise ArmFault(
-            "motion_process", f"died without a word (exit code {self.code}); the drives have stopped the arm"
+            UNFINISHED, f"{died}; drives that hear nothing stop by themselves: look at the arm before `ident ack`"
         )
+
+    def _how(self) -> str:
+        if self.code is not None and self.code < 0:
+            return signal.Signals(-self.code).name
+        return f"exit code {self.code}"
 
 
 def _watched(
@@ -205,20 +212,24 @@ def _watched(
                 if not ready:
                     continue
                 line = process.stdout.readline()
-                if not line:
+                if not line.endswith(b"\n"):  # the end, or what was killed in the middle of a word
                     break
                 said = json.loads(line)
                 if "pid" in said:
-                    controls = ControlFile.reach(Path(request["controls"]))
+                    with suppress(UsageError):  # it died at once, which is heard next
+                        controls = ControlFile.reach(Path(request["arm_folder"]) / CONTROLS)
                 if "state" in said:
                     tell(said["state"])
                 ending.report = said.get("report", ending.report)
                 ending.error = said.get("error", ending.error)
         except BaseException:
+            process.stdin.close()  # nobody asks for this motion any more
             if controls is not None:
                 controls.ask_stop()
-            with suppress(subprocess.TimeoutExpired):
+            try:
                 process.wait(_LAST_WORDS)
+            except subprocess.TimeoutExpired:
+                process.kill()  # it hangs, and the drives have heard nothing for as long
             raise
         finally:
             if controls is not None:

@@ -15,6 +15,7 @@ from cli.conftest import Commissioned, Ended, Ident, Samples, left_over, quick_a
 from ident_service import __version__
 from ident_service.cli import main
 from ident_service.config.load import shipped_arms
+from ident_service.record.open import open_recording
 from ident_service.results.parameter_file import read_parameters
 
 RUN_FILES = [
@@ -45,6 +46,36 @@ def test_simulate_prints_score_and_files(quick: Commissioned) -> None:
     assert all(f"  {name}\n" in quick.out for name in RUN_FILES)
     assert "score against the truth" in quick.out
     assert "planar2: 13 base parameters of 28 link parameters" in quick.out
+
+
+def test_identify_reads_a_torn_file_up_to_the_tear_and_says_where(
+    quick: Commissioned, tmp_path: Path, ident: Ident
+) -> None:
+    whole = (quick.folder / "identification.mcap").read_bytes()
+    torn = tmp_path / "run.mcap.partial"
+    torn.write_bytes(whole[: len(whole) * 7 // 10])
+    stamps = np.concatenate([block.stamp_ns for block in open_recording(torn).blocks()])
+    ended = ident("identify", torn, "--arm", quick.arm, "--out", tmp_path / "found", "--json")
+    assert ended.code == 0
+    assert ended.json["feasible"] is True
+    seconds = (stamps[-1] - stamps[0]) * 1e-9
+    assert 5.0 < seconds < 10.0
+    assert f"ident: {torn}: the file is torn; it was read up to {seconds:.4g} s after its first sample\n" in ended.err
+    (seen,) = json.loads((tmp_path / "found" / "parameters.json").read_text())["recording_quality"]
+    assert (seen["torn"], seen["samples"]) == (True, len(stamps))
+
+
+@pytest.mark.parametrize("size", [0, 4, 3000])
+def test_identify_refuses_what_is_torn_before_its_first_sample_in_one_sentence(
+    quick: Commissioned, tmp_path: Path, ident: Ident, size: int
+) -> None:
+    torn = tmp_path / "run.mcap.partial"
+    torn.write_bytes((quick.folder / "identification.mcap").read_bytes()[:size])
+    ended = ident("identify", torn, "--arm", quick.arm, "--out", tmp_path / "found")
+    assert ended.code == 1
+    assert ended.err.startswith(f"ident: {torn}: ")
+    assert ended.err.count("\n") == 1
+    assert not (tmp_path / "found").exists()
 
 
 def test_simulate_keeps_what_it_says(quick: Commissioned) -> None:
@@ -118,16 +149,6 @@ def test_identify_in_each_set(quick: Commissioned, ident: Ident, tmp_path: Path,
     ended = ident("identify", recording, "--arm", quick.arm, "--feasible-set", name, "--out", tmp_path / "out")
     assert ended.code == 0
     assert json.loads((tmp_path / "out" / "parameters.json").read_text())["feasible_set"] == name
-
-
-def test_a_torn_recording_is_read_up_to_the_tear(quick: Commissioned, ident: Ident, tmp_path: Path) -> None:
-    whole = (quick.folder / "identification.mcap").read_bytes()
-    torn = tmp_path / "torn.mcap"
-    torn.write_bytes(whole[: int(0.9 * len(whole))])
-    ended = ident("identify", torn, "--arm", quick.arm, "--out", tmp_path / "out", "--json")
-    assert ended.code == 0
-    assert f"ident: {torn}: the file is torn; it was read up to there\n" in ended.err
-    assert ended.json["feasible"] is True
 
 
 def test_base(ident: Ident) -> None:

@@ -160,6 +160,8 @@ class _Both:
     def __init__(self, story: Story, writer: RecordingWriter) -> None:
         self._story, self._writer = story, writer
 
+    error = ""
+
     def put(self, cycle: Cycle) -> bool:
         self._writer.sample(cycle)
         return self._story.put(cycle)

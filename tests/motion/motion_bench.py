@@ -119,6 +119,7 @@ class Story:
     events: list[tuple[int, int, str]] = field(default_factory=list)
     misbehave: Callable[[int], bool] = lambda count: True
     at_event: Callable[[str], None] = lambda message: None
+    error: str = ""
 
     def put(self, cycle: Cycle) -> bool:
         self.samples.append(cycle._asdict())

@@ -28,6 +28,16 @@ def test_a_recorder_that_is_behind_stops_the_arm(make: Callable[..., Bench]) -> 
     bench.stopped_under_control()
 
 
+def test_a_recorder_that_knows_why_says_why(make: Callable[..., Bench]) -> None:
+    bench = make()
+    bench.story.misbehave = lambda count: count < 850
+    bench.story.error = "the recorder's process died"
+    fault = bench.fault()
+    assert fault.code == "recorder_behind"
+    assert "the recorder's process died" in str(fault)
+    assert "cannot keep up" not in str(fault)
+
+
 def test_a_warning_does_not_hide_that_the_recorder_is_behind(make: Callable[..., Bench]) -> None:
     bench = make(Fault(LOOKED + 849, FaultKind.LOST_FEEDBACK, 0))
     bench.story.misbehave = lambda count: count != 850

@@ -5,19 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from kill_bench import REAL, SLOW
 
 from ident_service.config.load import shipped_arms
-
-# Watchdog and deadline are wide, because test machines stall; what they do is tested in virtual time.
-DRIVER = "{process: separate, time: real, status: %s, watchdog: 0.5, deadline: 2.0}"
 
 
 @pytest.fixture
 def real_arm(tmp_path: Path) -> Path:
-    """An arm in real time at 200 Hz, which any machine keeps."""
+    """An arm in real time, slow enough for a busy machine."""
     path = tmp_path / "real.yaml"
-    driver = DRIVER % (tmp_path / "plant.status")
-    path.write_text(f"extends: {shipped_arms()['planar2']}\ncontrol: {{rate: 200}}\ndriver: {driver}\n")
+    driver = f"{{process: separate, {REAL}, status: {tmp_path / 'plant.status'}}}"
+    path.write_text(f"extends: {shipped_arms()['planar2']}\n{SLOW}driver: {driver}\n")
     return path
 
 

@@ -18,7 +18,7 @@ from ident_service.config.load import load_arm, shipped_arms
 from ident_service.config.schema import ArmConfig
 from ident_service.motion.control_file import ControlFile
 from ident_service.motion.factory import make_arm
-from ident_service.service.arm_state import FaultFile, control_path
+from ident_service.service.arm_state import control_path, fault_file
 from ident_service.service.recover import Recovery, recover
 from sim_backend.arm import from_config
 from sim_backend.faults import Fault, FaultKind
@@ -104,7 +104,7 @@ def test_a_healthy_arm_at_home_only_needs_a_check(tmp_path: Path, state: Path) -
 
 def test_drives_are_reset_only_after_every_fault_is_acknowledged(tmp_path: Path, state: Path) -> None:
     config = config_with(tmp_path, more=LEVEL)
-    arm, faults = broken(config), FaultFile(state, config.name)
+    arm, faults = broken(config), fault_file(state, config.name)
     faults.latch("drive_fault", "elbow: the drive reports a fault")
     faults.latch("lease_lost", "the lease was not renewed in time")
     found = recover(config, state, arm)
@@ -186,7 +186,7 @@ def test_an_arm_that_does_not_answer_is_said_to(tmp_path: Path, state: Path) -> 
 
 
 def test_a_fault_keeps_its_first_cause_and_time(state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    faults = FaultFile(state, "arm")
+    faults = fault_file(state, "arm")
     for now, code, cause in ((1000.0, "one", "first"), (2000.0, "two", "second"), (3000.0, "one", "again")):
         monkeypatch.setattr("time.time", lambda now=now: now)
         faults.latch(code, cause)
@@ -235,7 +235,7 @@ def test_home_keeps_the_rules_of_a_run(ident: Callable[..., tuple[int, str]], tm
     code, said = ident("recover", "--leave-limit", "--out", str(tmp_path / "inside"))
     assert code == 3
     assert "nothing to leave" in said
-    FaultFile(state, "planar2").latch("following_error", "something pushed")
+    fault_file(state, "planar2").latch("following_error", "something pushed")
     code, said = ident("home", "--out", str(tmp_path / "again"))
     assert code == 3
     assert "following_error (something pushed)" in said

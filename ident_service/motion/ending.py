@@ -1,0 +1,20 @@
+"""How a run ended, as one file in its folder; without it, the run did not end but was killed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Final
+
+from ident_service.record.files import write_atomically
+
+ENDED: Final = "ended.json"
+
+
+def write_ending(folder: Path, document: dict[str, Any]) -> None:
+    """Write the report of a run that was stopped or done, or `{"error": MESSAGE}`; a later one replaces it.
+
+    Raises:
+        UsageError: the folder cannot be written.
+    """
+    write_atomically(folder / ENDED, json.dumps(document, indent=1) + "\n")

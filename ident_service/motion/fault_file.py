@@ -1,0 +1,145 @@
+"""The faults of one arm on the disk, until a person acknowledges each by its name.
+
+Whoever moves the arm writes down beforehand that it does (`moving.json`), and takes that back when the arm is without
+torque and every fault is in `faults.json`. What is killed in between, alone or with all its family, thus leaves a mark,
+and a mark without a process that holds the arm's control file is the fault `motion_process`.
+
+Boundary: files; the memory of faults within a run is `latch.py`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from ident_service.errors import MotionRefused, UsageError
+from ident_service.motion.control_file import in_use
+from ident_service.record.files import write_atomically
+
+CONTROLS: Final = "control"  # the arm's control file, in its folder
+UNFINISHED: Final = "motion_process"
+
+
+@dataclass(frozen=True)
+class Remembered:
+    """A fault that nobody has acknowledged.
+
+    Attributes:
+        code: its name.
+        cause: one plain sentence.
+        since: when it was latched [s since 1970 in UTC]; of a motion that was killed, when it began.
+    """
+
+    code: str
+    cause: str
+    since: float
+
+
+class FaultFile:
+    """Faults that ended runs of one arm."""
+
+    def __init__(self, folder: Path) -> None:
+        """`folder` of the arm, below the state folder; called like the arm."""
+        self._arm = folder.name
+        self._faults, self._mark, self._controls = folder / "faults.json", folder / "moving.json", folder / CONTROLS
+
+    def latched(self) -> dict[str, str]:
+        """Cause by code, the earliest first; raises as `remembered`."""
+        return {one.code: one.cause for one in self.remembered()}
+
+    def remembered(self) -> tuple[Remembered, ...]:
+        """All that is latched, the earliest first.
+
+        Raises:
+            UsageError: a file was damaged by somebody.
+        """
+        return self._remembered(moving=in_use(self._controls))
+
+    def began(self, run: Path) -> None:
+        """Write down that this process, which has taken the control file, is about to move the arm.
+
+        Args:
+            run: folder of the run.
+
+        Raises:
+            MotionRefused: a fault that nobody has acknowledged.
+            UsageError: a file was damaged by somebody, or cannot be written.
+        """
+        self.require_none({one.code: one.cause for one in self._remembered(moving=False)})
+        self._mark.parent.mkdir(parents=True, exist_ok=True)
+        mark = {"pid": os.getpid(), "run": str(run), "began": time.time()}
+        write_atomically(self._mark, json.dumps(mark, indent=1) + "\n")
+
+    def ended(self) -> None:
+        """Take that back: the arm is without torque, and what went wrong is latched."""
+        self._mark.unlink(missing_ok=True)
+
+    def require_none(self, faults: dict[str, str]) -> None:
+        """Raise MotionRefused, which names the faults, if there are any."""
+        if faults:
+            words = "; ".join(f"{code} ({cause})" for code, cause in faults.items())
+            raise MotionRefused(f"{self._arm}: faults that nobody has acknowledged: {words}; `ident ack FAULT`")
+
+    def latch(self, code: str, cause: str) -> None:
+        """Remember a fault; one that is latched already keeps its first cause.
+
+        Raises:
+            UsageError: the file was damaged by somebody, or cannot be written.
+        """
+        rows = self._rows()
+        if all(row.code != code for row in rows):
+            self._write((*rows, Remembered(code, cause, time.time())))
+
+    def acknowledge(self, code: str) -> str:
+        """Forget a fault; returns its cause.
+
+        Raises:
+            UsageError: no fault of this name is latched, or a file was damaged by somebody.
+        """
+        faults = self.latched()
+        if code not in faults:
+            known = ", ".join(faults) or "none"
+            raise UsageError(f"{self._arm}: no fault {code!r} is latched (latched: {known})")
+        self._write(tuple(row for row in self._rows() if row.code != code))
+        if code == UNFINISHED:
+            self.ended()
+        return faults[code]
+
+    def _remembered(self, *, moving: bool) -> tuple[Remembered, ...]:
+        rows = self._rows()
+        if moving or (mark := self._read(self._mark)) is None or any(row.code == UNFINISHED for row in rows):
+            return rows
+        try:
+            pid, run, began = int(mark["pid"]), str(mark["run"]), float(mark["began"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise self._damaged(self._mark, error) from None
+        return *rows, Remembered(UNFINISHED, f"process {pid} died while it had the arm, in the run {run}", began)
+
+    def _rows(self) -> tuple[Remembered, ...]:
+        content = self._read(self._faults)
+        try:
+            rows = [] if content is None else content["faults"]
+            return tuple(Remembered(str(row["code"]), str(row["cause"]), float(row["written"])) for row in rows)
+        except (KeyError, TypeError, ValueError) as error:
+            raise self._damaged(self._faults, error) from None
+
+    def _read(self, path: Path) -> Any:
+        """The JSON in a file, None without one."""
+        try:
+            return json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError) as error:
+            raise self._damaged(path, error) from None
+
+    def _damaged(self, path: Path, error: Exception) -> UsageError:
+        return UsageError(f"{path}: cannot be read ({error}); look at the arm, then remove the file")
+
+    def _write(self, faults: tuple[Remembered, ...]) -> None:
+        self._faults.parent.mkdir(parents=True, exist_ok=True)
+        rows = [{"code": one.code, "cause": one.cause, "written": one.since} for one in faults]
+        write_atomically(self._faults, json.dumps({"faults": rows}, indent=1) + "\n")

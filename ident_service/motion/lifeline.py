@@ -1,0 +1,50 @@
+"""Whether whoever asked for the motion is still there: a pipe that it holds, and the lease that it renews.
+
+The pipe ends with the process at its other end, however that dies, and within a cycle; so does the motion, in real and
+in virtual time. The lease is for one that lives but hangs. It is measured on the machine's clock, because that is where
+a process hangs, and counts in real time only: in lock step the arm's time waits for nobody but the plant and the
+recorder, seconds of it pass while the machine stalls for none, and a stall would be taken for a silence. No real arm
+moves in lock step.
+"""
+
+from __future__ import annotations
+
+import select
+
+from ident_service.motion.control_file import ControlFile
+
+
+class Lifeline:
+    """The loop's `Controls` in a process of its own."""
+
+    def __init__(self, controls: ControlFile, pipe: int, *, lock_step: bool) -> None:
+        """Take both.
+
+        Args:
+            controls: taken by this process.
+            pipe: readable end of the pipe that whoever asked for the motion holds open; a file or a device, too, which
+                never ends.
+            lock_step: whether the loop's clock waits (a clock's `lock_step`).
+        """
+        self._controls, self._lock_step = controls, lock_step
+        self._poll = select.poll()
+        self._poll.register(pipe, 0)  # nothing but its end
+
+    @property
+    def stop(self) -> bool:
+        """Whether the arm is to be brought to a controlled stop."""
+        return self._controls.stop
+
+    @property
+    def pause(self) -> bool:
+        """Whether the arm is to stand."""
+        return self._controls.pause
+
+    @property
+    def cut(self) -> bool:
+        """Whether the other end of the pipe is closed."""
+        return bool(self._poll.poll(0))
+
+    def lease_ok(self, now_ns: int) -> bool:
+        """Whether whoever asked for the motion is there; a system call that does not wait."""
+        return not self.cut and (self._lock_step or self._controls.lease_ok(now_ns))
