@@ -7,6 +7,7 @@ time too, and no thread is left when streaming begins. What else is heard meanwh
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from typing import Any
 
@@ -21,6 +22,8 @@ from drivers.canopen.words import abort_words
 from ident_service.errors import DriverError
 
 TIMEOUT = 0.3  # s for one reply
+# What the library logs as an error is in the errors raised here, or was tried again.
+logging.getLogger("canopen.sdo").setLevel(logging.CRITICAL)
 _ABORT = 0x80
 DOES_NOT_EXIST = (0x06020000, 0x06090011)
 READ_ONLY = (0x06010000, 0x06010002)

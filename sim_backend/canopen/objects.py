@@ -103,7 +103,7 @@ class Objects:
             DriverError: not an EDS, or types that the emulator does not have.
         """
         try:
-            dictionary: ObjectDictionary = eds.import_eds(io.StringIO(text), node)  # type: ignore[no-untyped-call]
+            dictionary: ObjectDictionary = eds.import_eds(io.StringIO(text), node)
         except Exception as error:  # noqa: BLE001 the library lets whatever its parser meets through
             raise DriverError(f"not an EDS: {error}") from None
         self.entries: dict[int, Entry] = {}
