@@ -236,6 +236,26 @@ def test_wrong_lengths_change_nothing() -> None:
     assert told(bus) == [(EventCode.WRONG_LENGTH, 1)] * 7
 
 
+def test_frames_that_canopen_does_not_have_are_not_taken_for_its_own() -> None:
+    bus = codec()
+    bus.begin_cycle()
+    for frame in (position(1, 5), status(1, 0x1637), Frame(0x701, b"\x05"), Frame(0x081, b"\x50\x82" + bytes(6))):
+        bus.receive(frame._replace(remote=True))
+        bus.receive(frame._replace(extended=True))
+    drive = bus.drives[0]
+    assert (drive.seen, drive.status, drive.nmt, drive.emergency) == (False, None, None, None)
+    assert bus.take_events() == []
+    assert bus.counters.ignored == 8
+
+
+def test_a_crowd_of_strangers_is_counted_but_not_remembered() -> None:
+    bus = codec()
+    for identifier in range(0x400, 0x500):
+        bus.receive(Frame(identifier, b""))
+    assert bus.counters.strangers == 0x100
+    assert len(bus.take_events()) == 64
+
+
 @st.composite
 def any_frame(draw: st.DrawFn) -> Frame:
     """Frames of ours, of others, torn, remote, extended and error frames."""
@@ -261,6 +281,7 @@ def stirred(bus: BusCodec, frames: list[Frame]) -> Iterator[list[Frame]]:
         yield bus.torque_frames(TORQUES)
 
 
+@pytest.mark.slow
 @settings(max_examples=500)
 @given(st.lists(any_frame(), min_size=20, max_size=20))
 @example([Frame(0x040, b"", error=True), Frame(0x081, b""), Frame(2**32 - 1, b"\xff" * 64, extended=True)])

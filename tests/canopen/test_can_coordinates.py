@@ -154,7 +154,7 @@ def test_the_scale_of_a_torque_is_what_the_motor_really_gives() -> None:
     assert weak.torque_limit[0] == pytest.approx(0.8 * 75.6)
 
 
-@given(st.integers(-(2**40), 2**40), st.integers(-(2**30), 2**30))
+@given(st.integers(-(2**40), 2**40), st.integers(-(2**31) + 1, 2**31 - 1))
 def test_positions_of_32_bits_come_round(before: int, step: int) -> None:
     now = before + step
     told = (now + 2**31) % 2**32 - 2**31
