@@ -130,7 +130,8 @@ class Injection:
         for drive in drives:
             frames = self._drive_changed(fault, drive, now_ns, begins=begins)
             self._faces[drive].motor.defects = self._defects(drive)
-            self._faces[drive].evaluate(now_ns)
+            if drive not in self._dead:
+                self._faces[drive].evaluate(now_ns)
             sent += self.on_the_way(drive, frames, now_ns)
         return sent
 

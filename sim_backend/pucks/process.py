@@ -194,3 +194,5 @@ class _Run:
                     self._emulator.inject([parse_fault(line, self._emulator.names)], now_ns)
                 except DriverError as error:
                     self._tell(f"not understood: {error}")
+        # A line must have had its effect before the next one is read.
+        self._pass_on(self._emulator.tick(now_ns))

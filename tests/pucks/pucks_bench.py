@@ -42,7 +42,7 @@ class Host:
     def __init__(self, link: Link, nodes: tuple[int, ...] = (1, 2)) -> None:
         self.link, self.nodes = link, nodes
         self.heard: list[Frame] = []
-        self.link.receive(self.link.clock.now_ns() + 5 * MS)
+        self.listen(5)
 
     @classmethod
     def on(cls, config: ArmConfig) -> Host:
