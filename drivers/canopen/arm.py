@@ -18,6 +18,7 @@ from contextlib import suppress
 import numpy as np
 
 from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector
+from drivers.canopen import dictionary as od
 from drivers.canopen.buses import Buses
 from drivers.canopen.codec import BusCodec, Drive
 from drivers.canopen.coordinates import Coordinates, coordinates, unwrapped
@@ -25,7 +26,7 @@ from drivers.canopen.enabling import Enabling, Resetting
 from drivers.canopen.events import axis_events
 from drivers.canopen.link import Link, open_links
 from drivers.canopen.lock import BusLock
-from drivers.canopen.profile import bus_profiles
+from drivers.canopen.profile import Write, bus_profiles
 from drivers.canopen.setup import Setup, configure, identify
 from drivers.canopen.words import DISABLE_VOLTAGE, QUICK_STOP, NmtCommand, axis_status
 from drivers.clock import Clock, RealClock
@@ -36,7 +37,7 @@ from ident_service.errors import DriverError
 
 LIMIT_SLACK = 0.05  # rad or m beyond the joints' limits that the drives keep by themselves
 _HEARTBEAT_CHECK = 10  # cycles between two looks at everybody's heartbeat
-_LOST_TORQUE = (0x8130, 0x8250)  # emergencies of a drive that heard nothing from us
+_FAREWELL = 5  # cycles after the last control words, in which drives say that they are off
 
 
 class CanopenArm(Arm):
@@ -65,6 +66,11 @@ class CanopenArm(Arm):
         self._joints_of = {k: joints for motors, joints in self._coordinates.groups for k in motors}
         self._drives_of = [
             next(motors for motors, joints in self._coordinates.groups if j in joints) for j in range(len(self._limits))
+        ]
+        joints = list(config.joints)
+        self._names = [
+            f"{' and '.join(joints[j] for j in self._joints_of[k])}: drive {drive.node}"
+            for k, drive in enumerate(config.driver.drives)
         ]
         self.clock: Clock = RealClock()
         self._buses: Buses | None = None
@@ -95,10 +101,9 @@ class CanopenArm(Arm):
                 self._locks = [BusLock(bus) for bus in self._driver.buses]
             buses = self._buses = Buses(self._profiles, self._open_bus(self._config), self._period_ns)
             self.clock = buses.clock
-            buses.boot()
+            buses.call()
             self._identities = tuple(self._configured(buses, number) for number in range(len(buses.drives)))
-            buses.command(NmtCommand.START)
-            buses.keep_alive()
+            buses.begin()
         except BaseException:
             self.close()
             raise
@@ -127,10 +132,11 @@ class CanopenArm(Arm):
         self._no_torque()
         self._streaming = True
         try:
-            self._through(buses, Enabling(buses.drives, self._driver.bring_up, self.clock.now_ns()))
+            self._through(buses, Enabling(buses.drives, self._names, self._driver.bring_up, self.clock.now_ns()))
         except BaseException:
             self.stop(StopKind.TORQUE_OFF)
             raise
+        buses.forget_events()  # of the states that drives went through
         self._enabled = True
 
     def reset(self) -> None:
@@ -142,7 +148,7 @@ class CanopenArm(Arm):
         buses = self._open()
         if self._enabled:
             raise DriverError("the arm is enabled; stop it before its faults are cleared")
-        self._through(buses, Resetting(buses.drives, self._driver.bring_up, self.clock.now_ns()))
+        self._through(buses, Resetting(buses.drives, self._names, self._driver.bring_up, self.clock.now_ns()))
 
     def exchange(self, torque: Vector | None) -> Sample:
         """One cycle, as the contract has it.
@@ -154,10 +160,9 @@ class CanopenArm(Arm):
         if torque is not None:
             if not self._enabled:
                 raise DriverError("a torque was given, but the arm is not enabled")
-            wanted = np.clip(np.asarray(torque, dtype=float), -self._limits, self._limits)
-            # Checked as it came: clipping hides an infinity.
             if np.shape(torque) != self._limits.shape or not np.isfinite(torque).all():
                 raise DriverError(f"{len(self._limits)} finite torques are needed, not {torque}")
+            wanted = np.clip(np.asarray(torque, dtype=float), -self._limits, self._limits)
             self._counts, _ = self._coordinates.torque_counts(wanted)
             self._acting = _frozen(self._coordinates.joint_torque(self._counts))
         # Enabled, an exchange that only looks is no torque frame: drives that count them must notice.
@@ -182,13 +187,25 @@ class CanopenArm(Arm):
         """Torque off, drives as they were powered up, buses free; any number of times."""
         self.stop(StopKind.TORQUE_OFF)
         if self._buses is not None:
-            with suppress(Exception):
-                self._buses.command(NmtCommand.RESET_COMMUNICATION)
+            self._leave(self._buses)
             self._buses.close()
         for lock in self._locks:
             lock.close()
         self._buses, self._locks = None, []
         self._streaming = False
+
+    def _leave(self, buses: Buses) -> None:
+        """Let drives that are off forget that a host will be missed; the others shall miss it. Never raises."""
+        with suppress(Exception):
+            for _ in range(_FAREWELL):
+                buses.cycle(self._counts if self._streaming else None)
+        for number, drive in enumerate(buses.drives):
+            off = drive.status is not None and not axis_status(drive.status) & AxisStatus.POWERED
+            if off and drive.answered:
+                with suppress(Exception):
+                    buses.objects(number).write(Write(od.ABORT_CONNECTION, 0))
+        with suppress(Exception):
+            buses.command(NmtCommand.ENTER_PRE_OPERATIONAL)
 
     def _open(self) -> Buses:
         if self._buses is None:
@@ -261,7 +278,7 @@ class CanopenArm(Arm):
             events = codec.take_events()
             if events:
                 joints = {self._driver.drives[k].node: self._joints_of[k][0] for k in codec.profile.drives}
-                found += axis_events(events, codec.controller, joints, codec.profile.bus.channel)
+                found += axis_events(events, codec, joints)
             if self._cycle % _HEARTBEAT_CHECK == 0:
                 found += self._missed(codec)
         return found
@@ -298,9 +315,8 @@ def _status(drives: Sequence[Drive]) -> int:
     """Of a joint: powered when all its drives are, in trouble when one of them is."""
     powered, trouble = True, AxisStatus(0)
     for drive in drives:
-        word = AxisStatus(0) if drive.status is None else axis_status(drive.status)
-        if drive.emergency is not None and drive.emergency.code in _LOST_TORQUE:
-            word |= AxisStatus.WATCHDOG
+        error = 0 if drive.emergency is None else drive.emergency.code
+        word = AxisStatus(0) if drive.status is None else axis_status(drive.status, error)
         powered = powered and bool(word & AxisStatus.POWERED)
         trouble |= word & ~AxisStatus.POWERED
     return int(trouble | (AxisStatus.POWERED if powered else 0))

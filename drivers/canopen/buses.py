@@ -14,15 +14,18 @@ from contextlib import suppress
 
 from drivers.canopen.codec import BusCodec, Drive
 from drivers.canopen.dictionary import CST
+from drivers.canopen.frame import Frame
 from drivers.canopen.link import Link
-from drivers.canopen.profile import BusProfile
-from drivers.canopen.sdo import Objects
+from drivers.canopen.profile import SDO_REPLY, SDO_REQUEST, BusProfile
+from drivers.canopen.sdo import TIMEOUT, Objects
 from drivers.canopen.words import NmtCommand, NmtState
 from drivers.clock import Clock
 from ident_service.errors import DriverError
 
 RECEIVE = 0.97  # of a period, within which a position counts for its cycle (FIELDBUS.md: the last is on the wire then)
-BOOT = 2.0  # s within which a drive that was reset must have booted
+AWAKE = 2.0  # s within which every drive must answer
+SETTLED = 5  # cycles in a row with everybody's position before an arm counts as open
+_ASK = bytes([0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0])  # SDO upload of the device type, which every node has
 
 
 class Buses:
@@ -85,27 +88,66 @@ class Buses:
         """Of the bus that a drive is on."""
         return self._at[number][0].profile
 
-    def boot(self) -> None:
-        """Bring every drive to its power-on communication state, and wait until all have said so.
+    def call(self) -> None:
+        """Bring every drive to the NMT state in which it is configured, and wait until all of them answer.
+
+        A drive that was just switched on may still boot, one whose last host died may be operational. Communication is
+        not reset: by CiA 402 that is a lost connection, which a drive may answer with a fault (6007h).
 
         Raises:
-            DriverError: some do not; the message names them.
+            DriverError: some do not answer; the message names them.
         """
         for link in self._links:
             link.drain()
-        self.command(NmtCommand.RESET_COMMUNICATION)
-        deadline = self.clock.now_ns() + round(BOOT * 1e9)
-        for codec, link in self._pairs:
-            while not all(drive.boots for drive in codec.drives):
-                frame = link.receive(deadline)
-                if frame is None:
-                    break
-                codec.receive(frame)
-            codec.take_events()
-        if missing := ", ".join(str(drive.node) for drive in self.drives if not drive.boots):
+        self.command(NmtCommand.ENTER_PRE_OPERATIONAL)
+        missing = {drive.node for drive in self.drives}
+        last = self.clock.now_ns() + round(AWAKE * 1e9)
+        while missing and (now_ns := self.clock.now_ns()) < last:
+            for codec, link in self._pairs:
+                asked = missing & set(codec.profile.nodes)
+                for node in sorted(asked):
+                    link.send(Frame(SDO_REQUEST + node, _ASK))
+                again = now_ns + round(TIMEOUT * 1e9)
+                while asked and (frame := link.receive(again)) is not None:
+                    asked.discard(frame.identifier - SDO_REPLY)
+                    codec.receive(frame)
+                missing -= set(codec.profile.nodes) - asked
+        if missing:
+            nodes = ", ".join(map(str, sorted(missing)))
             raise DriverError(
-                f"no answer of drives {missing} within {BOOT:g} s; check power, cable and bit rate (`ident bus scan`)"
+                f"no answer of drives {nodes} within {AWAKE:g} s; check power, cable and bit rate (`ident bus scan`)"
             )
+
+    def begin(self) -> None:
+        """Drives and host are configured: let PDOs flow until all drives say so and their positions come in time.
+
+        Everybody reports his state at first, which takes the bus longer than a cycle.
+
+        Raises:
+            DriverError: some do not get there.
+        """
+        self.command(NmtCommand.START)
+        for drive in self.drives:
+            drive.nmt = None
+        slowest = max(codec.profile.heartbeat_drives for codec in self.codecs)
+        last = self.clock.now_ns() + round((AWAKE + slowest) * 1e9)
+        settled = 0
+        while settled < SETTLED:
+            if self.clock.now_ns() > last:
+                bad = [drive.node for drive in self.drives if drive.nmt != NmtState.OPERATIONAL or not drive.answered]
+                raise DriverError(
+                    f"drives {', '.join(map(str, bad)) or 'of all kinds'} do not answer every SYNC in time"
+                )
+            self.cycle(None)
+            there = all(drive.nmt == NmtState.OPERATIONAL and drive.answered for drive in self.drives)
+            settled = settled + 1 if there else 0
+        self.forget_events()
+
+    def forget_events(self) -> None:
+        """What happened until now was expected, or has been told otherwise."""
+        for codec in self.codecs:
+            codec.take_events()
+        self.lost = 0
 
     def cycle(self, counts: Sequence[int] | None) -> int:
         """Wait for the next cycle and make it.

@@ -23,15 +23,16 @@ _FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION)
 class Enabling:
     """From switched off to `operation enabled`."""
 
-    def __init__(self, drives: Sequence[Drive], step: float, now_ns: int) -> None:
+    def __init__(self, drives: Sequence[Drive], names: Sequence[str], step: float, now_ns: int) -> None:
         """Begin.
 
         Args:
             drives: of all buses, as their codecs know them.
+            names: what people call them.
             step: how long all drives together may take for one step [s].
             now_ns: of the link's clock.
         """
-        self._drives = drives
+        self._drives, self._names = drives, names
         self._step_ns = round(step * 1e9)
         self._deadline_ns = now_ns + self._step_ns
         self._target = 0
@@ -50,7 +51,7 @@ class Enabling:
             DriverError: a drive has a fault, or the step's time is over; who, and why as far as it is known.
         """
         if bad := [drive for drive in self._drives if drive.state in _FAULTS]:
-            raise DriverError(f"{'; '.join(map(_told, bad))}; only a reset clears it (`ident recover`)")
+            raise DriverError(f"{_told(self._drives, self._names, bad)}; only a reset clears it (`ident recover`)")
         fresh = all(drive.answered for drive in self._drives)
         self._seeded = self._seeded + 1 if fresh else 0
         while not self.done and self._reached():
@@ -63,7 +64,7 @@ class Enabling:
         if now_ns > self._deadline_ns:
             late = [drive for drive in self._drives if not self._there(drive)] or list(self._drives)
             raise DriverError(
-                f"not {_WAY[self._target]} within {self._step_ns * 1e-9:g} s: {'; '.join(map(_told, late))}"
+                f"not {_WAY[self._target]} within {self._step_ns * 1e-9:g} s: {_told(self._drives, self._names, late)}"
             )
         words = []
         for number, drive in enumerate(self._drives):
@@ -86,9 +87,9 @@ class Enabling:
 class Resetting:
     """Out of the state `fault`: a rising edge of bit 7, nothing else; the drives stay off."""
 
-    def __init__(self, drives: Sequence[Drive], step: float, now_ns: int) -> None:
+    def __init__(self, drives: Sequence[Drive], names: Sequence[str], step: float, now_ns: int) -> None:
         """Begin; arguments as for `Enabling`."""
-        self._drives = drives
+        self._drives, self._names = drives, names
         self._deadline_ns = now_ns + round(step * 1e9)
         self._edge: dict[int, int] = {}
 
@@ -103,7 +104,7 @@ class Resetting:
             return []
         if now_ns > self._deadline_ns:
             kept = [drive for drive in self._drives if drive.state in (*_FAULTS, DriveState.UNKNOWN)]
-            raise DriverError(f"the cause is still there: {'; '.join(map(_told, kept))}")
+            raise DriverError(f"the cause is still there: {_told(self._drives, self._names, kept)}")
         words = []
         for number, drive in enumerate(self._drives):
             if drive.state is DriveState.FAULT:
@@ -114,8 +115,13 @@ class Resetting:
         return words
 
 
-def _told(drive: Drive) -> str:
-    if drive.status is None:
-        return f"node {drive.node} has told no status word"
-    words, last = f"node {drive.node} is {drive.state}", drive.emergency
-    return words if last is None else f"{words} ({emergency_words(last.code, last.register, last.vendor)})"
+def _told(drives: Sequence[Drive], names: Sequence[str], chosen: Sequence[Drive]) -> str:
+    """What some of the drives say."""
+    words = []
+    for name, drive in zip(names, drives, strict=True):
+        if drive in chosen:
+            last = drive.emergency
+            why = "" if last is None else f" ({emergency_words(last.code, last.register, last.vendor)})"
+            says = "has told no status word" if drive.status is None else f"is in the state {drive.state}{why}"
+            words.append(f"{name} {says}")
+    return "; ".join(words)

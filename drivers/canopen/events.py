@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from drivers.canopen.codec import HOST, Event, EventCode
+from drivers.canopen.codec import HOST, BusCodec, Event, EventCode
 from drivers.canopen.controller import ControllerState
+from drivers.canopen.words import NmtState
 from drivers.status import AxisEvent, AxisEventCode
 
 _CODES: dict[EventCode, AxisEventCode] = {
@@ -26,33 +27,31 @@ _CODES: dict[EventCode, AxisEventCode] = {
     EventCode.BUS_ERROR: AxisEventCode.STRANGE_FRAME,
 }
 # Emergencies of a drive that is in trouble with the bus itself (CiA 301, table 26).
-_ERROR_PASSIVE = 0x8120
+_ERROR_PASSIVE = "8120h"
+_CONTROLLER = {ControllerState.BUS_OFF: AxisEventCode.BUS_OFF, ControllerState.PASSIVE: AxisEventCode.BUS_DEGRADED}
 
 
-def axis_events(
-    events: Iterable[Event], controller: ControllerState, joint_of: Mapping[int, int], bus: str
-) -> list[AxisEvent]:
+def axis_events(events: Iterable[Event], codec: BusCodec, joint_of: Mapping[int, int]) -> list[AxisEvent]:
     """Translate the events of one bus.
 
     Args:
-        events: as the codec tells them. States of drives and errors that were reset are not among the results.
-        controller: the host's, now.
+        events: as the codec tells them. States of drives, errors that were reset and a return to normal are not among
+            the results.
+        codec: of the bus.
         joint_of: first joint that each node moves.
-        bus: its name, for events that are of no drive.
     """
+    bus = codec.profile.bus.channel
+    operational = {drive.node for drive in codec.drives if drive.nmt == NmtState.OPERATIONAL}
     found = []
     for event in events:
-        if event.code is EventCode.CONTROLLER:
-            if controller is ControllerState.BUS_OFF:
-                found.append(AxisEvent(AxisEventCode.BUS_OFF, None, f"{bus}: {event.words}"))
-            elif controller is ControllerState.PASSIVE:
-                found.append(AxisEvent(AxisEventCode.BUS_DEGRADED, None, f"{bus}: {event.words}"))
-            continue
         code = _CODES.get(event.code)
-        if code is None:
-            continue
-        if event.code is EventCode.EMERGENCY and event.words.startswith(f"{_ERROR_PASSIVE:04X}h"):
+        if event.code is EventCode.CONTROLLER:
+            code = _CONTROLLER.get(codec.controller)
+        elif event.code is EventCode.EMERGENCY and event.words.startswith(_ERROR_PASSIVE):
             code = AxisEventCode.BUS_DEGRADED
-        words = f"{bus}: {event.words}" if event.node == HOST else f"node {event.node}: {event.words}"
-        found.append(AxisEvent(code, joint_of.get(event.node), words))
+        elif event.code is EventCode.NMT_STATE and event.node in operational:
+            code = None
+        if code is not None:
+            words = f"{bus}: {event.words}" if event.node == HOST else f"node {event.node}: {event.words}"
+            found.append(AxisEvent(code, joint_of.get(event.node), words))
     return found

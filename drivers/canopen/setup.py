@@ -17,7 +17,6 @@ from ident_service.errors import DriverError
 
 _DRIVE_PROFILE = 402  # low word of 1000h
 _FIRMWARE = 0x100A
-_PATIENCE = 5  # requests without an answer before a drive that has booted counts as deaf
 _IDENTITY = {"vendor": od.VENDOR, "product": od.PRODUCT, "revision": od.REVISION, "serial": od.SERIAL}
 
 
@@ -73,7 +72,7 @@ def identify(objects: Objects, wanted: DriveIdentity) -> str:
     Raises:
         DriverError: it does not answer, is no drive, or not the one that the configuration names.
     """
-    kind = _awake(objects)
+    kind = objects.read(od.DEVICE_TYPE)
     if kind & 0xFFFF != _DRIVE_PROFILE:
         raise DriverError(f"node {objects.node}: is no drive of CiA 402 (1000h is {kind:08X}h)")
     found = {}
@@ -101,18 +100,6 @@ def identify(objects: Objects, wanted: DriveIdentity) -> str:
         firmware = "not told"
     words = ", ".join(f"{name} {value:08X}h" for name, value in found.items())
     return f"node {objects.node}: {words}, firmware {firmware}"
-
-
-def _awake(objects: Objects) -> int:
-    """Device type of a drive that may still be booting: what it sent as it was powered is told from nothing else."""
-    for _ in range(_PATIENCE):
-        try:
-            return objects.read(od.DEVICE_TYPE)
-        except SdoRefused:
-            raise
-        except DriverError:
-            continue
-    return objects.read(od.DEVICE_TYPE)
 
 
 def configure(objects: Objects, setup: Setup) -> None:
