@@ -13,6 +13,7 @@ from ident_service.motion.pause import Paused, Resumed
 from ident_service.motion.reference import Reference, Setpoint
 from ident_service.motion.states import MOVING, STOPPABLE, State, States
 from ident_service.motion.stop import stop
+from ident_service.motion.surroundings import Surroundings
 
 _FOLLOWER = {State.APPROACHING: State.EXCITING, State.EXCITING: State.RETURNING, State.RETURNING: State.DONE}
 
@@ -25,7 +26,13 @@ class Course:
     """
 
     def __init__(
-        self, states: States, ways: Sequence[Reference], start: Setpoint, limits: MotionLimits, resuming: MotionLimits
+        self,
+        states: States,
+        ways: Sequence[Reference],
+        start: Setpoint,
+        limits: MotionLimits,
+        resuming: MotionLimits,
+        surroundings: Surroundings | None = None,
     ) -> None:
         """Plan to move.
 
@@ -35,10 +42,11 @@ class Course:
             start: where the arm stands.
             limits: of the arm, for stops and pauses.
             resuming: of ways out of pauses.
+            surroundings: what ways out of pauses must keep clear of.
         """
         self.reference = start
         self._states = states
-        self._limits, self._resuming = limits, resuming
+        self._limits, self._resuming, self._surroundings = limits, resuming, surroundings
         self._way, *self._later = ways
         self._begin_ns: int | None = None
         self._left = State.APPROACHING  # what a pause interrupts
@@ -93,7 +101,7 @@ class Course:
         """The arm rests at the end of a pause's stop: it is paused, and the way back can be looked for."""
         self._states.enter(State.PAUSED)
         if self._paused is not None:
-            self._search = self._paused.resume_in_slices(self._resuming)
+            self._search = self._paused.resume_in_slices(self._resuming, self._surroundings)
 
     def look_for_way_back(self) -> str | None:
         """While paused, one slice of the search for the way back; why there is none, when that turns out."""

@@ -17,7 +17,7 @@ from ident_service.errors import ArmFault, DriverError, MotionRefused
 from ident_service.excitation.demands import require_within_limits
 from ident_service.excitation.excitation import Excitation
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.outline import Outline
+from ident_service.model.contact import Contact
 from ident_service.model.rigid_body import InverseDynamics
 from ident_service.motion.control import ComputedTorque
 from ident_service.motion.controls import Controls, StopWhen
@@ -27,12 +27,13 @@ from ident_service.motion.faults import FAULTS, HOLD
 from ident_service.motion.guard import Guard
 from ident_service.motion.latch import Latch
 from ident_service.motion.loop import REST_CYCLES, REST_SPEED, Loop, Peaks
+from ident_service.motion.owed import owed_ways
 from ident_service.motion.reference import PathReference, Reference, rest
 from ident_service.motion.sink import Sink as Sink
 from ident_service.motion.speed import Slowed, require_factor, slowed_limits
 from ident_service.motion.states import LAWFUL, State, States
 from ident_service.motion.stop import require_stops_within_limits
-from ident_service.motion.surroundings import require_clear
+from ident_service.motion.surroundings import Surroundings, require_clear
 from ident_service.motion.way import calm_way
 
 _INFO: Final = 20  # level of rcl_interfaces/msg/Log
@@ -155,8 +156,10 @@ class _Run:
         home = sample.position.copy()
         ways = self._ways(home, limits)
         require_clear(model, self.excitation.path, [ways[0], ways[-1]], limits)
-        guard = Guard(chain.names, limits, period, home, revolute=chain.revolute, outline=Outline(model, model.prior))
         dynamics = InverseDynamics(chain, model.layout, model.prior)
+        owed = owed_ways(dynamics, model, limits, period, described.position_resolution)
+        contact = Contact(model)
+        guard = Guard(chain.names, limits, period, home, revolute=chain.revolute, contact=contact, owed=owed)
         control = ComputedTorque(dynamics, limits, period, model.config.control.velocity_cutoff, home)
         torque, cannot_hold = guard.torque(control.torque(home, sample.valid, rest(home)))
         if cannot_hold is not None:
@@ -166,7 +169,14 @@ class _Run:
             arm,
             guard,
             control,
-            Course(self.states, ways, rest(home), limits, slowed_limits(limits, self.speed)),
+            Course(
+                self.states,
+                ways,
+                rest(home),
+                limits,
+                slowed_limits(limits, self.speed),
+                Surroundings(model, limits),
+            ),
             self.states,
             Deadlines(guard.findings, period),
             self.controls,

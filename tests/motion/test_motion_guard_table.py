@@ -11,7 +11,7 @@ from motion_bench import bench_model
 
 from drivers.arm import StopKind
 from drivers.status import AxisStatus
-from ident_service.model.outline import Outline
+from ident_service.model.contact import Contact
 from ident_service.motion.checks import (
     ENVELOPE,
     ENVELOPE_SLACK,
@@ -312,8 +312,7 @@ def workspace_guard() -> Bench:
     workspace = {"obstacles": {"floor": {"half_space": {"normal": (0.0, 1.0, 0.0), "offset": -0.5}}}}
     workspace["inside"] = {"x": (-0.5, 1.2)}
     model = bench_model(geometry=bodies, workspace=workspace)
-    assert model.prior is not None
-    return Bench(outline=Outline(model, model.prior))
+    return Bench(contact=Contact(model))
 
 
 @pytest.mark.parametrize(("angle", "deep"), [(-0.4, False), (-0.5, True)])
@@ -326,7 +325,7 @@ def test_the_arm_stays_in_its_space(angle: float, deep: bool) -> None:
     assert (fault is not None) == deep
     if fault is not None:
         assert (fault.code, fault.reaction) == ("workspace", STOP)
-        assert fault.message.startswith("elbow - obstacle floor: 0.02943 m too deep: ")
+        assert fault.message.startswith("elbow - obstacle floor: touch, 0.02943 m deep: ")
 
 
 def test_a_lost_axis_is_where_it_was_last_seen() -> None:
@@ -335,7 +334,6 @@ def test_a_lost_axis_is_where_it_was_last_seen() -> None:
     is_fault(bench.see(HOME, valid=(True, False))[1], "lost_feedback")
 
 
-def test_without_planes_nothing_is_looked_at() -> None:
+def test_without_bodies_nothing_is_looked_at() -> None:
     model = bench_model()
-    assert model.prior is not None
-    assert Bench(outline=Outline(model, model.prior)).see(HOME)[1] is None
+    assert Bench(contact=Contact(model)).see(HOME)[1] is None

@@ -1,0 +1,104 @@
+"""How far joints whose positions stand still to the last bit would have moved if nothing but dry friction held them.
+
+Behind a light joint a small torque makes a large speed before a push that is large for the drive is reached, so what is
+asked is not how hard a joint is pushed but what the push must have done. Dry friction f holds a joint that stands still
+within `[-f, f]`, so the correction (`control.py`) can change by `2 f` from the `c_0` with which the position last
+changed before the joint must move; one that was sliding is held by `f` already, and a change that pushes it on in its
+direction moves it, but for what friction is larger at rest. With the allowance b of the one case or the other
+
+    dv = max(|c - c_0| - b, 0) / M_jj(q) dt          dd = v dt
+
+and a joint that owes more than a way `d` it could hide in its encoder's steps is not where its encoder says. A jammed
+joint looks the same, and so does one whose dry friction is far larger than the configuration says.
+
+Boundary: one observer of all joints; what follows is `guard.py`'s.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drivers.arm import Counts, Flags, Vector
+from ident_service.config.limits import MotionLimits
+from ident_service.excitation.following import expected_friction
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.rigid_body import InverseDynamics
+
+# Times the friction expected, which is a guess: how far the correction may change against a joint that stands, and on
+# in the direction of one that slid, for what friction is larger at rest and for other joints' reactions.
+STANDING, SLIDING = 3.0, 1.0
+SLID = 20  # cycles within which a second step in the same direction shows that a joint slides
+OWED, STEPS = 0.02, 10.0  # of the following error allowed; and steps of the encoder
+
+
+class Owed:
+    """The ways that joints owe."""
+
+    def __init__(
+        self, dynamics: InverseDynamics, limits: MotionLimits, period: float, friction: Vector, resolution: Vector
+    ) -> None:
+        """Begin with nothing owed.
+
+        Args:
+            dynamics: the prior model.
+            limits: of the arm.
+            period: of the loop [s].
+            friction: dry friction expected of each joint [N m or N], shape (joints,).
+            resolution: smallest step of the positions [rad or m], shape (joints,).
+        """
+        self._dynamics, self._period = dynamics, period
+        self._standing, self._sliding = STANDING * friction, SLIDING * friction
+        self._hidden = OWED * limits.following_error + STEPS * resolution
+        self._speed, self._way = np.zeros_like(friction), np.zeros_like(friction)
+        self._base = np.zeros_like(friction)
+        self._none: Flags = np.zeros(len(friction), dtype=bool)
+        self._direction, self._slid = np.zeros_like(friction), np.zeros_like(friction)
+        self._since: Counts = np.zeros(len(friction), dtype=np.int64)
+        self._owing = False
+
+    def update(self, moved: Vector, correction: Vector, position: Vector) -> Flags:
+        """One cycle.
+
+        Args:
+            moved: by how much the positions have changed [rad or m], shape (joints,); 0 for one that was not measured.
+            correction: what the errors added to the torque [N m or N], shape (joints,); all zero where no position is
+                asked for, of which nothing follows.
+            position: last known [rad or m], shape (joints,).
+
+        Returns:
+            Which joints owe more than can be hidden, shape (joints,).
+        """
+        changed, direction = moved != 0.0, np.sign(moved)
+        slides = (direction == self._direction) & (self._since < SLID)
+        self._slid = np.where(changed, np.where(slides, direction, 0.0), self._slid)
+        self._direction = np.where(changed, direction, self._direction)
+        self._since = np.where(changed, 0, self._since + 1)
+        self._base = np.where(changed, correction, self._base)
+        change = correction - self._base
+        push = np.abs(change) - np.where(change * self._slid > 0.0, self._sliding, self._standing)
+        acting = push > 0.0
+        if not acting.any():
+            self._forgive()
+            return self._none
+        if not correction.any():
+            self._base = correction.copy()
+            self._forgive()
+            return self._none
+        gained = push * (self._period / np.diag(self._dynamics.mass_matrix(position)))
+        self._speed = np.where(acting, self._speed + gained, 0.0)
+        self._way = np.where(acting, self._way + self._speed * self._period, 0.0)
+        self._owing = True
+        return np.asarray(self._way > self._hidden)
+
+    def _forgive(self) -> None:
+        if self._owing:
+            self._speed, self._way, self._owing = np.zeros_like(self._speed), np.zeros_like(self._way), False
+
+
+def owed_ways(
+    dynamics: InverseDynamics, model: ArmModel, limits: MotionLimits, period: float, resolution: Vector
+) -> Owed:
+    """The observer of an arm: dry friction is the prior's, but never less than the configuration's guess."""
+    guess = model.config.design.friction_guess
+    expected = expected_friction(model, limits, guess).coulomb
+    return Owed(dynamics, limits, period, np.maximum(expected, guess[0] * limits.torque), resolution)
