@@ -125,8 +125,9 @@ class Guard:
         self._count_still(sample, correction)
         self._count_unchanged(sample, velocity)
         if self._owed is not None:
-            moved = np.where(sample.valid, sample.position - self._shown, 0.0)
-            self._owes = self._owed.update(moved, correction, self._position)
+            up, down = sample.position > self._shown, sample.position < self._shown
+            direction = np.where(sample.valid, up * 1.0 - down, 0.0)
+            self._owes = self._owed.update(direction, correction, self._position)
         held = answered and self._all_fresh and self._quiet(sample.position, reference.position, velocity)
         if held and self._plain(sample):
             # Copied, in case that a driver fills the same array again.

@@ -56,11 +56,12 @@ class Owed:
         self._since: Counts = np.zeros(len(friction), dtype=np.int64)
         self._owing = False
 
-    def update(self, moved: Vector, correction: Vector, position: Vector) -> Flags:
+    def update(self, direction: Vector, correction: Vector, position: Vector) -> Flags:
         """One cycle.
 
         Args:
-            moved: by how much the positions have changed [rad or m], shape (joints,); 0 for one that was not measured.
+            direction: in which each position has changed, 1 or -1, or 0 where it has not or was not measured, shape
+                (joints,).
             correction: what the errors added to the torque [N m or N], shape (joints,); all zero where no position is
                 asked for, of which nothing follows.
             position: last known [rad or m], shape (joints,).
@@ -68,7 +69,7 @@ class Owed:
         Returns:
             Which joints owe more than can be hidden, shape (joints,).
         """
-        changed, direction = moved != 0.0, np.sign(moved)
+        changed = direction != 0.0
         slides = (direction == self._direction) & (self._since < SLID)
         self._slid = np.where(changed, np.where(slides, direction, 0.0), self._slid)
         self._direction = np.where(changed, direction, self._direction)

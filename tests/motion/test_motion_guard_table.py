@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -326,6 +327,36 @@ def test_the_arm_stays_in_its_space(angle: float, deep: bool) -> None:
     if fault is not None:
         assert (fault.code, fault.reaction) == ("workspace", STOP)
         assert fault.message.startswith("elbow - obstacle floor: touch, 0.02943 m deep: ")
+
+
+@pytest.mark.parametrize(
+    ("position", "pair"),
+    [
+        ((0.1, -0.1), None),
+        ((0.25 * np.pi, 0.0), "elbow - obstacle post"),  # stretched out along the diagonal
+        ((0.0, 1.9), "elbow - base"),  # its tip is at (0.338, 0.473)
+    ],
+)
+def test_the_arm_touches_neither_boxes_nor_itself(position: tuple[float, float], pair: str | None) -> None:
+    bodies: dict[str, Any] = {
+        name: [{"from": (-0.4, 0.0, 0.0), "to": (0.0, 0.0, 0.0), "radius": 0.03}] for name in NAMES
+    }
+    bodies["base"] = [{"from": (0.338, 0.473, 0.0), "to": (0.338, 0.473, 0.1), "radius": 0.03}]
+    workspace = {"obstacles": {"post": {"box": {"center": (0.7, 0.7, 0.0), "size": (0.1, 0.1, 0.1)}}}}
+    bench = Bench(np.array(position), contact=Contact(bench_model(geometry=bodies, workspace=workspace)))
+    fault = bench.see(np.array(position))[1]
+    if pair is None:
+        assert fault is None
+        return
+    assert fault is not None
+    assert (fault.code, fault.reaction) == ("workspace", STOP)
+    assert fault.message.startswith(f"{pair}: touch, ")
+
+
+def test_a_velocity_is_told_with_its_joint_and_unit() -> None:
+    bench = Bench(revolute=(True, False))
+    assert bench.guard.about(0, "moves at {} too long", 0.5) == "shoulder: moves at 0.5 rad/s too long"
+    assert bench.guard.about(1, "moves at {} too long", 0.25) == "elbow: moves at 0.25 m/s too long"
 
 
 def test_a_lost_axis_is_where_it_was_last_seen() -> None:
