@@ -107,7 +107,12 @@ class Guard:
         return self.findings.warnings
 
     def feedback(
-        self, sample: Sample, reference: Setpoint, velocity: Vector, correction: Vector
+        self,
+        sample: Sample,
+        reference: Setpoint,
+        velocity: Vector,
+        correction: Vector,
+        answer: Vector | None = None,
     ) -> tuple[Flags, Fault | None]:
         """Judge a sample.
 
@@ -116,6 +121,7 @@ class Guard:
             reference: where the arm should be at its stamp.
             velocity: filtered velocity before this sample [rad/s or m/s], shape (joints,).
             correction: of the torque before this sample, what the errors added to it [N m or N], shape (joints,).
+            answer: the acceleration in it [rad/s^2 or m/s^2], shape (joints,); without, nothing is owed.
 
         Returns:
             Which axes' positions may be used, and the most severe fault found, if any.
@@ -124,10 +130,10 @@ class Guard:
         answered = bool(sample.valid.all())
         self._count_still(sample, correction)
         self._count_unchanged(sample, velocity)
-        if self._owed is not None:
+        if self._owed is not None and answer is not None:
             up, down = sample.position > self._shown, sample.position < self._shown
             direction = np.where(sample.valid, up * 1.0 - down, 0.0)
-            self._owes = self._owed.update(direction, correction, self._position)
+            self._owes = self._owed.update(direction, correction, answer, self._position)
         held = answered and self._all_fresh and self._quiet(sample.position, reference.position, velocity)
         if held and self._plain(sample):
             # Copied, in case that a driver fills the same array again.

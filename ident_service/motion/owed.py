@@ -8,8 +8,10 @@ direction moves it, but for what friction is larger at rest. With the allowance 
 
     dv = max(|c - c_0| - b, 0) / M_jj(q) dt          dd = v dt
 
-and a joint that owes more than a way `d` it could hide in its encoder's steps is not where its encoder says. A jammed
-joint looks the same, and so does one whose dry friction is far larger than the configuration says.
+Of the change only as much counts as is also the joint's own, `M_jj (a - a_0)_j` with a the acceleration that its own
+errors ask for: the rest balances what other joints' corrections do to it. A joint that owes more than a way `d` which
+it could hide in its encoder's steps is not where its encoder says. A jammed joint looks the same, and so does one
+whose dry friction is far larger than the configuration says.
 
 Boundary: one observer of all joints; what follows is `guard.py`'s.
 """
@@ -50,13 +52,13 @@ class Owed:
         self._standing, self._sliding = STANDING * friction, SLIDING * friction
         self._hidden = OWED * limits.following_error + STEPS * resolution
         self._speed, self._way = np.zeros_like(friction), np.zeros_like(friction)
-        self._base = np.zeros_like(friction)
+        self._base, self._base_answer = np.zeros_like(friction), np.zeros_like(friction)
         self._none: Flags = np.zeros(len(friction), dtype=bool)
         self._direction, self._slid = np.zeros_like(friction), np.zeros_like(friction)
         self._since: Counts = np.zeros(len(friction), dtype=np.int64)
         self._owing = False
 
-    def update(self, direction: Vector, correction: Vector, position: Vector) -> Flags:
+    def update(self, direction: Vector, correction: Vector, answer: Vector, position: Vector) -> Flags:
         """One cycle.
 
         Args:
@@ -64,6 +66,7 @@ class Owed:
                 (joints,).
             correction: what the errors added to the torque [N m or N], shape (joints,); all zero where no position is
                 asked for, of which nothing follows.
+            answer: the acceleration in it [rad/s^2 or m/s^2], shape (joints,).
             position: last known [rad or m], shape (joints,).
 
         Returns:
@@ -75,17 +78,20 @@ class Owed:
         self._direction = np.where(changed, direction, self._direction)
         self._since = np.where(changed, 0, self._since + 1)
         self._base = np.where(changed, correction, self._base)
+        self._base_answer = np.where(changed, answer, self._base_answer)
         change = correction - self._base
-        push = np.abs(change) - np.where(change * self._slid > 0.0, self._sliding, self._standing)
-        acting = push > 0.0
-        if not acting.any():
+        allowed = np.where(change * self._slid > 0.0, self._sliding, self._standing)
+        if not (np.abs(change) > allowed).any():
             self._forgive()
             return self._none
         if not correction.any():
-            self._base = correction.copy()
+            self._base, self._base_answer = correction.copy(), answer.copy()
             self._forgive()
             return self._none
-        gained = push * (self._period / np.diag(self._dynamics.mass_matrix(position)))
+        inertia = np.diag(self._dynamics.mass_matrix(position))
+        own = np.sign(change) * inertia * (answer - self._base_answer)
+        push = np.minimum(np.abs(change), own) - allowed
+        acting, gained = push > 0.0, push / inertia * self._period
         self._speed = np.where(acting, self._speed + gained, 0.0)
         self._way = np.where(acting, self._way + self._speed * self._period, 0.0)
         self._owing = True

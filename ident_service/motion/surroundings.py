@@ -87,7 +87,7 @@ class Surroundings:
         reach = np.array(self._collision.reach)
         rising = 0.5 * reach @ limits.acceleration
         here = float(self._collision.distances(way.at(0.0).position[None]).min())
-        least = min(self._clearance, 0.5 * here)
+        least = max(min(self._clearance, 0.5 * here), 0.0)
         time, looked = 0.0, 0
         while time < way.duration:
             setpoint = way.at(time)
@@ -96,12 +96,12 @@ class Surroundings:
             rate = reach @ np.abs(setpoint.velocity)
             # The positive root of `rising h^2 + rate h = spare`; what nothing moves has forever.
             pace = rate + np.sqrt(rate**2 + 4.0 * rising * spare)
-            steps = np.divide(2.0 * spare, pace, out=np.full_like(spare, np.inf), where=pace > 0.0)
+            steps = np.divide(2.0 * spare, pace, out=np.where(spare > 0.0, np.inf, 0.0), where=pace > 0.0)
             pair = int(steps.argmin())
             if not steps[pair] > _SHORTEST:
                 raise MotionRefused(
                     f"the way comes within {distances[pair]:.4f} m at {self._collision.pairs[pair]}, {time:.2f} s; "
-                    f"{max(least, 0.0):.4f} m must remain"
+                    f"{least:.4f} m must remain"
                 )
             time, looked = time + float(steps[pair]), looked + 1
             if looked % _AT_ONCE == 0:
