@@ -101,7 +101,7 @@ def _what_cannot_be_believed(seen: Seen, limits: MotionLimits) -> Iterator[Check
         yield Check("feedback_not_finite", sample.valid & ~np.isfinite(sample.velocity), "velocity is not a number")
     yield Check("feedback_not_finite", ~np.isfinite(sample.torque), "torque that acts is not a number")
     yield Check("emergency_stop", _says(seen, AxisStatus.EMERGENCY_STOP), "the drive reports an emergency stop")
-    what = "position unchanged to the last bit while the joint moved or was pushed hard"
+    what = "position unchanged to the last bit although the joint moved or was pushed"
     yield Check("frozen_encoder", seen.frozen, what)
     beyond, limit = _beyond(position, limits)
     what = "at {} {u}, more than a following error beyond the position limit of {} {u}"

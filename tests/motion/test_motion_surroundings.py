@@ -19,7 +19,7 @@ from ident_service.motion.controls import Switches
 from ident_service.motion.pause import Paused, Resumed
 from ident_service.motion.reference import PathReference, Reference, Setpoint, rest
 from ident_service.motion.run import run
-from ident_service.motion.surroundings import Surroundings, stops_touching
+from ident_service.motion.surroundings import Surroundings, require_clear, stops_touching
 from ident_service.motion.way import at_once, way
 
 Array = np.ndarray
@@ -136,6 +136,18 @@ def test_a_stop_out_of_a_way_that_would_touch_is_told() -> None:
     assert told is not None
     assert told.startswith("a stop out of the way at 0.00 s would touch: elbow - obstacle ball, -0.")
     assert at_once(stops_touching(collision, Standing(rest(np.zeros(2))), LIMITS)) is None
+
+
+def test_a_run_is_refused_for_a_stop_out_of_its_approach_too() -> None:
+    """Far below the motion, a ball that neither the motion nor the approach reaches."""
+    low = np.array([-1.6, 0.0])
+    ahead = tip(low + np.array([0.2, 0.0]))
+    model = with_ball(1.04 * ahead, 0.05, clearance=0.0)
+    path = bench_excitation().path
+    require_clear(model, path, [Standing(rest(low))], LIMITS)
+    flying = replace(rest(low), velocity=np.array([2.0, 0.0]))
+    with pytest.raises(MotionRefused, match=r"a stop out of the way at 0\.00 s would touch: elbow - "):
+        require_clear(model, path, [Standing(flying)], LIMITS)
 
 
 def test_looking_takes_a_bearable_part_of_a_cycle(monkeypatch: pytest.MonkeyPatch) -> None:
