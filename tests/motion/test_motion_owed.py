@@ -10,6 +10,7 @@ from campaign_bench import play, subject, windows
 from guard_bench import HOME, LIMITS, PERIOD, Bench, is_fault, unit
 from motion_bench import PRIOR, TRUTH, bench_config, bench_model
 
+from ident_service.config.schema import ArmConfig
 from ident_service.model.rigid_body import InverseDynamics
 from ident_service.motion.checks import FROZEN_CYCLES, FROZEN_EFFORT, VELOCITY_OFF
 from ident_service.motion.owed import OWED, SLID, SLIDING, STANDING, STEPS, Owed, owed_ways
@@ -177,7 +178,7 @@ def stuck_share(truth: Array) -> float:
 
 @pytest.mark.parametrize("times", [1.0, 1.4])
 def test_a_slow_joint_that_sticks_is_not_taken_for_a_frozen_one(times: float) -> None:
-    """Dry friction of up to 1.4 times the guess, at a twentieth of the speed."""
+    """Dry friction of more than the guess, at a twentieth of the speed."""
     which = subject("bench")
     sticky = TRUTH | {"fc1": times * FRICTION[0], "fc2": times * FRICTION[1]}
     driver = {"kind": "simulated", "truth": sticky, "encoder_resolution": 1e-4, "torque_resolution": 0.01}
@@ -187,8 +188,17 @@ def test_a_slow_joint_that_sticks_is_not_taken_for_a_frozen_one(times: float) ->
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("speed", [0.2, 0.05])
-def test_the_large_arm_sticks_in_a_rehearsal_and_is_not_taken_for_frozen(speed: float) -> None:
-    outcome = play(subject("wam"), State.EXCITING, (), None, speed)
+@pytest.mark.parametrize(("speed", "times"), [(1.0, 1.25), (0.2, 1.25), (0.05, None)])
+def test_the_large_arm_sticks_and_is_not_taken_for_frozen(speed: float, times: float | None) -> None:
+    """With its own friction, some of it a third above the guess; and with all of it a quarter above."""
+    which = subject("wam")
+    if times is not None:
+        document = which.config.model_dump(mode="json", by_alias=True)
+        truth = document["driver"]["truth"]
+        dry = times * which.config.design.friction_guess[0] * which.limits.torque
+        for k, value in enumerate(dry.tolist(), start=1):
+            truth["values"][truth["names"].index(f"fc{k}")] = value
+        which = replace(which, config=ArmConfig.model_validate(document))
+    outcome = play(which, State.EXCITING, (), None, speed)
     assert outcome.fault is None
     assert stuck_share(np.array([moment.velocity for moment in outcome.truth])) > 0.02
