@@ -55,7 +55,8 @@ class Owed:
         self._base, self._base_answer = np.zeros_like(friction), np.zeros_like(friction)
         self._none: Flags = np.zeros(len(friction), dtype=bool)
         self._direction, self._slid = np.zeros_like(friction), np.zeros_like(friction)
-        self._since: Counts = np.zeros(len(friction), dtype=np.int64)
+        self._cycle = 0
+        self._stepped: Counts = np.zeros(len(friction), dtype=np.int64)
         self._owing = False
 
     def update(self, direction: Vector, correction: Vector, answer: Vector, position: Vector) -> Flags:
@@ -72,13 +73,15 @@ class Owed:
         Returns:
             Which joints owe more than can be hidden, shape (joints,).
         """
+        self._cycle += 1
         changed = direction != 0.0
-        slides = (direction == self._direction) & (self._since < SLID)
-        self._slid = np.where(changed, np.where(slides, direction, 0.0), self._slid)
-        self._direction = np.where(changed, direction, self._direction)
-        self._since = np.where(changed, 0, self._since + 1)
-        self._base = np.where(changed, correction, self._base)
-        self._base_answer = np.where(changed, answer, self._base_answer)
+        if changed.any():
+            slides = (direction == self._direction) & (self._cycle - self._stepped <= SLID)
+            np.copyto(self._slid, direction * slides, where=changed)
+            np.copyto(self._direction, direction, where=changed)
+            np.copyto(self._stepped, self._cycle, where=changed)
+            np.copyto(self._base, correction, where=changed)
+            np.copyto(self._base_answer, answer, where=changed)
         change = correction - self._base
         allowed = np.where(change * self._slid > 0.0, self._sliding, self._standing)
         if not (np.abs(change) > allowed).any():
