@@ -4,16 +4,24 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: demo test unit lint types bench bench-design campaign clean
+.PHONY: demo test unit coverage lint types bench bench-design campaign clean
 
 demo: $(READY)
 	$(BIN)/ident simulate
 
-test: lint types
+test: lint types coverage
 	$(BIN)/pytest -m "not campaign"
 
 unit: $(READY)
 	$(BIN)/pytest -n 2 -m "not campaign and not slow"
+
+# Every branch of what stops an arm, by its own tests: less than all of them fails.
+GUARDED := checks faults guard latch owed states stop
+coverage: $(READY)
+	$(BIN)/pytest -m "not campaign and not slow" --cov-branch --cov-report=term-missing --cov-fail-under=100 \
+		$(GUARDED:%=--cov=ident_service.motion.%) tests/motion/test_motion_guard.py \
+		tests/motion/test_motion_guard_table.py tests/motion/test_motion_owed.py tests/motion/test_motion_states.py \
+		tests/motion/test_motion_stop.py
 
 lint: $(READY)
 	$(BIN)/ruff check .
@@ -39,4 +47,4 @@ $(READY): pyproject.toml
 	touch $@
 
 clean:
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist
+	rm -rf $(VENV) .coverage .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist

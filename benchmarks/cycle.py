@@ -17,11 +17,12 @@ from ident_service.config.limits import motion_limits
 from ident_service.config.load import load_arm
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.outline import Outline
+from ident_service.model.contact import Contact
 from ident_service.model.rigid_body import InverseDynamics
 from ident_service.motion.control import ComputedTorque
 from ident_service.motion.deadlines import Deadlines
 from ident_service.motion.guard import Guard
+from ident_service.motion.owed import owed_ways
 from ident_service.motion.reference import PathReference
 
 CYCLES = 20_000  # one period of the motion, which is played twice
@@ -36,8 +37,10 @@ def measure(model: ArmModel) -> list[Row]:
     reference = PathReference(excitation(model, "identification").path)
     steps = np.array([3.65e-5, 5.4e-5, 5.4e-5, 8.5e-5, 7.9e-5, 7.9e-5, 1.03e-4])
     home = reference.at(0.0).position
-    guard = Guard(model.chain.names, limits, period, home, outline=Outline(model, prior))
-    control = ComputedTorque(InverseDynamics(model.chain, model.layout, prior), limits, period, 30.0, home)
+    dynamics = InverseDynamics(model.chain, model.layout, prior)
+    owed = owed_ways(dynamics, model, limits, period, steps)
+    guard = Guard(model.chain.names, limits, period, home, contact=Contact(model), owed=owed)
+    control = ComputedTorque(dynamics, limits, period, 30.0, home)
     deadlines = Deadlines(guard.findings, period)
     valid, age = np.ones(7, dtype=bool), np.zeros(7, dtype=np.int64)
     wanted = control.torque(home, valid, reference.at(0.0))
@@ -56,7 +59,7 @@ def measure(model: ArmModel) -> list[Row]:
             sample = Sample(cycle, stamp_ns, position, None, torque, valid, age, 0, (1,) * 7)
             start = clock()
             deadlines.cycle(stamp_ns, stamp_ns)
-            usable, _ = guard.feedback(sample, setpoint, control.velocity, control.correction)
+            usable, _ = guard.feedback(sample, setpoint, control.velocity, control.correction, control.answer)
             seen = clock()
             wanted = control.torque(position, usable, setpoint)
             law = clock()
@@ -64,7 +67,7 @@ def measure(model: ArmModel) -> list[Row]:
             spent[cycle] = middle - begin, seen - start + clock() - law, law - seen
         for name, times in (
             ("reference", spent[:, 0]),
-            ("guard with planes", spent[:, 1]),
+            ("guard", spent[:, 1]),
             ("control law", spent[:, 2]),
             ("guard and control law", spent[:, 1] + spent[:, 2]),
         ):

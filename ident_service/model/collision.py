@@ -7,6 +7,8 @@ change `reach.py`; the search for motions uses `capsules.py`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pinocchio as pin
 
@@ -43,17 +45,10 @@ class CollisionModel:
         self.pairs = around.pairs
         self.reach = reach(around)
         self.joints = around.chain.joints
-        self._model = _kinematics(around.chain)
+        self._model = kinematics(around.chain)
         self._data = self._model.createData()
-        self._geometry = pin.GeometryModel()
-        for index, body in enumerate(around.bodies):
-            self._geometry.addGeometryObject(_object(f"{index} {body.owner}", body))
-        for contacts in around.contacts:
-            for first, second in contacts:
-                self._geometry.addCollisionPair(pin.CollisionPair(first, second))
-        self._distances = pin.GeometryData(self._geometry)
-        for request in self._distances.distanceRequests:
-            request.gjk_tolerance = request.epa_tolerance = _TOLERANCE
+        every = [contact for contacts in around.contacts for contact in contacts]
+        self._geometry, self._distances = geometry(around, every)
         counts = [len(contacts) for contacts in around.contacts]
         self._starts = np.concatenate([[0], np.cumsum(counts[:-1])]).astype(int) if counts else np.zeros(0, dtype=int)
         self._require_freedom(around, model.config.name)
@@ -106,7 +101,8 @@ class CollisionModel:
         )
 
 
-def _kinematics(chain: Chain) -> pin.Model:
+def kinematics(chain: Chain) -> pin.Model:
+    """Where the joints carry what stands still in their frames; without masses."""
     model = pin.Model()
     for k in range(chain.joints):
         axis = chain.axes[k]
@@ -114,6 +110,24 @@ def _kinematics(chain: Chain) -> pin.Model:
         parent = 0 if chain.parents[k] == WORLD else chain.parents[k] + 1
         model.addJoint(parent, joint, pin.SE3(chain.rotation[k], chain.translation[k]), chain.names[k])
     return model
+
+
+def geometry(around: Scene, contacts: Sequence[tuple[int, int]]) -> tuple[pin.GeometryModel, pin.GeometryData]:
+    """All bodies, and what coal needs to find the distances of some pairs of them.
+
+    Args:
+        around: the bodies.
+        contacts: pairs of their indices.
+    """
+    solids = pin.GeometryModel()
+    for index, body in enumerate(around.bodies):
+        solids.addGeometryObject(_object(f"{index} {body.owner}", body))
+    for first, second in contacts:
+        solids.addCollisionPair(pin.CollisionPair(first, second))
+    found = pin.GeometryData(solids)
+    for request in found.distanceRequests:
+        request.gjk_tolerance = request.epa_tolerance = _TOLERANCE
+    return solids, found
 
 
 def _object(name: str, body: Body) -> pin.GeometryObject:

@@ -65,7 +65,7 @@ class Seen:
         frozen: which encoders stand still although the joint cannot.
         was_powered: which axes' drives have said so before.
         sent: last torque asked for [N m or N], shape (joints,), or None.
-        depths: how deep what of the arm reaches beyond a plane [m].
+        depths: how deep pairs of solids reach into each other [m].
         pairs: names for them.
     """
 
@@ -101,7 +101,7 @@ def _what_cannot_be_believed(seen: Seen, limits: MotionLimits) -> Iterator[Check
         yield Check("feedback_not_finite", sample.valid & ~np.isfinite(sample.velocity), "velocity is not a number")
     yield Check("feedback_not_finite", ~np.isfinite(sample.torque), "torque that acts is not a number")
     yield Check("emergency_stop", _says(seen, AxisStatus.EMERGENCY_STOP), "the drive reports an emergency stop")
-    what = "position unchanged to the last bit while the joint moved or was pushed hard"
+    what = "position unchanged to the last bit although the joint moved or was pushed"
     yield Check("frozen_encoder", seen.frozen, what)
     beyond, limit = _beyond(position, limits)
     what = "at {} {u}, more than a following error beyond the position limit of {} {u}"
@@ -135,7 +135,7 @@ def _what_must_end(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
     what_fast = f"moves at {{}} {{u}}/s, more than {VELOCITY_STOP:g} times the limit of {{}} {{u}}/s"
     yield Check("over_velocity", speed > VELOCITY_STOP * limits.velocity, what_fast, (velocity, limits.velocity))
     yield Check("following_error", away > allowed, what, (away, allowed))
-    yield Check("workspace", seen.depths > 0.0, "{} m too deep", (seen.depths,), seen.pairs)
+    yield Check("workspace", seen.depths > 0.0, "touch, {} m deep", (seen.depths,), seen.pairs)
 
 
 def _what_can_be_bridged(seen: Seen, limits: MotionLimits) -> Iterator[Check]:

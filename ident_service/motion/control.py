@@ -26,6 +26,8 @@ class ComputedTorque:
         velocity: filtered velocity of the last update [rad/s or m/s], shape (joints,).
         correction: what the errors added to the last torque, `M(q) (K_d (dq_r - dq) + K_p (q_r - q))` [N m or N],
             shape (joints,); nothing when the arm is only damped.
+        answer: the acceleration in it, `K_d (dq_r - dq) + K_p (q_r - q)` [rad/s^2 or m/s^2], shape (joints,); nothing
+            likewise.
     """
 
     def __init__(
@@ -47,7 +49,7 @@ class ComputedTorque:
         self.position = position.copy()
         self.velocity = np.zeros_like(position)
         self._none = np.zeros_like(position)
-        self.correction = self._none
+        self.correction = self.answer = self._none
 
     def torque(self, position: Vector, valid: Flags, reference: Setpoint) -> Vector:
         """One update.
@@ -61,12 +63,8 @@ class ComputedTorque:
             Torque [N m or N], shape (joints,), not yet limited.
         """
         position = self._filtered(position, valid)
-        alpha = (
-            reference.acceleration
-            + self._kd * (reference.velocity - self.velocity)
-            + self._kp * (reference.position - position)
-        )
-        torque = self._dynamics.torque(position, self.velocity, alpha)
+        self.answer = self._kd * (reference.velocity - self.velocity) + self._kp * (reference.position - position)
+        torque = self._dynamics.torque(position, self.velocity, reference.acceleration + self.answer)
         self.correction = torque - self._dynamics.torque(position, self.velocity, reference.acceleration)
         return torque
 
@@ -83,7 +81,7 @@ class ComputedTorque:
             Torque [N m or N], shape (joints,), not yet limited.
         """
         position = self._filtered(position, valid)
-        self.correction = self._none
+        self.correction = self.answer = self._none
         torque = self._dynamics.torque(position, self.velocity, -self._kd * self.velocity) + added
         if share < 1.0:
             torque = torque - (1.0 - share) * self._dynamics.torque(position, self._none, self._none)

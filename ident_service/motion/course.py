@@ -13,6 +13,7 @@ from ident_service.motion.pause import Paused, Resumed
 from ident_service.motion.reference import Reference, Setpoint, hold
 from ident_service.motion.states import MOVING, STOPPABLE, State, States
 from ident_service.motion.stop import stop
+from ident_service.motion.surroundings import Surroundings
 
 
 class Course:
@@ -31,6 +32,7 @@ class Course:
         start: Setpoint,
         limits: MotionLimits,
         resuming: MotionLimits,
+        surroundings: Surroundings | None = None,
         *,
         held: bool = False,
     ) -> None:
@@ -42,12 +44,13 @@ class Course:
             start: where the arm stands.
             limits: of the arm, for stops and pauses.
             resuming: of ways out of pauses.
+            surroundings: what ways out of pauses must keep clear of.
             held: whether the end of the last way is held like the end of a stop, instead of being done at once.
         """
         self.reference = start
         self.complete = False
         self._states = states
-        self._limits, self._resuming = limits, resuming
+        self._limits, self._resuming, self._surroundings = limits, resuming, surroundings
         self._held = held
         (self.first, self._way), *self._later = legs
         self._begin_ns: int | None = None
@@ -106,7 +109,7 @@ class Course:
         """The arm rests at the end of a pause's stop: it is paused, and the way back can be looked for."""
         self._states.enter(State.PAUSED)
         if self._paused is not None:
-            self._search = self._paused.resume_in_slices(self._resuming)
+            self._search = self._paused.resume_in_slices(self._resuming, self._surroundings)
 
     def look_for_way_back(self) -> str | None:
         """While paused, one slice of the search for the way back; why there is none, when that turns out."""

@@ -103,7 +103,7 @@ FAULTS: dict[str, Rule] = {
     "position_limit": Rule(_STOP, "it overshot, or was pushed"),
     "over_velocity": Rule(_STOP, "it was pushed, or model or gains are wrong"),
     "following_error": Rule(_STOP, "something blocks or pushes it, or model or gains are wrong"),
-    "workspace": Rule(_STOP, "the arm left the space it may move in"),
+    "workspace": Rule(_STOP, "the arm touches itself or something, or left the space it may move in"),
     "lease_lost": Rule(_STOP, "whoever asked for motion has gone silent"),
     "controls_failed": Rule(_STOP, "nobody could stop the arm any more"),
     "no_way_back": Rule(_STOP, "the pause cannot be ended by going on"),
@@ -126,7 +126,7 @@ FAULTS: dict[str, Rule] = {
     "emergency_stop": Rule(_OFF, "somebody pressed it, or its circuit is open"),
     "feedback_not_finite": Rule(_OFF, "the driver does not know where the axis is"),
     # A controlled stop would turn against a position that never comes (decision 0008).
-    "frozen_encoder": Rule(_OFF, "the encoder stands still, or the joint is jammed"),
+    "frozen_encoder": Rule(_OFF, "the encoder stands still, the joint is jammed, or drier than design.friction_guess"),
     "far_outside": Rule(_OFF, "no controller can have brought it there: a wrong zero, or it was dragged"),
     "runaway": Rule(_OFF, "a sign may be wrong"),
 }

@@ -14,7 +14,7 @@ import numpy as np
 from drivers.arm import Counts, Flags, Sample, Vector
 from drivers.status import TRIPPED, AxisStatus
 from ident_service.config.limits import MotionLimits
-from ident_service.model.outline import Outline
+from ident_service.model.contact import Contact
 from ident_service.motion.checks import (
     ENVELOPE,
     ENVELOPE_SLACK,
@@ -33,6 +33,7 @@ from ident_service.motion.checks import (
 from ident_service.motion.faults import Fault as Fault  # who uses a guard needs these too
 from ident_service.motion.faults import Findings
 from ident_service.motion.faults import Reaction as Reaction
+from ident_service.motion.owed import Owed
 from ident_service.motion.reference import Setpoint
 
 ABSURD = 3.0  # times the torque limit: no controller of ours asks for that
@@ -56,7 +57,8 @@ class Guard:
         position: Vector,
         *,
         revolute: tuple[bool, ...] | None = None,
-        outline: Outline | None = None,
+        contact: Contact | None = None,
+        owed: Owed | None = None,
     ) -> None:
         """Begin with the arm standing somewhere.
 
@@ -66,21 +68,24 @@ class Guard:
             period: of the loop [s].
             position: where it stands [rad or m], shape (joints,).
             revolute: which joints turn, for the units in the sentences; all when None.
-            outline: what may not pass planes; without one, nothing is checked.
+            contact: what may not touch; without it, nothing is checked.
+            owed: of joints that stand still; without it, only hard pushes and full motion tell frozen encoders.
         """
         joints = len(position)
         self.findings = Findings()
         self.rate = np.minimum(TORQUE_RATE, TORQUE_RATE_SHARE * limits.torque) * period
         self._names, self._limits, self._period = joint_names, limits, period
         self._units = tuple("rad" if turns else "m" for turns in revolute or (True,) * joints)
-        self._outline = outline if outline is not None and outline.pairs else None
-        self._pairs = outline.pairs if outline is not None else ()
+        self._contact = contact if contact is not None and contact.pairs else None
+        self._pairs = contact.pairs if contact is not None else ()
+        self._owed = owed
         self._position = self._shown = position.copy()
         self._age: Counts = np.zeros(joints, dtype=np.int64)
         self._jumps: Counts = np.zeros(joints, dtype=np.int64)
         self._still: Counts = np.zeros(joints, dtype=np.int64)
         self._unchanged: Counts = np.zeros(joints, dtype=np.int64)
         self._sudden = np.zeros(joints, dtype=bool)
+        self._owes: Flags = np.zeros(joints, dtype=bool)
         self._all_fresh = self._none_still = self._all_change = True
         self._depths = np.zeros(len(self._pairs))
         self._sent: Vector | None = None
@@ -102,7 +107,12 @@ class Guard:
         return self.findings.warnings
 
     def feedback(
-        self, sample: Sample, reference: Setpoint, velocity: Vector, correction: Vector
+        self,
+        sample: Sample,
+        reference: Setpoint,
+        velocity: Vector,
+        correction: Vector,
+        answer: Vector | None = None,
     ) -> tuple[Flags, Fault | None]:
         """Judge a sample.
 
@@ -111,6 +121,7 @@ class Guard:
             reference: where the arm should be at its stamp.
             velocity: filtered velocity before this sample [rad/s or m/s], shape (joints,).
             correction: of the torque before this sample, what the errors added to it [N m or N], shape (joints,).
+            answer: the acceleration in it [rad/s^2 or m/s^2], shape (joints,); without, nothing is owed.
 
         Returns:
             Which axes' positions may be used, and the most severe fault found, if any.
@@ -119,6 +130,10 @@ class Guard:
         answered = bool(sample.valid.all())
         self._count_still(sample, correction)
         self._count_unchanged(sample, velocity)
+        if self._owed is not None and answer is not None:
+            up, down = sample.position > self._shown, sample.position < self._shown
+            direction = np.where(sample.valid, up * 1.0 - down, 0.0)
+            self._owes = self._owed.update(direction, correction, answer, self._position)
         held = answered and self._all_fresh and self._quiet(sample.position, reference.position, velocity)
         if held and self._plain(sample):
             # Copied, in case that a driver fills the same array again.
@@ -196,9 +211,9 @@ class Guard:
             return False
         if sample.velocity is not None and not bool(np.isfinite(sample.velocity).all()):
             return False
-        if self._outline is None:
+        if self._contact is None:
             return True
-        self._depths = self._outline.depths(sample.position)
+        self._depths = self._contact.depths(sample.position)
         return bool((self._depths <= 0.0).all())
 
     def _all_well(self, status: tuple[int, ...]) -> bool:
@@ -225,8 +240,8 @@ class Guard:
         self._shown = np.where(sample.valid, position, self._shown)
         if sample.status:
             self._all_well(sample.status)
-        if self._outline is not None and bool(np.isfinite(self._position).all()):
-            self._depths = self._outline.depths(self._position)
+        if self._contact is not None and bool(np.isfinite(self._position).all()):
+            self._depths = self._contact.depths(self._position)
         seen = Seen(
             sample,
             wanted,
@@ -273,7 +288,7 @@ class Guard:
 
     def _frozen(self) -> Flags:
         """Which encoders stand still although the joint cannot."""
-        return (self._still >= FROZEN_CYCLES) | (self._sudden & (self._unchanged >= SUDDEN_CYCLES))
+        return (self._still >= FROZEN_CYCLES) | (self._sudden & (self._unchanged >= SUDDEN_CYCLES)) | self._owes
 
     def _found(self, check: Check) -> Fault:
         return self.findings.found(check.code, in_words(check, self._names, self._units))

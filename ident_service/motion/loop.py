@@ -109,7 +109,9 @@ class Loop:
         free = self._lowering or self.states.state is State.STOPPED
         if free:  # no position is asked for
             reference = rest(self.control.position)
-        usable, fault = self.guard.feedback(sample, reference, self.control.velocity, self.control.correction)
+        usable, fault = self.guard.feedback(
+            sample, reference, self.control.velocity, self.control.correction, self.control.answer
+        )
         torque, torque_fault = self.guard.torque(self._law(sample, usable, reference, free))
         compute_ns = self.arm.clock.now_ns() - woken_ns
         kept = sample if fault is None or fault.code != "feedback_not_finite" else self._finite(sample)

@@ -12,6 +12,7 @@ from ident_service.config.limits import MotionLimits
 from ident_service.errors import MotionRefused
 from ident_service.motion.reference import Reference, Setpoint, rest
 from ident_service.motion.stop import stop
+from ident_service.motion.surroundings import Surroundings
 from ident_service.motion.way import RuckigReference, at_once, way_in_slices
 
 _SEARCH_STEP = 0.1  # s
@@ -60,16 +61,24 @@ class Paused:
         """
         return at_once(self.resume_in_slices(limits))
 
-    def resume_in_slices(self, limits: MotionLimits | None = None) -> Generator[None, None, Resumed]:
+    def resume_in_slices(
+        self, limits: MotionLimits | None = None, surroundings: Surroundings | None = None
+    ) -> Generator[None, None, Resumed]:
         """As `resume`, a bearable part of a control cycle at a time; the generator returns the way back.
+
+        Args:
+            limits: as for `resume`.
+            surroundings: what ways back must keep clear of; one that does not is none, and the search goes on.
 
         Raises:
             MotionRefused: as `resume`, from any of its steps.
         """
-        here = rest(self._stop.end)
+        here, limits = rest(self._stop.end), limits or self._limits
         for time in _joining_times(self.time, self._motion.duration):
             try:
-                back = yield from way_in_slices(here, self._motion.at(time), limits or self._limits)
+                back = yield from way_in_slices(here, self._motion.at(time), limits)
+                if surroundings is not None:
+                    yield from surroundings.require_clear(back, limits)
                 return Resumed(back, self._motion, time)
             except MotionRefused as error:
                 refusal = error

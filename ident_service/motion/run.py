@@ -16,7 +16,7 @@ from ident_service.config.limits import MotionLimits, motion_limits
 from ident_service.errors import ArmFault, DriverError, MotionRefused
 from ident_service.excitation.excitation import Excitation
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.outline import Outline
+from ident_service.model.contact import Contact
 from ident_service.model.rigid_body import InverseDynamics
 from ident_service.motion.control import ComputedTorque
 from ident_service.motion.controls import Controls, StopWhen
@@ -26,11 +26,13 @@ from ident_service.motion.faults import FAULTS, HOLD
 from ident_service.motion.guard import Guard
 from ident_service.motion.latch import Latch
 from ident_service.motion.loop import REST_CYCLES, REST_SPEED, Loop, Peaks
+from ident_service.motion.owed import owed_ways
 from ident_service.motion.plans import Excite, Plan
 from ident_service.motion.reference import rest
 from ident_service.motion.sink import Sink as Sink
 from ident_service.motion.speed import require_factor, slowed_limits
 from ident_service.motion.states import LAWFUL, State, States
+from ident_service.motion.surroundings import Surroundings
 
 _INFO: Final = 20  # level of rcl_interfaces/msg/Log
 
@@ -179,8 +181,10 @@ class _Run:
         home = sample.position.copy()
         admitted = self.plan.admits(model, home, limits)
         legs, limits = self.plan.legs(model, home, limits), admitted
-        guard = Guard(chain.names, limits, period, home, revolute=chain.revolute, outline=Outline(model, model.prior))
         dynamics = InverseDynamics(chain, model.layout, model.prior)
+        owed = owed_ways(dynamics, model, limits, period, described.position_resolution)
+        contact = Contact(model)
+        guard = Guard(chain.names, limits, period, home, revolute=chain.revolute, contact=contact, owed=owed)
         control = ComputedTorque(dynamics, limits, period, model.config.control.velocity_cutoff, home)
         torque, cannot_hold = guard.torque(control.torque(home, sample.valid, rest(home)))
         if cannot_hold is not None:
@@ -190,7 +194,15 @@ class _Run:
             arm,
             guard,
             control,
-            Course(self.states, legs, rest(home), limits, slowed_limits(limits, self.plan.speed), held=self.plan.held),
+            Course(
+                self.states,
+                legs,
+                rest(home),
+                limits,
+                slowed_limits(limits, self.plan.speed),
+                Surroundings(model, limits),
+                held=self.plan.held,
+            ),
             self.states,
             Deadlines(guard.findings, period),
             self.controls,

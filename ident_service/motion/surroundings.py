@@ -2,11 +2,15 @@
 
 Motion and ways are proven for all time (`excitation/clearance.py`); stops are looked at where they begin every 50 ms,
 and must only not touch: a stop is short, rare, and better than what it was asked for.
+
+A way back from a pause is proven while the arm stands and the loop goes on, one posture at a time. Within a time h a
+pair's distance d falls by no more than `sum_k L_k (|dq_k| h + A_k h^2 / 2)` (`model/reach.py`), with A the largest
+acceleration; the next posture is where that could have used up what d may fall by.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,8 +24,12 @@ from ident_service.model.capsules import CapsuleModel
 from ident_service.model.collision import CollisionModel
 from ident_service.motion.reference import Reference, Setpoint
 from ident_service.motion.stop import stop
+from ident_service.motion.way import at_once
 
 _BEGINS, _POINTS = 0.05, 8  # s between stops, points on each
+_AT_ONCE = 4  # postures looked at in one go, while the loop goes on
+_SHORTEST = 1e-4  # s between two postures of a way
+_ROUNDING = 1e-6  # m, more than what coal's distances are wrong by
 
 
 @dataclass(frozen=True)
@@ -37,6 +45,89 @@ class Nearest:
     distance: float
     pair: str | None
     time: float
+
+
+class Surroundings:
+    """What a way that is found while the arm is energised must keep clear of."""
+
+    def __init__(self, model: ArmModel, limits: MotionLimits) -> None:
+        """Take an arm.
+
+        Args:
+            model: with its geometry and surroundings; without any, every way is clear.
+            limits: of the arm, that its stops keep.
+
+        Raises:
+            MotionRefused: a pair of bodies that is never free.
+        """
+        self._collision = CollisionModel(model)
+        self._clearance = model.config.workspace.clearance
+        self._limits = limits
+
+    def require_clear(self, way: Reference, limits: MotionLimits) -> Generator[None, None, None]:
+        """Prove that a way keeps clear and that no stop out of it touches, a bearable part of a cycle at a time.
+
+        Where the arm stands nearer to something than the clearance, as after a stop, half of that distance is kept.
+
+        Args:
+            way: from rest.
+            limits: that the way keeps.
+
+        Raises:
+            MotionRefused: from any of the steps, naming what comes how near to what, and when.
+        """
+        if not self._collision.pairs:
+            return
+        yield from self._proven(way, limits)
+        touching = yield from stops_touching(self._collision, way, self._limits)
+        if touching is not None:
+            raise MotionRefused(touching)
+
+    def _proven(self, way: Reference, limits: MotionLimits) -> Generator[None, None, None]:
+        reach = np.array(self._collision.reach)
+        rising = 0.5 * reach @ limits.acceleration
+        here = float(self._collision.distances(way.at(0.0).position[None]).min())
+        least = max(min(self._clearance, 0.5 * here), 0.0)
+        time, looked = 0.0, 0
+        while time < way.duration:
+            setpoint = way.at(time)
+            (distances,) = self._collision.distances(setpoint.position[None])
+            spare = np.maximum(distances - least - _ROUNDING, 0.0)
+            rate = reach @ np.abs(setpoint.velocity)
+            # The positive root of `rising h^2 + rate h = spare`; what nothing moves has forever.
+            pace = rate + np.sqrt(rate**2 + 4.0 * rising * spare)
+            steps = np.divide(2.0 * spare, pace, out=np.where(spare > 0.0, np.inf, 0.0), where=pace > 0.0)
+            pair = int(steps.argmin())
+            if not steps[pair] > _SHORTEST:
+                raise MotionRefused(
+                    f"the way comes within {distances[pair]:.4f} m at {self._collision.pairs[pair]}, {time:.2f} s; "
+                    f"{least:.4f} m must remain"
+                )
+            time, looked = time + float(steps[pair]), looked + 1
+            if looked % _AT_ONCE == 0:
+                yield
+
+
+def stops_touching(
+    collision: CollisionModel, way: Reference, limits: MotionLimits
+) -> Generator[None, None, str | None]:
+    """The stop out of a way that would touch something, in words, or None, a bearable part of a cycle at a time."""
+    for time in np.arange(0.0, way.duration, _BEGINS).tolist():
+        reference = stop(way.at(time), limits)
+        yield
+        times = np.linspace(0.0, reference.duration, _POINTS).tolist()
+        for first in range(0, _POINTS, _AT_ONCE):
+            postures = np.array([reference.at(moment).position for moment in times[first : first + _AT_ONCE]])
+            nearest = collision.distances(postures).min(axis=0)
+            pair = int(nearest.argmin())
+            if nearest[pair] <= 0.0:
+                return _touches("way", time, collision.pairs[pair], float(nearest[pair]))
+            yield
+    return None
+
+
+def _touches(what: str, time: float, pair: str | None, distance: float) -> str:
+    return f"a stop out of the {what} at {time:.2f} s would touch: {pair}, {distance:.4f} m"
 
 
 def way_clearance(collision: CollisionModel, reference: Reference, limits: MotionLimits, least: float) -> Clearance:
@@ -71,7 +162,7 @@ def touching_stop(path: Path, limits: MotionLimits, model: ArmModel) -> str | No
     nearest = stop_clearance(path, limits, model)
     if nearest.distance > 0.0:
         return None
-    return f"a stop out of the motion at {nearest.time:.2f} s would touch: {nearest.pair}, {nearest.distance:.4f} m"
+    return _touches("motion", nearest.time, nearest.pair, nearest.distance)
 
 
 def require_clear(model: ArmModel, path: Path, ways: Sequence[Reference], limits: MotionLimits) -> None:
@@ -86,18 +177,18 @@ def require_clear(model: ArmModel, path: Path, ways: Sequence[Reference], limits
     Raises:
         MotionRefused: naming what comes how near to what, and when.
     """
-    require_ways_clear(model, [("a way to or from the motion", way) for way in ways], limits)
     collision = CollisionModel(model)
     if not collision.pairs:
         return
     least = model.config.workspace.clearance
     _require_proven("the motion", certified_clearance(collision, path, least), least)
+    require_ways_clear(model, [("a way to or from the motion", way) for way in ways], limits)
     if touching := touching_stop(path, limits, model):
         raise MotionRefused(touching)
 
 
 def require_ways_clear(model: ArmModel, ways: Sequence[tuple[str, Reference]], limits: MotionLimits) -> None:
-    """Refuse ways that come too near to anything.
+    """Refuse ways that come too near to anything, or out of which a stop would touch something.
 
     Args:
         model: of the arm, with its geometry and surroundings; without any, nothing is checked.
@@ -113,6 +204,8 @@ def require_ways_clear(model: ArmModel, ways: Sequence[tuple[str, Reference]], l
     least = model.config.workspace.clearance
     for what, way in ways:
         _require_proven(what, way_clearance(collision, way, limits, least), least)
+        if touching := at_once(stops_touching(collision, way, limits)):
+            raise MotionRefused(touching)
 
 
 def _require_proven(what: str, clearance: Clearance, least: float) -> None:

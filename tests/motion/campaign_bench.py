@@ -121,20 +121,22 @@ class Case:
     state: State
     share: float  # of the state's time at which it strikes
     joint: int | None
+    speed: float = 1.0  # of the run
 
     def __str__(self) -> str:
-        return f"{self.arm}-{self.kind.value}-{self.state.value}-{self.share:.2f}-{self.joint}"
+        slow = "" if self.speed == 1.0 else f"-at {self.speed:g}"
+        return f"{self.arm}-{self.kind.value}-{self.state.value}-{self.share:.2f}-{self.joint}{slow}"
 
 
 class Script(Switches):
     """Somebody who pauses and goes on, or stops, at given cycles of the loop."""
 
-    def __init__(self, which: Subject, state: State) -> None:
+    def __init__(self, which: Subject, state: State, speed: float = 1.0) -> None:
         super().__init__()
         pausing = state in (State.PAUSING, State.PAUSED, State.RESUMING)
         stopping = state in (State.STOPPING, State.STOPPED)
-        self._pause = which.pause if pausing else 10**9
-        self._stop = which.stop if stopping else 10**9
+        self._pause = round(which.pause / speed) if pausing else 10**9
+        self._stop = round(which.stop / speed) if stopping else 10**9
 
     def lease_ok(self, now_ns: int) -> bool:
         cycle = now_ns // 1_000_000
@@ -171,14 +173,14 @@ class _Both:
         return self._story.event(stamp_ns, level, message)
 
 
-def play(which: Subject, state: State, faults: tuple[Fault, ...], path: Path | None) -> Outcome:
+def play(which: Subject, state: State, faults: tuple[Fault, ...], path: Path | None, speed: float = 1.0) -> Outcome:
     """One run on a new arm, with what the script of a state does, recorded if a path is given."""
     truth: list[Truth] = []
     inner = from_config(which.config, faults=faults, observer=truth.append)
     assert isinstance(inner, SimulatedArm)
     arm, story, latch, fault = WatchedArm(inner), Story(), Latch(), None
-    options: dict[str, Any] = {"latch": latch, "hold_seconds": HOLD}
-    script = Script(which, state)
+    options: dict[str, Any] = {"latch": latch, "hold_seconds": HOLD, "speed": speed}
+    script = Script(which, state, speed)
     try:
         if path is None:
             with arm:
@@ -193,9 +195,9 @@ def play(which: Subject, state: State, faults: tuple[Fault, ...], path: Path | N
 
 
 @cache
-def windows(name: str, state: State) -> dict[str, tuple[int, int]]:
+def windows(name: str, state: State, speed: float = 1.0) -> dict[str, tuple[int, int]]:
     """First and last cycle of every state of a healthy run of a script."""
-    healthy = play(subject(name), state, (), None)
+    healthy = play(subject(name), state, (), None, speed)
     assert healthy.fault is None
     begins = [(message, stamp // 1_000_000) for stamp, level, message in healthy.story.events if level == 20]
     ends = [begin for _, begin in begins[1:]] + [healthy.story.samples[-1]["cycle"]]
@@ -204,7 +206,7 @@ def windows(name: str, state: State) -> dict[str, tuple[int, int]]:
 
 def injected(case: Case) -> Fault:
     """The fault of a case, at its time."""
-    first, last = windows(case.arm, case.state)[case.state.value]
+    first, last = windows(case.arm, case.state, case.speed)[case.state.value]
     promise = PROMISES[case.kind]
     cycle = first + round(case.share * (last - 1 - first))
     return Fault(cycle, case.kind, case.joint, promise.duration, promise.size)

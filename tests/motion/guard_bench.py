@@ -43,6 +43,7 @@ class Bench:
         velocity: Array = STILL,
         valid: tuple[bool, bool] = (True, True),
         correction: Array = STILL,
+        answer: Array | None = None,
         measured: Array | None = None,
         **other: Any,
     ) -> tuple[list[bool], Fault | None]:
@@ -52,7 +53,7 @@ class Bench:
         sample = replace(sample, **other)
         self.cycle += 1
         setpoint = rest(position if reference is None else reference)
-        usable, fault = self.guard.feedback(sample, setpoint, velocity, correction)
+        usable, fault = self.guard.feedback(sample, setpoint, velocity, correction, answer)
         return usable.tolist(), fault
 
 

@@ -37,6 +37,7 @@ STATES = (
     *(State.STOPPING, State.STOPPED),
 )
 SEED = 5
+REHEARSAL = 0.1
 
 
 def cases(arm: str, times: int, joints: int) -> Iterator[Case]:
@@ -49,6 +50,14 @@ def cases(arm: str, times: int, joints: int) -> Iterator[Case]:
             yield Case(arm, kind, state, rng.random(), joint)
 
 
+def slow_freezes(arm: str, times: int) -> Iterator[Case]:
+    """Encoders of all joints that freeze in a rehearsal, where joints are slow."""
+    rng = random.Random(f"{SEED} slow {arm}")  # noqa: S311 - not for secrets
+    moving = (State.APPROACHING, State.EXCITING, State.RETURNING, State.RESUMING)
+    for state, joint, _ in product(moving, range(2 if arm == "bench" else 7), range(times)):
+        yield Case(arm, FaultKind.FROZEN_ENCODER, state, rng.random(), joint, REHEARSAL)
+
+
 def sample() -> list[Case]:
     """A few of each kind on the small arm, a few of all on the large one."""
     rng = random.Random(SEED)  # noqa: S311 - not for secrets
@@ -56,7 +65,8 @@ def sample() -> list[Case]:
     chosen = [
         case for kind in FaultKind for case in rng.sample([case for case in small if case.kind is kind], 2)
     ]  # fmt: skip
-    return chosen + rng.sample([case for case in large if case.state in (State.EXCITING, State.STOPPING)], 5)
+    chosen += rng.sample([case for case in large if case.state in (State.EXCITING, State.STOPPING)], 5)
+    return chosen + rng.sample(list(slow_freezes("bench", 1)), 3)
 
 
 def test_every_kind_of_fault_has_its_promise() -> None:
@@ -72,21 +82,25 @@ def test_a_sample_of_the_campaign(case: Case, tmp_path: Path) -> None:
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize("case", [*cases("bench", 3, 2), *cases("wam", 2, 2)], ids=str)
+@pytest.mark.parametrize(
+    "case",
+    [*cases("bench", 3, 2), *cases("wam", 2, 2), *slow_freezes("bench", 5), *slow_freezes("wam", 2)],
+    ids=str,
+)
 def test_the_campaign(case: Case, tmp_path: Path) -> None:
     keeps_its_promise(case, tmp_path)
 
 
 def keeps_its_promise(case: Case, folder: Path) -> None:
     which, fault, path = subject(case.arm), injected(case), folder / "run.mcap"
-    outcome = play(which, case.state, (fault,), path)
+    outcome = play(which, case.state, (fault,), path, case.speed)
     plant_stays_within_limits(which, outcome)
     recording_is_readable(which, outcome, path)
     promise = PROMISES[case.kind]
     if outcome.fault is None:
         assert promise.within is None, "not found"
         assert outcome.latch.faults == ()
-        assert list(dict.fromkeys(outcome.story.states)) == list(windows(case.arm, case.state))
+        assert list(dict.fromkeys(outcome.story.states)) == list(windows(case.arm, case.state, case.speed))
         return
     assert outcome.fault.code in promise.codes
     is_latched(which, outcome)

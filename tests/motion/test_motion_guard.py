@@ -182,6 +182,15 @@ def test_a_position_that_changes_now_and_then_is_not_frozen(joint: int) -> None:
         assert bench.see(position, correction=push)[1] is None
 
 
+@pytest.mark.parametrize("joint", [0, 1])
+def test_a_push_that_ends_is_forgotten(joint: int) -> None:
+    bench, push = Bench(), 1.01 * FROZEN_EFFORT * LIMITS.torque * unit(joint)
+    for _ in range(3):
+        for _ in range(FROZEN_CYCLES - 1):
+            assert bench.see(HOME, correction=push)[1] is None
+        assert bench.see(HOME)[1] is None
+
+
 def test_losing_an_axis_does_not_excuse_a_frozen_one() -> None:
     bench, push = Bench(), 1.01 * FROZEN_EFFORT * LIMITS.torque * unit(1)
     for cycle in range(FROZEN_CYCLES - 1):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from motion_bench import bench_model
 
 from drivers.arm import StopKind
 from drivers.status import AxisStatus
-from ident_service.model.outline import Outline
+from ident_service.model.contact import Contact
 from ident_service.motion.checks import (
     ENVELOPE,
     ENVELOPE_SLACK,
@@ -312,8 +313,7 @@ def workspace_guard() -> Bench:
     workspace = {"obstacles": {"floor": {"half_space": {"normal": (0.0, 1.0, 0.0), "offset": -0.5}}}}
     workspace["inside"] = {"x": (-0.5, 1.2)}
     model = bench_model(geometry=bodies, workspace=workspace)
-    assert model.prior is not None
-    return Bench(outline=Outline(model, model.prior))
+    return Bench(contact=Contact(model))
 
 
 @pytest.mark.parametrize(("angle", "deep"), [(-0.4, False), (-0.5, True)])
@@ -326,7 +326,37 @@ def test_the_arm_stays_in_its_space(angle: float, deep: bool) -> None:
     assert (fault is not None) == deep
     if fault is not None:
         assert (fault.code, fault.reaction) == ("workspace", STOP)
-        assert fault.message.startswith("elbow - obstacle floor: 0.02943 m too deep: ")
+        assert fault.message.startswith("elbow - obstacle floor: touch, 0.02943 m deep: ")
+
+
+@pytest.mark.parametrize(
+    ("position", "pair"),
+    [
+        ((0.1, -0.1), None),
+        ((0.25 * np.pi, 0.0), "elbow - obstacle post"),  # stretched out along the diagonal
+        ((0.0, 1.9), "elbow - base"),  # its tip is at (0.338, 0.473)
+    ],
+)
+def test_the_arm_touches_neither_boxes_nor_itself(position: tuple[float, float], pair: str | None) -> None:
+    bodies: dict[str, Any] = {
+        name: [{"from": (-0.4, 0.0, 0.0), "to": (0.0, 0.0, 0.0), "radius": 0.03}] for name in NAMES
+    }
+    bodies["base"] = [{"from": (0.338, 0.473, 0.0), "to": (0.338, 0.473, 0.1), "radius": 0.03}]
+    workspace = {"obstacles": {"post": {"box": {"center": (0.7, 0.7, 0.0), "size": (0.1, 0.1, 0.1)}}}}
+    bench = Bench(np.array(position), contact=Contact(bench_model(geometry=bodies, workspace=workspace)))
+    fault = bench.see(np.array(position))[1]
+    if pair is None:
+        assert fault is None
+        return
+    assert fault is not None
+    assert (fault.code, fault.reaction) == ("workspace", STOP)
+    assert fault.message.startswith(f"{pair}: touch, ")
+
+
+def test_a_velocity_is_told_with_its_joint_and_unit() -> None:
+    bench = Bench(revolute=(True, False))
+    assert bench.guard.about(0, "moves at {} too long", 0.5) == "shoulder: moves at 0.5 rad/s too long"
+    assert bench.guard.about(1, "moves at {} too long", 0.25) == "elbow: moves at 0.25 m/s too long"
 
 
 def test_a_lost_axis_is_where_it_was_last_seen() -> None:
@@ -335,7 +365,6 @@ def test_a_lost_axis_is_where_it_was_last_seen() -> None:
     is_fault(bench.see(HOME, valid=(True, False))[1], "lost_feedback")
 
 
-def test_without_planes_nothing_is_looked_at() -> None:
+def test_without_bodies_nothing_is_looked_at() -> None:
     model = bench_model()
-    assert model.prior is not None
-    assert Bench(outline=Outline(model, model.prior)).see(HOME)[1] is None
+    assert Bench(contact=Contact(model)).see(HOME)[1] is None

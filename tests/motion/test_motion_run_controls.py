@@ -12,7 +12,6 @@ from motion_bench import LOOKED
 from run_bench import FOREVER, HOLD, HOME, LIMITS, MIDWAY, MOTION, PERIOD, Bench
 
 from drivers.arm import StopKind
-from ident_service.config.limits import MotionLimits
 from ident_service.errors import ArmFault, MotionRefused
 from ident_service.motion.controls import HOLD_TO_RUN_SECONDS, Switches
 from ident_service.motion.faults import LOWER, LOWER_AFTER, SETTLE
@@ -123,7 +122,7 @@ def test_a_stop_is_obeyed_in_a_pause_too(make: Callable[..., Bench], pause: tupl
 
 
 def test_no_way_back_ends_the_pause(make: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch) -> None:
-    def refused(self: Paused, limits: MotionLimits | None = None) -> Any:
+    def refused(self: Paused, *_: Any) -> Any:
         yield
         raise MotionRefused("it swings")
 
