@@ -37,8 +37,8 @@ def _check(arguments: argparse.Namespace) -> Answer:
     model = arm_model(load_arm(arguments.file))
     config = model.config
     budget = require_budget(arguments.file, config)
-    head = "" if budget is None else bus_lines(budget)
-    head += f"{arguments.file}: {config.name}, {model.chain.joints} joints, {model.layout.size} parameters: good\n"
+    head = f"{arguments.file}: {config.name}, {model.chain.joints} joints, {model.layout.size} parameters: good\n"
+    head += "" if budget is None else bus_lines(budget)
     document: dict[str, Any] = {"file": arguments.file, "arm": config.name, "sha256": config.sha256, "problems": []}
     try:
         limits = motion_limits(config)

@@ -39,7 +39,16 @@ _POSITION = 0x606400
 
 
 class CanopenDrive:
-    """One node with its motor; `sim_backend/pucks/face.py` says what every protocol's has."""
+    """One node with its motor; `sim_backend/pucks/face.py` says what every protocol's has.
+
+    Attributes:
+        objects: its dictionary.
+        motor: what it drives.
+        emergency: its errors.
+        nmt: its state in the network.
+        power: its state as a drive.
+        sync_identifier: which frames are a SYNC.
+    """
 
     def __init__(self, eds: str, number: int, motor: Motor, identity: dict[int, int] | None = None) -> None:
         """Make a drive without power.
@@ -66,7 +75,9 @@ class CanopenDrive:
         self._pdos = Pdos(node, self.emergency, self._arrived, self._late)
         self._torque = TorqueLoop(self.objects, motor)
         self._failure = 0
-        self._warned = False
+        self._warned = self._evaluated = False
+        self._ears: set[int] = set()
+        self.sync_identifier = 0
         self.objects.before_read = self._about_to_read
         self.objects.veto = self._veto
         self.objects.written = self._written
@@ -88,11 +99,6 @@ class CanopenDrive:
         """In words: the state of the network, of the drive, and its errors."""
         errors = "".join(f", error 0x{code:04X}" for code in self.emergency.active)
         return f"{self.nmt.state.name}, {self.power.state.name}".lower().replace("_", " ") + errors
-
-    @property
-    def sync_identifier(self) -> int:
-        """Which frames are a SYNC."""
-        return self.objects.number(0x1005) & 0x7FF
 
     def power_up(self, now_ns: int) -> None:
         """Power comes: the boot-up message follows at once."""
@@ -154,11 +160,7 @@ class CanopenDrive:
 
     def listens(self, identifier: int) -> bool:
         """Whether a frame of this identifier means anything to this drive."""
-        return (
-            identifier in (0, self.sync_identifier, 0x600 + self._node.number)
-            or identifier in self._pdos.rpdos
-            or 0x700 < identifier < 0x780
-        )
+        return identifier in self._ears or 0x700 < identifier < 0x780
 
     def traffic(self, frame: Frame) -> Traffic:
         """What kind of frame of its own this is."""
@@ -225,8 +227,10 @@ class CanopenDrive:
             self.emergency.occurs(SYNC_LENGTH)
             return
         self._sample(self._node.now_ns)
+        self._evaluated = False
         self._pdos.sync()
-        if self.power.state is PowerState.OPERATION_ENABLED:
+        # Limits depend on where the motor is, whether a torque has come or not.
+        if not self._evaluated and self.power.state is PowerState.OPERATION_ENABLED:
             self._torque.evaluate(self._node.now_ns)
 
     def _sample(self, now_ns: int) -> None:
@@ -249,6 +253,7 @@ class CanopenDrive:
             self.emergency.is_over(*[code for code in self.emergency.active if code not in waiting])
         if self.power.state is PowerState.OPERATION_ENABLED:
             self._torque.evaluate(self._node.now_ns)
+            self._evaluated = True
 
     def _late(self) -> None:
         self._abort_connection()
@@ -304,7 +309,12 @@ class CanopenDrive:
         self.objects.reset(last=_DRIVE_OBJECTS - 1)
         for subindex, value in self._identity.items():
             self.objects.put(0x1018, value, subindex)
+        self._configure()
+
+    def _configure(self) -> None:
         self._pdos.configure()
+        self.sync_identifier = self.objects.number(0x1005) & 0x7FF
+        self._ears = {0, self.sync_identifier, 0x600 + self._node.number, *self._pdos.rpdos}
 
     def _about_to_read(self, key: int) -> None:
         if key in (_POSITION, 0x606C00):
@@ -320,8 +330,8 @@ class CanopenDrive:
 
     def _written(self, key: int) -> None:
         index = key >> 8
-        if index in _PDO_PARAMETERS:
-            self._pdos.configure()
+        if index in _PDO_PARAMETERS or index == 0x1005:
+            self._configure()
         elif index == 0x1016:
             self.nmt.configure_consumers()
         elif index == 0x1017:

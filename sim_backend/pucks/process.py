@@ -27,7 +27,10 @@ from sim_backend.pucks.lock_step import INTERFACE
 from sim_backend.pucks.station import Station
 
 _POLL_NS = 20_000_000  # commands, stop and states are looked at this often
-_RESTING = 1e-3  # speed below which an arm is said to rest [rad/s or m/s]
+_AT_ONCE = 256  # frames handled before time is looked at again
+# Speed below which an arm is said to rest when it has been so for a while, and above which to move [rad/s or m/s].
+_RESTS, _MOVES = 1e-3, 1e-2
+_RESTING_NS = 500_000_000
 
 
 @dataclass(frozen=True)
@@ -104,6 +107,7 @@ class _Run:
         self._told: tuple[str, ...] = ("",) * len(emulator.faces)
         self._faults: tuple[PuckFault, ...] = ()
         self._rested = True
+        self._stirred_ns = 0
         self._quit = False
 
     def until(self, seconds: float | None, stop_requested: Callable[[], bool]) -> Emulated:
@@ -122,9 +126,13 @@ class _Run:
                     self._look(now)
                     if stop_requested() or (end is not None and now >= end):
                         break
-                for bus, frame in self._station.receive(self._patience(now, looked)):
-                    self._heard += 1
-                    self._pass_on(emulator.receive(bus, frame, clock.now_ns()))
+                heard = self._station.receive(self._patience(now, looked))
+                at_once = 0
+                while heard is not None:
+                    at_once += 1
+                    self._pass_on(emulator.receive(*heard, clock.now_ns()))
+                    heard = self._station.receive(0.0) if at_once < _AT_ONCE else None
+                self._heard += at_once
                 # What was due while frames waited comes after them: a drive's firmware would have had them in time.
                 self._pass_on(emulator.tick(clock.now_ns()))
         finally:
@@ -132,7 +140,7 @@ class _Run:
         now = clock.now_ns()
         self._look(now)
         return Emulated(
-            (now - begun) * 1e-9, self._heard, self._sent, self._station.unsent, emulator.states, self._resting()
+            (now - begun) * 1e-9, self._heard, self._sent, self._station.unsent, emulator.states, self._resting(now)
         )
 
     def _patience(self, now_ns: int, looked_ns: int) -> float:
@@ -169,15 +177,20 @@ class _Run:
         if emulator.active != self._faults:
             self._faults = emulator.active
             self._tell("faults: " + (", ".join(self._named(fault) for fault in emulator.active) or "none"))
-        if (resting := self._resting()) != self._rested:
+        if (resting := self._resting(now_ns)) != self._rested:
             self._rested = resting
             self._tell("the arm is at rest" if resting else "the arm moves")
 
     def _named(self, fault: PuckFault) -> str:
         return fault.kind if fault.drive is None else f"{fault.kind} of {self._emulator.names[fault.drive]}"
 
-    def _resting(self) -> bool:
-        return bool((np.abs(self._emulator.body.plant.velocity) < _RESTING).all())
+    def _resting(self, now_ns: int) -> bool:
+        fastest = float(np.abs(self._emulator.body.plant.velocity).max())
+        if fastest > _RESTS:
+            self._stirred_ns = now_ns
+        if self._rested:
+            return fastest < _MOVES
+        return now_ns - self._stirred_ns > _RESTING_NS
 
     def _obey(self, line: str, now_ns: int) -> None:
         match line:

@@ -18,7 +18,6 @@ from ident_service.errors import DriverError
 
 # Interfaces of a driver that python-can knows by another name.
 _NAMES = {"raw": "socketcan"}
-_AT_ONCE = 256  # frames handled before time is looked at again
 
 
 class Station:
@@ -53,23 +52,17 @@ class Station:
         for thread in self._threads:
             thread.start()
 
-    def receive(self, timeout: float) -> list[tuple[int, Frame]]:
-        """Frames that have come, each with its bus; waits for the first one.
+    def receive(self, timeout: float) -> tuple[int, Frame] | None:
+        """The next frame with its bus, None when none comes.
 
         Args:
-            timeout: how long [s].
+            timeout: how long to wait [s].
 
         Raises:
             DriverError: an interface is gone.
         """
-        found: list[tuple[int, Frame]] = []
-        while len(found) < _AT_ONCE:
-            item = self._take(0.0 if found else timeout)
-            if item is None:
-                break
-            number, message = item
-            found.append((number, _frame(message)))
-        return found
+        item = self._take(timeout)
+        return None if item is None else (item[0], _frame(item[1]))
 
     def send(self, frames: Iterable[tuple[int, Frame]]) -> None:
         """Send frames; one that an interface does not take counts as `unsent`, as on a bus that is off."""

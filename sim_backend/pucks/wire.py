@@ -23,6 +23,7 @@ class Wire:
         self._free_ns = 0
         self._waiting: list[tuple[int, int, Sent]] = []
         self._count = 0
+        self._found: tuple[int, tuple[int, int, Sent]] | None = None  # who is next, while it is known
 
     def duration_ns(self, size: int) -> int:
         """How long a frame of this many bytes takes [ns]."""
@@ -31,11 +32,13 @@ class Wire:
     def occupy(self, now_ns: int, size: int) -> None:
         """A frame of the host's goes out as soon as the wire is free."""
         self._free_ns = max(self._free_ns, now_ns) + self.duration_ns(size)
+        self._found = None
 
     def put(self, sent: Sent) -> None:
         """A drive wants to send."""
         self._waiting.append((sent.ready_ns, self._count, sent))
         self._count += 1
+        self._found = None
 
     @property
     def next_ns(self) -> int | None:
@@ -49,14 +52,16 @@ class Wire:
         assert found is not None  # noqa: S101 whoever takes has looked
         self._free_ns, item = found
         self._waiting.remove(item)
+        self._found = None
         return item[2]
 
     def _next(self) -> tuple[int, tuple[int, int, Sent]] | None:
         """Who wins when the wire is free and somebody wants it."""
-        if not self._waiting:
-            return None
+        if self._found is not None or not self._waiting:
+            return self._found
         start = max(self._free_ns, min(ready for ready, _, _ in self._waiting))
         winner = min(
             (item for item in self._waiting if item[0] <= start), key=lambda item: (item[2].frame.identifier, item[1])
         )
-        return start + self.duration_ns(len(winner[2].frame.data)), winner
+        self._found = start + self.duration_ns(len(winner[2].frame.data)), winner
+        return self._found

@@ -212,6 +212,7 @@ def test_a_bus_that_cannot_be_had_leaves_none_open() -> None:
     config = arm_on_bus(interface="virtual", channel="both")
     driver = config.model_dump()["driver"]
     driver["buses"] = [driver["buses"][0], {"interface": "carrier_pigeon"}]
+    driver["drives"][1]["bus"] = 1
     from can.interfaces import virtual as python_can_virtual
 
     with pytest.raises(BusError):

@@ -141,5 +141,6 @@ def test_frames_are_of_the_kind_they_were_sent_as() -> None:
         assert second is not None
         assert (first.arbitration_id, first.is_error_frame, second.is_error_frame) == (0x123, False, True)
         other.send(can.Message(arbitration_id=0x7FF, is_remote_frame=True, is_extended_id=False))
-        assert station.receive(1.0) == [(0, Frame(0x7FF, remote=True))]
+        assert station.receive(1.0) == (0, Frame(0x7FF, remote=True))
+        assert station.receive(0.0) is None
         station.close()

@@ -173,6 +173,22 @@ def test_no_frame_breaks_a_node(enabled: Host, sent: list[Frame]) -> None:
     """Whatever comes, every node answers afterwards."""
     for frame in sent:
         enabled.link.send(frame)
-    enabled.listen(2)
+    enabled.listen(10)  # what they still had to say
     for node in enabled.nodes:
         assert enabled.read(node, 0x1000, 0, "I") == 0x00020192
+
+
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(st.lists(frames, max_size=20))
+def test_no_frame_for_others_moves_a_motor(enabled: Host, sent: list[Frame]) -> None:
+    enabled.cycle(70, -30)
+    meant = {0x080, 0x201, 0x301, 0x302, 0x601, 0x602}
+    for frame in sent:
+        if frame.identifier not in meant or frame.error or frame.remote or frame.extended:
+            enabled.link.send(frame)
+    assert [motor.torque for motor in enabled.arm.emulator.body.motors] == pytest.approx([0.07, -0.03])
+    enabled.listen(10)
+    enabled.send(0x000, b"\x81\x00")
+    enabled.listen(30)
+    enabled.configure()
+    enabled.enable()
