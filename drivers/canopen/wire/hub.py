@@ -19,14 +19,15 @@ from threading import RLock
 from types import TracebackType
 from typing import Final, Self
 
+from drivers.canopen.bits import exact
 from drivers.canopen.bus_errors import BusError
 from drivers.canopen.frame import Frame
 from drivers.canopen.wire import address, packets
-from drivers.canopen.wire.frame_bits import ERROR_BITS, frame_bits
 from drivers.canopen.wire.medium import Medium, Port, overflow
 from ident_service.errors import DriverError
 
 MOST_ENDS: Final = 32
+ERROR_BITS: Final = 20  # flag and delimiter of an error, and the interframe space; superposed flags make it up to 26
 _SELECT_LIMIT: Final = 1024  # descriptors that select, whose timeout alone is finer than milliseconds, can watch
 
 
@@ -71,7 +72,7 @@ class Wire:
         self.name, self.bitrate, self.fd = name, bitrate, fd
         error_ns = 0
         if bitrate:
-            duration_ns = duration_ns or (lambda frame: frame_bits(frame) * 1_000_000_000 // bitrate)
+            duration_ns = duration_ns or (lambda frame: exact(frame).nominal * 1_000_000_000 // bitrate)
             error_ns = ERROR_BITS * 1_000_000_000 // bitrate
         self.medium = Medium(duration_ns, error_ns)
         self.lock = RLock()
