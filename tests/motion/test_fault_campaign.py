@@ -39,8 +39,8 @@ STATES = (
 )
 SEED = 5
 REHEARSAL = 0.1
-# A joint that slid slowly, and whose reference hardly moves on, is carried off by gravity, and nothing in its own encoder
-# tells (decision 0008). It is found at last, too late for its velocity limit.
+# A joint that slid slowly, and whose reference hardly moves on, is carried off by gravity, and its own encoder does not
+# tell (decision 0008). It is found at last, too late for its velocity limit.
 REMAINING = {"bench-frozen_encoder-resuming-0.13-0-at 0.1"}
 
 
