@@ -134,7 +134,9 @@ class CanopenArm(Arm):
         self._no_torque()
         self._streaming = True
         try:
-            self._through(buses, Enabling(buses.drives, self._names, self._driver.bring_up, self.clock.now_ns()))
+            reports = self._driver.status.inhibit, self._driver.status.period
+            steps = Enabling(buses.drives, self._names, self._driver.bring_up, self.clock.now_ns(), reports)
+            self._through(buses, steps)
         except BaseException:
             self.stop(StopKind.TORQUE_OFF)
             raise
