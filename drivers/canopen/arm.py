@@ -29,7 +29,7 @@ from drivers.canopen.lock import BusLock
 from drivers.canopen.profile import Write, bus_profiles
 from drivers.canopen.setup import Setup, configure, identify
 from drivers.canopen.words import DISABLE_VOLTAGE, QUICK_STOP, NmtCommand, axis_status
-from drivers.clock import Clock, RealClock
+from drivers.clock import Clock, RealClock, VirtualClock
 from drivers.status import AxisEvent, AxisEventCode, AxisStatus
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.schema import ArmConfig
@@ -72,7 +72,9 @@ class CanopenArm(Arm):
             f"{' and '.join(joints[j] for j in self._joints_of[k])}: drive {drive.node}"
             for k, drive in enumerate(config.driver.drives)
         ]
-        self.clock: Clock = RealClock()
+        # Until the buses are open and bring theirs.
+        in_step = all(bus.interface == "lock_step" for bus in config.driver.buses)
+        self.clock: Clock = VirtualClock() if in_step else RealClock()
         self._buses: Buses | None = None
         self._locks: list[BusLock] = []
         self._reset_state()
@@ -97,7 +99,7 @@ class CanopenArm(Arm):
             raise DriverError("the arm is already open")
         self._reset_state()
         try:
-            if all(bus.interface != "lock_step" for bus in self._driver.buses):
+            if not self.clock.lock_step:
                 self._locks = [BusLock(bus) for bus in self._driver.buses]
             buses = self._buses = Buses(self._profiles, self._open_bus(self._config), self._period_ns)
             self.clock = buses.clock
@@ -132,7 +134,9 @@ class CanopenArm(Arm):
         self._no_torque()
         self._streaming = True
         try:
-            self._through(buses, Enabling(buses.drives, self._names, self._driver.bring_up, self.clock.now_ns()))
+            reports = self._driver.status.inhibit, self._driver.status.period
+            steps = Enabling(buses.drives, self._names, self._driver.bring_up, self.clock.now_ns(), reports)
+            self._through(buses, steps)
         except BaseException:
             self.stop(StopKind.TORQUE_OFF)
             raise
