@@ -59,7 +59,7 @@ def from_config(config: ArmConfig, bus_number: int) -> RawLink:
 
 
 def open_socket(channel: str, bitrate: int = 1_000_000, *, fd: bool = False) -> socket.socket:
-    """A CAN socket that hears what the cyclic plane wants, errors of the controller, and never its own frames.
+    """A CAN socket that hears all of CANopen, errors of the controller, and never its own frames.
 
     Args:
         channel: network interface, as `ip link` names it.
