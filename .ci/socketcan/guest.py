@@ -97,7 +97,10 @@ def initial_files(root: Path, command: list[str]) -> Iterator[tuple[str, bytes]]
     for name in dict.fromkeys(order):
         yield f"modules/{name}.ko", files[name].read_bytes()
     kept = "".join(f"export {name}={shlex.quote(os.environ[name])}\n" for name in KEPT if name in os.environ)
-    yield "command", f"{kept}export HOME=/run TMPDIR=/run\ncd {shlex.quote(os.getcwd())}\n{shlex.join(command)}\n".encode()
+    yield (
+        "command",
+        f"{kept}export HOME=/run TMPDIR=/run\ncd {shlex.quote(os.getcwd())}\n{shlex.join(command)}\n".encode(),
+    )
 
 
 def needed(module: str, files: dict[str, Path]) -> Iterator[str]:
