@@ -67,30 +67,33 @@ def separate(**driver: Any) -> Bench:
     return Bench(arm, lambda: arm.truth.velocity, lambda: arm.truth.position)
 
 
-def canopen(faults: Sequence[dict[str, Any]] = ()) -> Bench:
-    """Two emulated drives with gears of 1, on a bus in virtual time; a thousandth is 1 mN m or 1 mN.
+def canopen_config(**driver: Any) -> ArmConfig:
+    """The bench behind two drives with gears of 1, on a bus in virtual time; a thousandth is 1 mN m or 1 mN."""
+    eds = (Path(__file__).parents[2] / "configs" / "puck.eds").read_text()
+    drive = {"counts": 65536, "rated_torque": 1.0, "max_speed": 6000.0}
+    section = {
+        "kind": "canopen",
+        "eds": {"name": "puck.eds", "text": eds},
+        "buses": [{"interface": "lock_step", "channel": "bench"}],
+        "drives": [drive | {"node": 1, "max_torque": 10.0}, drive | {"node": 2, "max_torque": 5.0}],
+        "emulation": {"truth": bench_config().model_dump(mode="json")["driver"]["truth"]},
+    }
+    content = bench_config().model_dump(mode="json", exclude={"driver"}) | {
+        "transmission": {"ratios": [1.0, 1.0], "drive_terms": "joints"},
+        "driver": section | driver,
+    }
+    return ArmConfig.model_validate(content)
 
-    Opening takes cycles too, so that faults are counted from the end of enabling here.
-    """
+
+def canopen(faults: Sequence[dict[str, Any]] = ()) -> Bench:
+    """Two emulated drives; opening takes cycles too, so that faults are counted from the end of enabling here."""
     from drivers.canopen.arm import CanopenArm
     from ident_service.config.simulation import SimulatedFault
     from sim_backend.machine import Truth
     from sim_backend.pucks.faults import configured
     from sim_backend.pucks.lock_step import LockStepArm
 
-    eds = (Path(__file__).parents[2] / "configs" / "puck.eds").read_text()
-    drive = {"counts": 65536, "rated_torque": 1.0, "max_speed": 6000.0}
-    content = bench_config().model_dump(mode="json", exclude={"driver"}) | {
-        "transmission": {"ratios": [1.0, 1.0], "drive_terms": "joints"},
-        "driver": {
-            "kind": "canopen",
-            "eds": {"name": "puck.eds", "text": eds},
-            "buses": [{"interface": "lock_step", "channel": "bench"}],
-            "drives": [drive | {"node": 1, "max_torque": 10.0}, drive | {"node": 2, "max_torque": 5.0}],
-            "emulation": {"truth": bench_config().model_dump(mode="json")["driver"]["truth"]},
-        },
-    }
-    config = ArmConfig.model_validate(content)
+    config = canopen_config()
     behind = LockStepArm(config)
     truths: list[Truth] = []
     behind.emulator.observer = truths.append
