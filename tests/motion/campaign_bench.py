@@ -261,7 +261,9 @@ def windows(name: str, state: State, speed: float = 1.0) -> dict[str, tuple[int,
     healthy = play(subject(name), state, (), None, speed)
     assert healthy.fault is None
     first, told = healthy.story.samples[0], [event for event in healthy.story.events if event[1] == 20]
-    begins = [(message, first["cycle"] + round((stamp - first["stamp_ns"]) * 1e-9 / PERIOD)) for stamp, _, message in told]
+    # Enabling may take time that has no cycles.
+    since = [max(-1, round((stamp - first["stamp_ns"]) * 1e-9 / PERIOD)) for stamp, _, _ in told]
+    begins = [(message, first["cycle"] + cycles) for (_, _, message), cycles in zip(told, since, strict=True)]
     ends = [begin for _, begin in begins[1:]] + [healthy.story.samples[-1]["cycle"]]
     return {message: (begin + 1, end) for (message, begin), end in zip(begins, ends, strict=True)}
 
