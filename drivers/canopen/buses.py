@@ -154,7 +154,7 @@ class Buses:
     def forget_events(self) -> None:
         """What happened until now was expected, or has been told otherwise."""
         for codec in self.codecs:
-            codec.take_events()
+            codec.forget_events()
         self.lost = 0
 
     def cycle(self, counts: Sequence[int] | None) -> int:
