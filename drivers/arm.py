@@ -72,6 +72,8 @@ class Sample:
         lost: frames lost since `open`.
         status: slow per-axis status words, with `status_age` cycles since they were read.
         events: what happened on the bus since the sample before.
+        drives: what each drive says of itself, in the words of its fieldbus, for people; empty where there is nothing
+            to add to `status`.
     """
 
     cycle: int
@@ -85,12 +87,22 @@ class Sample:
     status: tuple[int, ...] = field(default=())
     status_age: int = 0
     events: tuple[AxisEvent, ...] = ()
+    drives: tuple[str, ...] = ()
 
 
 class Arm(ABC):
     """A context manager with a handful of methods. Entering opens, leaving closes; closing stops torque first."""
 
     clock: Clock
+
+    def look(self) -> Arm:
+        """The same hardware as an arm that only looks, not open; this one must not be open beside it.
+
+        Of what is returned only `open`, `describe`, `exchange(None)` and `close` are used, and none of them sends a
+        command, changes what a drive does or is configured to do, or keeps its watchdog quiet. It may be slower
+        (`ArmDescription.rate`). By default it is this arm itself, which is right where opening changes nothing.
+        """
+        return self
 
     @abstractmethod
     def open(self) -> None:

@@ -26,9 +26,10 @@ from drivers.canopen.enabling import Enabling, Resetting
 from drivers.canopen.events import axis_events
 from drivers.canopen.link import Link, open_links
 from drivers.canopen.lock import BusLock
+from drivers.canopen.looking import LookingArm
 from drivers.canopen.profile import Write, bus_profiles
 from drivers.canopen.setup import Setup, configure, identify
-from drivers.canopen.words import DISABLE_VOLTAGE, QUICK_STOP, NmtCommand, axis_status
+from drivers.canopen.words import DISABLE_VOLTAGE, QUICK_STOP, NmtCommand, axis_status, joint_status
 from drivers.clock import Clock, RealClock
 from drivers.status import AxisEvent, AxisEventCode, AxisStatus
 from ident_service.config.canopen import CanopenDriver
@@ -64,9 +65,7 @@ class CanopenArm(Arm):
             raise DriverError(f"{config.name}: joints must name all {len(config.driver.drives)} joints")
         # Joints that each drive moves, and drives that each joint needs.
         self._joints_of = {k: joints for motors, joints in self._coordinates.groups for k in motors}
-        self._drives_of = [
-            next(motors for motors, joints in self._coordinates.groups if j in joints) for j in range(len(self._limits))
-        ]
+        self._drives_of = self._coordinates.motors_of
         joints = list(config.joints)
         self._names = [
             f"{' and '.join(joints[j] for j in self._joints_of[k])}: drive {drive.node}"
@@ -85,6 +84,10 @@ class CanopenArm(Arm):
         self._cycle = 0
         self._silent: set[int] = set()
         self._identities: tuple[str, ...] = ()
+
+    def look(self) -> Arm:
+        """An arm that reads the drives' objects by SDO and sends nothing else."""
+        return LookingArm(self._config, self._open_bus)
 
     def open(self) -> None:
         """Lock and open every bus, and tell every drive what it is to do; nothing is energised.
@@ -202,8 +205,11 @@ class CanopenArm(Arm):
         for number, drive in enumerate(buses.drives):
             off = drive.status is not None and not axis_status(drive.status) & AxisStatus.POWERED
             if off and drive.answered:
+                objects = buses.objects(number)
                 with suppress(Exception):
-                    buses.objects(number).write(Write(od.ABORT_CONNECTION, 0))
+                    objects.write(Write(od.ABORT_CONNECTION, 0))
+                with suppress(Exception):  # or it would report 8130h a moment after every session
+                    objects.write(Write(od.HEARTBEAT_CONSUMER, 0))
         with suppress(Exception):
             buses.command(NmtCommand.ENTER_PRE_OPERATIONAL)
 
@@ -312,14 +318,11 @@ def from_config(config: ArmConfig, clock: Clock | None = None) -> CanopenArm:
 
 
 def _status(drives: Sequence[Drive]) -> int:
-    """Of a joint: powered when all its drives are, in trouble when one of them is."""
-    powered, trouble = True, AxisStatus(0)
+    words = []
     for drive in drives:
         error = 0 if drive.emergency is None else drive.emergency.code
-        word = AxisStatus(0) if drive.status is None else axis_status(drive.status, error)
-        powered = powered and bool(word & AxisStatus.POWERED)
-        trouble |= word & ~AxisStatus.POWERED
-    return int(trouble | (AxisStatus.POWERED if powered else 0))
+        words.append(AxisStatus(0) if drive.status is None else axis_status(drive.status, error))
+    return int(joint_status(words))
 
 
 def _frozen(array: Vector) -> Vector:
