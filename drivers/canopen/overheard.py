@@ -5,12 +5,12 @@ Boundary: frames in, facts out; nothing is ever sent.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 from drivers.canopen.frame import Frame
 from drivers.canopen.link import Link
 from drivers.canopen.polling import Place
-from drivers.canopen.profile import HEARTBEAT, SYNC
+from drivers.canopen.profile import HEARTBEAT, SDO_REPLY, SYNC
 from drivers.canopen.words import NmtState, nmt_words
 
 LONGER = 1.2  # times a heartbeat's period, in which one must come
@@ -22,12 +22,14 @@ class Overheard:
     Attributes:
         nmt: what each node's last heartbeat said, and when it came [ns of the links' clock].
         booted: nodes whose last word was a boot-up message, which makes them pre-operational.
+        answered: nodes that sent an SDO reply which nobody waited for.
         streaming: buses on which somebody sends SYNC.
     """
 
     def __init__(self) -> None:
         self.nmt: dict[Place, tuple[int, int]] = {}
         self.booted: set[Place] = set()
+        self.answered: set[Place] = set()
         self.streaming: set[int] = set()
 
     def take(self, bus: int, frame: Frame) -> None:
@@ -44,6 +46,8 @@ class Overheard:
                 self.booted.add((bus, node))
                 state = NmtState.PRE_OPERATIONAL
             self.nmt[bus, node] = state, frame.stamp_ns
+        elif 1 <= frame.identifier - SDO_REPLY <= 127:
+            self.answered.add((bus, frame.identifier - SDO_REPLY))
 
     def listen(self, links: Sequence[Link], period: float) -> None:
         """Listen long enough for every heartbeat of this period [s]; raises DriverError when a bus is gone."""
@@ -57,10 +61,6 @@ class Overheard:
         for bus, link in enumerate(links):
             for frame in link.drain():
                 self.take(bus, frame)
-
-    def nodes(self, bus: int) -> Iterator[int]:
-        """Whose heartbeats were heard on a bus."""
-        return (node for number, node in self.nmt if number == bus)
 
     def nmt_words(self, place: Place, now_ns: int, patience_ns: int) -> str:
         """A node's NMT state for people, as of now.

@@ -217,9 +217,14 @@ def emergency_words(code: int, register: int = 0, vendor: bytes = b"") -> str:
         group = EMERGENCIES.get(code & 0xFFF0) or EMERGENCIES.get(code & 0xFF00) or EMERGENCIES.get(code & 0xF000)
         name = f"unknown code of the group {group!r}" if group else "unknown code"
     words = f"{code:04X}h {name}"
-    if bits := [bit for place, bit in enumerate(ERROR_REGISTER) if register >> place & 1]:
-        words += f" (error register: {', '.join(bits)})"
+    if register:
+        words += f" (error register: {register_words(register)})"
     return words + (f", vendor's bytes {vendor.hex(' ')}" if any(vendor) else "")
+
+
+def register_words(register: int) -> str:
+    """An error register (1001h) for people: `generic, communication`."""
+    return ", ".join(bit for place, bit in enumerate(ERROR_REGISTER) if register >> place & 1)
 
 
 def drive_words(status: int, emergency: int = 0) -> str:
