@@ -13,6 +13,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from enum import Enum
+from pathlib import Path
 from types import TracebackType
 from typing import Self
 
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from drivers.clock import Clock
 from drivers.status import AxisEvent
+from ident_service.errors import DriverError
 
 Vector = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -103,6 +105,21 @@ class Arm(ABC):
         (`ArmDescription.rate`). By default it is this arm itself, which is right where opening changes nothing.
         """
         return self
+
+    def log_frames(self, path: Path) -> None:
+        """Keep every frame of the fieldbus of the next session, from `open` to `close`.
+
+        Args:
+            path: of the file, which must not exist when the arm is opened; its suffix says its format.
+
+        Raises:
+            DriverError: this arm has no frames, or no such format is known.
+        """
+        raise DriverError("this arm has no fieldbus whose frames could be logged")
+
+    def logged(self) -> str:
+        """How the log of frames of the last session ended, in words; empty where none was kept."""
+        return ""
 
     @abstractmethod
     def open(self) -> None:

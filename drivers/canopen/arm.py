@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from drivers.canopen.link import Link, open_links
 from drivers.canopen.lock import BusLock
 from drivers.canopen.looking import LookingArm
 from drivers.canopen.profile import Write, bus_profiles
+from drivers.canopen.session_log import SessionLog, logged_links, require_format
 from drivers.canopen.setup import Setup, configure, identify
 from drivers.canopen.words import DISABLE_VOLTAGE, QUICK_STOP, NmtCommand, axis_status, joint_status
 from drivers.clock import Clock, RealClock
@@ -74,6 +76,8 @@ class CanopenArm(Arm):
         self.clock: Clock = RealClock()
         self._buses: Buses | None = None
         self._locks: list[BusLock] = []
+        self._log_path: Path | None = None
+        self._log: SessionLog | None = None
         self._reset_state()
 
     def _reset_state(self) -> None:
@@ -89,6 +93,14 @@ class CanopenArm(Arm):
         """An arm that reads the drives' objects by SDO and sends nothing else."""
         return LookingArm(self._config, self._open_bus)
 
+    def log_frames(self, path: Path) -> None:
+        """Keep every frame of the next session in a `.log` of candump's, `.asc` or `.blf`; as in the contract."""
+        self._log_path = require_format(path)
+
+    def logged(self) -> str:
+        """How the log of frames of the last session ended, in words; empty where none was kept."""
+        return "" if self._log is None or self._log.report is None else str(self._log.report)
+
     def open(self) -> None:
         """Lock and open every bus, and tell every drive what it is to do; nothing is energised.
 
@@ -99,10 +111,15 @@ class CanopenArm(Arm):
         if self._buses is not None:
             raise DriverError("the arm is already open")
         self._reset_state()
+        self._log = None
         try:
             if all(bus.interface != "lock_step" for bus in self._driver.buses):
                 self._locks = [BusLock(bus) for bus in self._driver.buses]
-            buses = self._buses = Buses(self._profiles, self._open_bus(self._config), self._period_ns)
+            links = self._open_bus(self._config)
+            if self._log_path is not None:
+                self._log, links = logged_links(links, self._log_path)
+                self._log_path = None
+            buses = self._buses = Buses(self._profiles, links, self._period_ns)
             self.clock = buses.clock
             buses.call()
             self._identities = tuple(self._configured(buses, number) for number in range(len(buses.drives)))
@@ -196,6 +213,8 @@ class CanopenArm(Arm):
             lock.close()
         self._buses, self._locks = None, []
         self._streaming = False
+        if self._log is not None:  # last: everybody is off, and the file may take its time
+            self._log.close()
 
     def _leave(self, buses: Buses) -> None:
         """Let drives that are off forget that a host will be missed; the others shall miss it. Never raises."""
