@@ -99,7 +99,7 @@ def initial_files(root: Path, command: list[str]) -> Iterator[tuple[str, bytes]]
     kept = "".join(f"export {name}={shlex.quote(os.environ[name])}\n" for name in KEPT if name in os.environ)
     yield (
         "command",
-        f"{kept}export HOME=/run TMPDIR=/run\ncd {shlex.quote(os.getcwd())}\n{shlex.join(command)}\n".encode(),
+        f"{kept}export HOME=/run TMPDIR=/run\ncd {shlex.quote(str(Path.cwd()))}\n{shlex.join(command)}\n".encode(),
     )
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
-from ident_service.cli.moving import RELEASED, HeldKey, moved, require_terminal
+from ident_service.cli.moving import RELEASED, HeldKey, add_can_log, moved, require_terminal
 from ident_service.cli.words import Parser, Verbs, seconds, speed
 from ident_service.errors import MotionRefused, UsageError
 
@@ -60,6 +60,7 @@ def _motion(sub: Parser) -> None:
     sub.add_argument(
         "--out", type=Path, metavar="DIR", help="run folder; must not exist (default: below the state folder)"
     )
+    add_can_log(sub)
 
 
 def _chosen(config: ArmConfig, motion: Path | None) -> Excitation:

@@ -341,6 +341,28 @@ def test_a_reset_energises_nothing_and_releases_no_brake(broken):
         broken.arm.exchange(NONE)
 
 
+def test_an_arm_that_only_looks_sees_the_same_and_leaves_everything_as_it_is(broken):
+    before = told(broken.arm)
+    names, position = broken.arm.describe().joint_names, before.position
+    broken.arm.close()
+    for _ in range(2):
+        with broken.arm.look() as looking:
+            says = looking.describe()
+            samples = [looking.exchange(None) for _ in range(5)]
+        assert says.joint_names == names
+        assert 0.0 < says.rate <= 1e9 / PERIOD_NS
+        np.testing.assert_allclose(np.diff([sample.stamp_ns for sample in samples]), 1e9 / says.rate, rtol=1e-6)
+        for sample in samples:
+            assert sample.valid.all()
+            np.testing.assert_array_equal(sample.torque, 0.0)
+            assert sample.status[0] & AxisStatus.FAULT
+            assert not any(word & AxisStatus.POWERED for word in sample.status)
+        np.testing.assert_allclose(samples[-1].position, samples[0].position, atol=1e-3)
+        np.testing.assert_allclose(samples[-1].position, position, atol=0.05)
+    broken.arm.open()
+    assert broken.arm.exchange(None).status[0] & AxisStatus.FAULT
+
+
 def test_a_running_arm_is_not_reset(running):
     running.arm.exchange(np.array([1.0, 1.0]))
     with pytest.raises(DriverError):

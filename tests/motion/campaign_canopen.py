@@ -64,7 +64,9 @@ CANOPEN_PROMISES: dict[str, Promise] = {
     "warning": Promise({"repeated_warnings"}, warns="drive_warning", words=("warns",)),
     "heartbeat_lost": Promise({"drive_silent"}, within=_TIMEOUT + 12, words=("no heartbeat for 0.3 s",)),
     "reboot": Promise({"feedback_gone", "drive_restarted"}, within=MAX_AGE + 1),
-    "wrong_node": Promise({"repeated_warnings"}, within=25, words=("a second position in one cycle", "after its cycle")),
+    "wrong_node": Promise(
+        {"repeated_warnings"}, within=25, words=("a second position in one cycle", "after its cycle")
+    ),
     "short_frame": Promise({"feedback_gone"}, duration=50, within=MAX_AGE + 1),
     "bus_off": Promise({"bus_off"}, within=SOON, words=("bus-off",)),
     "error_passive": Promise({"bus_degraded"}, within=SOON, words=("passive",)),
@@ -123,7 +125,9 @@ class EmulatedArm(WatchedArm):
         states: of the drives, after they have been left alone.
     """
 
-    def __init__(self, config: ArmConfig, strike: Strike | None = None, observer: Callable[[Truth], None] | None = None):
+    def __init__(
+        self, config: ArmConfig, strike: Strike | None = None, observer: Callable[[Truth], None] | None = None
+    ):
         self.behind = LockStepArm(config)
         self.behind.emulator.observer = observer
         self.taps: list[Tapped] = []
