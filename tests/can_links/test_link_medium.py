@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import pytest
@@ -12,7 +13,7 @@ from link_bench import frames
 from drivers.canopen.bits import exact
 from drivers.canopen.bus_errors import BUS_OFF, CONTROLLER, COUNTERS, PASSIVE_RX, PASSIVE_TX, RESTARTED, WARNING_TX
 from drivers.canopen.frame import Frame
-from drivers.canopen.heard import HEARD, is_heard
+from drivers.canopen.heard import HEARD
 from drivers.canopen.wire.hub import ERROR_BITS
 from drivers.canopen.wire.medium import INBOX, QUEUE, Medium, Port, priority
 
@@ -159,15 +160,20 @@ def test_who_does_not_listen_loses_frames_and_is_told_before_the_next_one() -> N
     assert frame.identifier == 0x123
 
 
-def test_a_port_with_the_drivers_filters_hears_what_they_say() -> None:
+@pytest.mark.parametrize(
+    ("filters", "wanted"), [(HEARD, range(0x800)), (((0x080, 0x700), (0x700, 0x7FF)), (*range(0x100), 0x700))]
+)
+def test_a_port_hears_what_its_filters_say(filters: tuple[tuple[int, int], ...], wanted: Sequence[int]) -> None:
     medium = Medium()
-    sender, listener = Port("all"), Port("driver", filters=HEARD)
+    sender, listener = Port("all"), Port("driver", filters=filters)
     medium.add(sender)
     medium.add(listener)
+    passed = []
     for identifier in range(0x800):
         medium.offer(sender, Frame(identifier), 0)
         medium.advance(0)
-        assert bool(heard(listener)) == is_heard(identifier)
+        passed += [frame.identifier for frame in heard(listener)]
+    assert passed == list(wanted)
     medium.offer(sender, Frame(0x100, extended=True), 0)
     medium.advance(0)
     assert heard(listener) == []
