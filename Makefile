@@ -41,7 +41,7 @@ campaign: $(READY)
 
 # Over the kernel's CAN sockets: here where this kernel has them, else in a guest.
 test-socketcan: $(READY)
-	.ci/socketcan/run $(BIN)/python
+	tests/socketcan/guest/run $(BIN)/python
 
 # pip 25.1 is the first to read dependency groups.
 $(READY): pyproject.toml
