@@ -4,7 +4,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: demo test unit coverage lint types bench bench-design campaign clean
+.PHONY: demo test unit coverage lint types bench bench-design campaign test-socketcan clean
 
 demo: $(READY)
 	$(BIN)/ident simulate
@@ -38,6 +38,10 @@ bench-design: $(READY)
 
 campaign: $(READY)
 	$(BIN)/pytest -m campaign --timeout 7200
+
+# Over the kernel's CAN sockets: here where this kernel has them, else in a guest.
+test-socketcan: $(READY)
+	tests/socketcan/guest/run $(BIN)/python
 
 # pip 25.1 is the first to read dependency groups.
 $(READY): pyproject.toml

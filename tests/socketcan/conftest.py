@@ -1,4 +1,4 @@
-"""Interfaces of the kernel; none of this runs where nobody has prepared a network with CAN (.ci/socketcan/run)."""
+"""Interfaces of the kernel; none of this runs where nobody has prepared a network with CAN (guest/run)."""
 
 from __future__ import annotations
 

@@ -10,6 +10,7 @@ Usage: guest.py COMMAND [ARGUMENT...], with the environment's PATH and the prese
 from __future__ import annotations
 
 import gzip
+import lzma
 import os
 import re
 import shlex
@@ -21,13 +22,23 @@ from collections.abc import Iterator
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-BUILD = HERE.parents[1] / "build" / "socketcan"
+BUILD = HERE.parents[2] / "build" / "socketcan"
 LONGEST = 900  # s that a guest may live
 KEPT = ("PATH", "PYTHONPATH", "OPENBLAS_NUM_THREADS", "LANG")
-TOOLS = {"qemu-system-x86_64": "qemu-system-x86", "apt-get": "apt", "dpkg": "dpkg", "setpriv": "util-linux"}
+TOOLS = {  # with the package that has them
+    "qemu-system-x86_64": "qemu-system-x86",
+    "apt-get": "apt",
+    "dpkg": "dpkg",
+    "setpriv": "util-linux",
+    "unshare": "util-linux",
+    "ip": "iproute2",
+    "tc": "iproute2",
+}
 MODULES = ("virtio_pci", "9pnet_virtio", "9p", "overlay", "can-raw", "vcan")  # and whatever they depend on
 MACHINE = (
-    *("qemu-system-x86_64", "-accel", "tcg,thread=multi", "-cpu", "max", "-m", "2048", "-smp", "2"),
+    *("qemu-system-x86_64", "-accel", "tcg", "-cpu", "max", "-m", "2048"),
+    # A computing guest's time is its instructions, at 2 ns each: a busy host makes nobody in it late.
+    *("-icount", "shift=1"),
     *("-nic", "none", "-display", "none", "-monitor", "none", "-no-reboot"),
     # Two serial lines: what is said, and the exit code.
     *("-serial", "stdio"),
@@ -50,7 +61,7 @@ def main(command: list[str]) -> int:
     # However this process ends, the guest ends with it.
     machine = ["setpriv", "--pdeathsig", "KILL", *MACHINE, "-serial", f"file:{code}"]
     try:
-        subprocess.run([*machine, "-kernel", kernel, "-initrd", initial], stdin=subprocess.DEVNULL, timeout=LONGEST)  # noqa: S603
+        subprocess.run([*machine, "-kernel", kernel, "-initrd", initial], stdin=subprocess.DEVNULL, timeout=LONGEST)
     except subprocess.TimeoutExpired:
         sys.exit(f"the guest was switched off after {LONGEST} s")
     except KeyboardInterrupt:
@@ -81,7 +92,7 @@ def unpacked() -> Path:
 
 def output(*command: str) -> str:
     """What a command says; its failure is ours."""
-    done = subprocess.run(command, cwd=BUILD, capture_output=True, text=True)  # noqa: S603
+    done = subprocess.run(command, cwd=BUILD, capture_output=True, text=True)
     if done.returncode:
         sys.exit(f"`{shlex.join(command)}` failed; as root: `apt-get update`\n{done.stderr}")
     return done.stdout
@@ -89,27 +100,27 @@ def output(*command: str) -> str:
 
 def initial_files(root: Path, command: list[str]) -> Iterator[tuple[str, bytes]]:
     """Name and content of what the guest begins with."""
-    yield "bin/busybox", (root / "bin" / "busybox").read_bytes()
-    yield "init", (HERE / "guest_init").read_bytes()
-    files = {file.stem.replace("-", "_"): file for file in root.glob("lib/modules/*/kernel/**/*.ko")}
-    order = [name for wanted in MODULES for name in needed(wanted.replace("-", "_"), files)]
-    yield "modules/order", "".join(f"{name}\n" for name in dict.fromkeys(order)).encode()
-    for name in dict.fromkeys(order):
-        yield f"modules/{name}.ko", files[name].read_bytes()
+    yield "bin/busybox", next(root.glob("**/bin/busybox")).read_bytes()
+    yield "init", (HERE / "init").read_bytes()
+    files = {file.name.split(".")[0].replace("-", "_"): file for file in root.glob("**/lib/modules/*/kernel/**/*.ko*")}
+    modules = dict(pair for name in MODULES for pair in needed(name.replace("-", "_"), files))
+    yield "modules/order", "".join(f"{name}\n" for name in modules).encode()
+    for name, content in modules.items():
+        yield f"modules/{name}.ko", content
     kept = "".join(f"export {name}={shlex.quote(os.environ[name])}\n" for name in KEPT if name in os.environ)
-    yield (
-        "command",
-        f"{kept}export HOME=/run TMPDIR=/run\ncd {shlex.quote(str(Path.cwd()))}\n{shlex.join(command)}\n".encode(),
-    )
+    place = f"export HOME=/run TMPDIR=/run\ncd {shlex.quote(str(Path.cwd()))}\n"
+    yield "command", f"{kept}{place}{shlex.join(command)}\n".encode()
 
 
-def needed(module: str, files: dict[str, Path]) -> Iterator[str]:
-    """A module after those that it depends on, as its section .modinfo says."""
-    found = re.search(rb"\0depends=([^\0]*)", files[module].read_bytes())
-    for other in found[1].decode().split(",") if found else ():
-        if other:
-            yield from needed(other.replace("-", "_"), files)
-    yield module
+def needed(module: str, files: dict[str, Path]) -> Iterator[tuple[str, bytes]]:
+    """A module, by name and content, after those that it depends on, as its section .modinfo says."""
+    content = files[module].read_bytes()
+    if files[module].suffix == ".xz":  # since Debian 13
+        content = lzma.decompress(content)
+    found = re.search(rb"\0depends=([^\0]*)", content)
+    for other in filter(None, found[1].decode().split(",") if found else ()):
+        yield from needed(other.replace("-", "_"), files)
+    yield module, content
 
 
 def archive(files: Iterator[tuple[str, bytes]]) -> Iterator[bytes]:

@@ -1,0 +1,128 @@
+"""A whole motion over the kernel's CAN: the drives in one process, driver and loop in this one, real time.
+
+The rate is one that an emulated machine keeps. The arm lies level, so that nothing falls while its drives are enabled
+with zero torque over slow cycles.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ident_service.config.canopen import CanopenDriver
+from ident_service.config.load import load_arm, shipped_arms
+from ident_service.estimation.identify import identify
+from ident_service.excitation.plan import excitation
+from ident_service.model.arm_model import arm_model
+from ident_service.motion.factory import make_arm
+from ident_service.motion.states import State
+from ident_service.record.open import open_recording
+from ident_service.service.commission import record_motion
+
+pytestmark = pytest.mark.timeout(900)
+PATIENCE = 300.0  # s, for a machine that emulates another one and has more to do
+
+ARM = """
+extends: {planar2}
+name: planar2_canopen
+gravity: [0, 0, -9.81]
+control: {{rate: 20, velocity_cutoff: 10}}
+joints:
+  shoulder: {{kp: 16, kd: 6, following_error: 0.8}}
+  elbow: {{kp: 16, kd: 6, following_error: 0.8}}
+motions:
+  identification: {{kind: seeded, seed: 1, base_frequency: 0.2, harmonics: 3, periods: 2}}
+  validation: {{kind: seeded, seed: 2, base_frequency: 0.2, harmonics: 3, periods: 2}}
+transmission: {{ratios: [40, -20], drive_terms: joints}}
+driver:
+  kind: canopen
+  eds: {eds}
+  buses: [{{interface: {interface}, channel: {channel}}}]
+  torque_deadline: 1.0
+  bring_up: 10.0
+  heartbeats: {{period: 1.0, drives: 1.0, timeout: 5.0}}
+  drives:
+    - {{node: 1, rated_torque: 0.1, max_torque: 1.2, max_speed: 6000}}
+    - {{node: 2, rated_torque: 0.1, max_torque: 0.9, max_speed: 6000}}
+  emulation:
+    seed: 1
+    truth:
+      {{Lxx1: 0.0034, Lxy1: 0.0106, Lyy1: 0.178, Lzz1: 0.179, lx1: -0.53, ly1: 0.04, m1: 2.15,
+       Ia1: 0.03, fv1: 0.4, fc1: 0.1, fo1: 0.05,
+       Lxx2: 0.0021, Lxy2: -0.0054, Lyy2: 0.091, Lzz2: 0.092, lx2: -0.27, ly2: -0.02, m2: 1.08,
+       Ia2: 0.012, fv2: 0.2, fc2: 0.05, fo2: -0.03}}
+    torque_noise: [0.05, 0.02]
+"""
+
+
+@contextmanager
+def emulated(arm: Path) -> Iterator[dict[str, object]]:
+    """`ident emulate` in a process of its own; what it says at its end is in the dictionary then."""
+    words = [sys.executable, "-m", "ident_service", "emulate", str(arm), "--json"]
+    pipe, said, document = subprocess.PIPE, list[str](), dict[str, object]()
+    with subprocess.Popen(words, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        reader = threading.Thread(target=said.extend, args=(process.stderr,), daemon=True)
+        reader.start()
+
+        def says(words: str, since: int = 0) -> None:
+            end = time.monotonic() + PATIENCE
+            while not any(words in line for line in said[since:]):
+                assert process.poll() is None, said
+                assert time.monotonic() < end, said
+                time.sleep(0.1)
+
+        try:
+            says("node 2: pre operational")
+            begun = len(said)
+            yield document
+            says("the arm is at rest", begun)
+            process.send_signal(signal.SIGINT)
+            document |= json.loads(process.stdout.read())
+            assert process.wait(PATIENCE) == 0
+        finally:
+            process.kill()
+            reader.join()
+
+
+@pytest.mark.parametrize("interface", ["raw", "socketcan"])
+def test_a_motion_over_a_real_bus_identifies_the_arm(interface: str, can_interface: str, tmp_path: Path) -> None:
+    planar2 = shipped_arms()["planar2"]
+    path, recording = tmp_path / "arm.yaml", tmp_path / "identification.mcap"
+    path.write_text(
+        ARM.format(planar2=planar2, eds=planar2.parent / "puck.eds", interface=interface, channel=can_interface)
+    )
+    config = load_arm(path)
+    model = arm_model(config)
+    motion = excitation(model, "identification")
+    with emulated(path) as drives:
+        report = record_motion(make_arm(config), model, motion, recording)
+    print(f"{interface}: {report}\ndrives: {drives}")
+    assert report.state is State.DONE
+    assert drives["at_rest"] is True
+    assert drives["unsent"] == 0
+    # At every SYNC both drives tell where they are; torque and SYNC are two frames a cycle.
+    assert isinstance(drives["sent"], int)
+    assert isinstance(drives["heard"], int)
+    assert min(drives["sent"], drives["heard"]) >= 2 * report.cycles
+
+    estimate = identify(model, [open_recording(recording, model.chain.names)])
+    assert isinstance(config.driver, CanopenDriver)
+    assert config.driver.emulation.truth is not None
+    truth = estimate.base.K @ model.layout.vector(config.driver.emulation.truth)
+    deviations = np.abs(estimate.beta - truth) / estimate.standard_deviations
+    identified = np.array([verdict == "identified" for verdict in estimate.verdicts])
+    print(f"identified {identified.sum()} of {len(truth)}, deviations {deviations.round(1)}")
+    assert identified.sum() >= 6
+    assert deviations[identified].max() <= 4.0
