@@ -7,18 +7,16 @@ own deadlines.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 
 from campaign_bench import _READ_WRONGLY, _UNTRUE, Promise, Strike, Subject, wam_config
+from helpers.emulated_arms import EDS, Tapped, tapped
 from motion_bench import TRUTH, WatchedArm, bench_config
 
 from drivers.arm import Sample
 from drivers.canopen.arm import CanopenArm
 from drivers.canopen.frame import Frame
-from drivers.clock import Clock
-from ident_service.config.canopen import CanopenDriver
 from ident_service.config.limits import motion_limits
 from ident_service.config.schema import ArmConfig
 from ident_service.excitation.plan import excitation
@@ -26,10 +24,9 @@ from ident_service.model.arm_model import arm_model
 from ident_service.motion.checks import MAX_AGE
 from sim_backend.machine import Truth
 from sim_backend.pucks.faults import PUCK_FAULTS, PuckFault
-from sim_backend.pucks.lock_step import LockStepArm, LockStepLink
+from sim_backend.pucks.lock_step import LockStepArm
 
 PERIOD = 1e-3
-EDS = (Path(__file__).parents[2] / "configs" / "puck.eds").read_text(encoding="utf-8")
 # Sent by somebody else; a torque frame, a control word and an NMT command are those that would do harm.
 FOREIGN: dict[str, Frame] = {
     "foreign_sync": Frame(0x080),
@@ -64,54 +61,13 @@ CANOPEN_PROMISES: dict[str, Promise] = {
     "warning": Promise({"repeated_warnings"}, warns="drive_warning", words=("warns",)),
     "heartbeat_lost": Promise({"drive_silent"}, within=_TIMEOUT + 12, words=("no heartbeat for 0.3 s",)),
     "reboot": Promise({"feedback_gone", "drive_restarted"}, within=MAX_AGE + 1),
-    "wrong_node": Promise({"repeated_warnings"}, within=25, words=("a second position in one cycle", "after its cycle")),
+    "wrong_node": Promise({"repeated_warnings"}, within=25, words=("second position", "after its cycle")),
     "short_frame": Promise({"feedback_gone"}, duration=50, within=MAX_AGE + 1),
     "bus_off": Promise({"bus_off"}, within=SOON, words=("bus-off",)),
     "error_passive": Promise({"bus_degraded"}, within=SOON, words=("passive",)),
     "lost_torques": Promise({"drive_emergency"}, duration=50, within=_DEADLINE + SOON, words=("8250h RPDO timeout",)),
     **{kind: Promise({"second_host"}, within=SOON, words=("somebody else",)) for kind in FOREIGN},
 }
-
-
-class Tapped:
-    """A link whose host may lose frames that it sends, and hear frames that a third party sends.
-
-    Attributes:
-        sent: by the host.
-        loses: which frames get lost.
-    """
-
-    def __init__(self, link: LockStepLink) -> None:
-        self._link = link
-        self._foreign: list[Frame] = []
-        self.sent: list[Frame] = []
-        self.loses: Callable[[Frame], bool] = lambda frame: False
-
-    @property
-    def clock(self) -> Clock:
-        return self._link.clock
-
-    def disturb(self, frames: Sequence[Frame], *, drives_hear: bool = True) -> None:
-        """Somebody else sends frames, which the host hears next, and the drives now."""
-        for frame in frames:
-            if drives_hear:
-                self._link.send(frame)
-            self._foreign.append(frame._replace(stamp_ns=self.clock.now_ns()))
-
-    def send(self, frame: Frame) -> None:
-        self.sent.append(frame)
-        if not self.loses(frame):
-            self._link.send(frame)
-
-    def receive(self, deadline_ns: int) -> Frame | None:
-        return self._foreign.pop(0) if self._foreign else self._link.receive(deadline_ns)
-
-    def drain(self) -> Sequence[Frame]:
-        heard, self._foreign = self._foreign, []
-        return [*heard, *self._link.drain()]
-
-    def close(self) -> None:
-        self._link.close()
 
 
 class EmulatedArm(WatchedArm):
@@ -123,7 +79,9 @@ class EmulatedArm(WatchedArm):
         states: of the drives, after they have been left alone.
     """
 
-    def __init__(self, config: ArmConfig, strike: Strike | None = None, observer: Callable[[Truth], None] | None = None):
+    def __init__(
+        self, config: ArmConfig, strike: Strike | None = None, observer: Callable[[Truth], None] | None = None
+    ) -> None:
         self.behind = LockStepArm(config)
         self.behind.emulator.observer = observer
         self.taps: list[Tapped] = []
@@ -133,8 +91,7 @@ class EmulatedArm(WatchedArm):
         self.before_exchange = self._break
 
     def _links(self, config: ArmConfig) -> list[Tapped]:
-        assert isinstance(config.driver, CanopenDriver)
-        self.taps = [Tapped(self.behind.link(number)) for number in range(len(config.driver.buses))]
+        self.taps = tapped(self.behind, config)
         return self.taps
 
     def exchange(self, torque: object) -> Sample:
