@@ -10,7 +10,7 @@ demo: $(READY)
 	$(BIN)/ident simulate
 
 test: lint types coverage
-	$(BIN)/pytest -m "not campaign"
+	$(BIN)/pytest -n 2 -m "not campaign"
 
 unit: $(READY)
 	$(BIN)/pytest -n 2 -m "not campaign and not slow"

@@ -13,6 +13,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from enum import Enum
+from pathlib import Path
 from types import TracebackType
 from typing import Self
 
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from drivers.clock import Clock
 from drivers.status import AxisEvent
+from ident_service.errors import DriverError
 
 Vector = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -72,6 +74,8 @@ class Sample:
         lost: frames lost since `open`.
         status: slow per-axis status words, with `status_age` cycles since they were read.
         events: what happened on the bus since the sample before.
+        drives: what each drive says of itself, in the words of its fieldbus, for people; empty where there is nothing
+            to add to `status`.
     """
 
     cycle: int
@@ -85,12 +89,37 @@ class Sample:
     status: tuple[int, ...] = field(default=())
     status_age: int = 0
     events: tuple[AxisEvent, ...] = ()
+    drives: tuple[str, ...] = ()
 
 
 class Arm(ABC):
     """A context manager with a handful of methods. Entering opens, leaving closes; closing stops torque first."""
 
     clock: Clock
+
+    def look(self) -> Arm:
+        """The same hardware as an arm that only looks, not open; this one must not be open beside it.
+
+        Of what is returned only `open`, `describe`, `exchange(None)` and `close` are used, and none of them sends a
+        command, changes what a drive does or is configured to do, or keeps its watchdog quiet. It may be slower
+        (`ArmDescription.rate`). By default it is this arm itself, which is right where opening changes nothing.
+        """
+        return self
+
+    def log_frames(self, path: Path) -> None:
+        """Keep every frame of the fieldbus of the next session, from `open` to `close`.
+
+        Args:
+            path: of the file, which must not exist when the arm is opened; its suffix says its format.
+
+        Raises:
+            DriverError: this arm has no frames, or no such format is known.
+        """
+        raise DriverError("this arm has no fieldbus whose frames could be logged")
+
+    def logged(self) -> str:
+        """How the log of frames of the last session ended, in words; empty where none was kept."""
+        return ""
 
     @abstractmethod
     def open(self) -> None:
@@ -141,7 +170,7 @@ class Arm(ABC):
     def stop(self, kind: StopKind) -> None:
         """Stop from any state, any number of times; never raises.
 
-        The torque of the last sample ends with its period.
+        The torque of the last sample ends with its period at the latest.
         """
 
     @abstractmethod

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 
@@ -26,10 +27,12 @@ from drivers.canopen.enabling import Enabling, Resetting
 from drivers.canopen.events import axis_events
 from drivers.canopen.link import Link, open_links
 from drivers.canopen.lock import BusLock
+from drivers.canopen.looking import LookingArm
 from drivers.canopen.profile import Write, bus_profiles
+from drivers.canopen.session_log import SessionLog, logged_links, require_format
 from drivers.canopen.setup import Setup, configure, identify
-from drivers.canopen.words import DISABLE_VOLTAGE, QUICK_STOP, NmtCommand, axis_status
-from drivers.clock import Clock, RealClock
+from drivers.canopen.words import DISABLE_VOLTAGE, QUICK_STOP, NmtCommand, axis_status, joint_status
+from drivers.clock import Clock, RealClock, VirtualClock
 from drivers.status import AxisEvent, AxisEventCode, AxisStatus
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.schema import ArmConfig
@@ -64,17 +67,19 @@ class CanopenArm(Arm):
             raise DriverError(f"{config.name}: joints must name all {len(config.driver.drives)} joints")
         # Joints that each drive moves, and drives that each joint needs.
         self._joints_of = {k: joints for motors, joints in self._coordinates.groups for k in motors}
-        self._drives_of = [
-            next(motors for motors, joints in self._coordinates.groups if j in joints) for j in range(len(self._limits))
-        ]
+        self._drives_of = self._coordinates.motors_of
         joints = list(config.joints)
         self._names = [
             f"{' and '.join(joints[j] for j in self._joints_of[k])}: drive {drive.node}"
             for k, drive in enumerate(config.driver.drives)
         ]
-        self.clock: Clock = RealClock()
+        # Until the buses are open and bring theirs.
+        in_step = all(bus.interface == "lock_step" for bus in config.driver.buses)
+        self.clock: Clock = VirtualClock() if in_step else RealClock()
         self._buses: Buses | None = None
         self._locks: list[BusLock] = []
+        self._log_path: Path | None = None
+        self._log: SessionLog | None = None
         self._reset_state()
 
     def _reset_state(self) -> None:
@@ -86,6 +91,18 @@ class CanopenArm(Arm):
         self._silent: set[int] = set()
         self._identities: tuple[str, ...] = ()
 
+    def look(self) -> Arm:
+        """An arm that reads the drives' objects by SDO and sends nothing else."""
+        return LookingArm(self._config, self._open_bus)
+
+    def log_frames(self, path: Path) -> None:
+        """Keep every frame of the next session in a `.log` of candump's, `.asc` or `.blf`; as in the contract."""
+        self._log_path = require_format(path)
+
+    def logged(self) -> str:
+        """How the log of frames of the last session ended, in words; empty where none was kept."""
+        return "" if self._log is None or self._log.report is None else str(self._log.report)
+
     def open(self) -> None:
         """Lock and open every bus, and tell every drive what it is to do; nothing is energised.
 
@@ -96,10 +113,15 @@ class CanopenArm(Arm):
         if self._buses is not None:
             raise DriverError("the arm is already open")
         self._reset_state()
+        self._log = None
         try:
-            if all(bus.interface != "lock_step" for bus in self._driver.buses):
+            if not self.clock.lock_step:
                 self._locks = [BusLock(bus) for bus in self._driver.buses]
-            buses = self._buses = Buses(self._profiles, self._open_bus(self._config), self._period_ns)
+            links = self._open_bus(self._config)
+            if self._log_path is not None:
+                self._log, links = logged_links(links, self._log_path)
+                self._log_path = None
+            buses = self._buses = Buses(self._profiles, links, self._period_ns)
             self.clock = buses.clock
             buses.call()
             self._identities = tuple(self._configured(buses, number) for number in range(len(buses.drives)))
@@ -132,7 +154,9 @@ class CanopenArm(Arm):
         self._no_torque()
         self._streaming = True
         try:
-            self._through(buses, Enabling(buses.drives, self._names, self._driver.bring_up, self.clock.now_ns()))
+            reports = self._driver.status.inhibit, self._driver.status.period
+            steps = Enabling(buses.drives, self._names, self._driver.bring_up, self.clock.now_ns(), reports)
+            self._through(buses, steps)
         except BaseException:
             self.stop(StopKind.TORQUE_OFF)
             raise
@@ -193,6 +217,8 @@ class CanopenArm(Arm):
             lock.close()
         self._buses, self._locks = None, []
         self._streaming = False
+        if self._log is not None:  # last: everybody is off, and the file may take its time
+            self._log.close()
 
     def _leave(self, buses: Buses) -> None:
         """Let drives that are off forget that a host will be missed; the others shall miss it. Never raises."""
@@ -202,8 +228,11 @@ class CanopenArm(Arm):
         for number, drive in enumerate(buses.drives):
             off = drive.status is not None and not axis_status(drive.status) & AxisStatus.POWERED
             if off and drive.answered:
+                objects = buses.objects(number)
                 with suppress(Exception):
-                    buses.objects(number).write(Write(od.ABORT_CONNECTION, 0))
+                    objects.write(Write(od.ABORT_CONNECTION, 0))
+                with suppress(Exception):  # or it would report 8130h a moment after every session
+                    objects.write(Write(od.HEARTBEAT_CONSUMER, 0))
         with suppress(Exception):
             buses.command(NmtCommand.ENTER_PRE_OPERATIONAL)
 
@@ -312,14 +341,11 @@ def from_config(config: ArmConfig, clock: Clock | None = None) -> CanopenArm:
 
 
 def _status(drives: Sequence[Drive]) -> int:
-    """Of a joint: powered when all its drives are, in trouble when one of them is."""
-    powered, trouble = True, AxisStatus(0)
+    words = []
     for drive in drives:
         error = 0 if drive.emergency is None else drive.emergency.code
-        word = AxisStatus(0) if drive.status is None else axis_status(drive.status, error)
-        powered = powered and bool(word & AxisStatus.POWERED)
-        trouble |= word & ~AxisStatus.POWERED
-    return int(trouble | (AxisStatus.POWERED if powered else 0))
+        words.append(AxisStatus(0) if drive.status is None else axis_status(drive.status, error))
+    return int(joint_status(words))
 
 
 def _frozen(array: Vector) -> Vector:

@@ -59,6 +59,11 @@ class Coordinates:
     groups: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
 
     @property
+    def motors_of(self) -> list[tuple[int, ...]]:
+        """The motors that each joint's position is worked out from, by number."""
+        return [next(motors for motors, joints in self.groups if j in joints) for j in range(len(self.offset))]
+
+    @property
     def torque_limit(self) -> Vector:
         """The most each joint can be given while the others are given nothing [N m or N], shape (n,)."""
         with np.errstate(divide="ignore"):

@@ -42,6 +42,33 @@ class LogReport:
     lost: int
     error: str = ""
 
+    def __str__(self) -> str:
+        """For people."""
+        lost = f", {self.lost} LOST" if self.lost else ""
+        return f"{self.written} frames{lost}" + (f"; {self.error}" if self.error else "")
+
+
+def require_format(path: Path | str) -> Path:
+    """The path of a log whose suffix names a format; raises DriverError for another one."""
+    if Path(path).suffix.lower() not in SUFFIXES:
+        raise DriverError(f"{path}: a log of CAN frames ends in {', '.join(SUFFIXES)}")
+    return Path(path)
+
+
+def logged_links(links: Sequence[Link], path: Path) -> tuple[SessionLog, list[Link]]:
+    """Open links whose frames go into a new file from now on, and its log, to be closed after them.
+
+    Raises:
+        DriverError: the file cannot be created; the links are closed then.
+    """
+    try:
+        log = SessionLog(path, links[0].clock)
+    except BaseException:
+        for link in links:
+            link.close()
+        raise
+    return log, [log.link(link, number) for number, link in enumerate(links)]
+
 
 class SessionLog:
     """A log of one or several buses; a context manager.
@@ -62,9 +89,7 @@ class SessionLog:
         Raises:
             DriverError: another suffix, or the file cannot be created.
         """
-        self.path = Path(path)
-        if self.path.suffix.lower() not in SUFFIXES:
-            raise DriverError(f"{path}: a log of CAN frames ends in {', '.join(SUFFIXES)}")
+        self.path = require_format(path)
         self.lost = 0
         self.report: LogReport | None = None
         self._clock = clock
@@ -74,6 +99,7 @@ class SessionLog:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "drivers.canopen.session_log_process"],
                 stdin=theirs.fileno(),
+                stdout=subprocess.DEVNULL,  # ours may be a pipe whose end means that we are gone
                 start_new_session=True,
             )
         request = {"path": str(self.path.absolute()), "utc_offset_ns": clock.utc_offset_ns}
@@ -82,7 +108,8 @@ class SessionLog:
         if answer.get("error") != "":
             self._end()
             raise DriverError(f"{path}: {answer.get('error', 'the process that writes the log did not start')}")
-        self._socket.setblocking(False)
+        # Time that stands still may wait for the file; a machine's may not.
+        self._socket.settimeout(_FINISH_S if clock.lock_step else 0.0)
 
     def __enter__(self) -> Self:
         """Nothing more to do."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import heapq
 import json
+import os
 import socket
 import sys
 from contextlib import suppress
@@ -108,8 +109,17 @@ class OrderedLog:
 
 def main() -> int:
     """Write one log; 0 when it is whole."""
+    _step_back()
     with socket.socket(fileno=sys.stdin.fileno()) as source:
         return _serve(source)
+
+
+def _step_back() -> None:
+    """Give up what the loop has got for itself and its children inherit: its priority and its core."""
+    with suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    with suppress(OSError):
+        os.sched_setaffinity(0, range(os.cpu_count() or 1))
 
 
 def _serve(source: socket.socket) -> int:

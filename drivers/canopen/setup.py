@@ -6,6 +6,7 @@ it does: SYNC's period and window, the interpolation period, PDOs that are only 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from drivers.canopen import dictionary as od
@@ -15,9 +16,9 @@ from drivers.canopen.sdo import DOES_NOT_EXIST, READ_ONLY, Objects, SdoRefused
 from ident_service.config.canopen import CanopenDrive, DriveIdentity, Reactions
 from ident_service.errors import DriverError
 
-_DRIVE_PROFILE = 402  # low word of 1000h
+DRIVE_PROFILE = 402  # low word of 1000h
 _FIRMWARE = 0x100A
-_IDENTITY = {"vendor": od.VENDOR, "product": od.PRODUCT, "revision": od.REVISION, "serial": od.SERIAL}
+IDENTITY = {"vendor": od.VENDOR, "product": od.PRODUCT, "revision": od.REVISION, "serial": od.SERIAL}
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,15 @@ class Setup:
         return todo
 
 
+def differences(found: Mapping[str, int], wanted: DriveIdentity) -> list[str]:
+    """What of an identity (1018h), by the keys of `IDENTITY`, is another than the configuration wants; in words."""
+    return [
+        f"{name} is {found[name]:08X}h instead of {value:08X}h" if name in found else f"{name} is not told"
+        for name, value in wanted.model_dump(exclude_none=True).items()
+        if found.get(name) != value
+    ]
+
+
 def identify(objects: Objects, wanted: DriveIdentity) -> str:
     """Ask a drive who it is.
 
@@ -73,26 +83,16 @@ def identify(objects: Objects, wanted: DriveIdentity) -> str:
         DriverError: it does not answer, is no drive, or not the one that the configuration names.
     """
     kind = objects.read(od.DEVICE_TYPE)
-    if kind & 0xFFFF != _DRIVE_PROFILE:
+    if kind & 0xFFFF != DRIVE_PROFILE:
         raise DriverError(f"node {objects.node}: is no drive of CiA 402 (1000h is {kind:08X}h)")
     found = {}
-    for name, entry in (
-        ("vendor", od.VENDOR),
-        ("product", od.PRODUCT),
-        ("revision", od.REVISION),
-        ("serial", od.SERIAL),
-    ):
+    for name, entry in IDENTITY.items():
         try:
             found[name] = objects.read(entry)
         except SdoRefused as refused:  # all but the vendor are optional (CiA 301, 7.5.2.19)
             if refused.code not in DOES_NOT_EXIST:
                 raise
-    others = [
-        f"{name} is {found[name]:08X}h" if name in found else f"{name} is not told"
-        for name, value in wanted.model_dump(exclude_none=True).items()
-        if found.get(name) != value
-    ]
-    if others:
+    if others := differences(found, wanted):
         raise DriverError(f"node {objects.node}: is not the drive that the configuration names: {', '.join(others)}")
     try:
         firmware = objects.read_bytes(_FIRMWARE, 0, "software version").decode("ascii", "replace").strip("\0 ")

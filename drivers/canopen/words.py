@@ -6,6 +6,7 @@ data, and the look-ups into it; nothing here knows a bus.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from enum import Enum, IntEnum
 
 from drivers.status import AxisStatus
@@ -199,6 +200,15 @@ def axis_status(status: int, emergency: int = 0) -> AxisStatus:
     return found | AxisStatus.WATCHDOG if emergency in _WATCHDOGS else found
 
 
+def joint_status(drives: Iterable[AxisStatus]) -> AxisStatus:
+    """Of a joint that some drives move: powered when all of them are, in trouble when one of them is."""
+    powered, trouble = True, AxisStatus(0)
+    for word in drives:
+        powered = powered and bool(word & AxisStatus.POWERED)
+        trouble |= word & ~AxisStatus.POWERED
+    return trouble | AxisStatus.POWERED if powered else trouble
+
+
 def emergency_words(code: int, register: int = 0, vendor: bytes = b"") -> str:
     """An emergency for people: `8250h RPDO timeout: no torque frame came in time (error register: communication)`."""
     name = EMERGENCIES.get(code)
@@ -207,9 +217,26 @@ def emergency_words(code: int, register: int = 0, vendor: bytes = b"") -> str:
         group = EMERGENCIES.get(code & 0xFFF0) or EMERGENCIES.get(code & 0xFF00) or EMERGENCIES.get(code & 0xF000)
         name = f"unknown code of the group {group!r}" if group else "unknown code"
     words = f"{code:04X}h {name}"
-    if bits := [bit for place, bit in enumerate(ERROR_REGISTER) if register >> place & 1]:
-        words += f" (error register: {', '.join(bits)})"
+    if register:
+        words += f" (error register: {register_words(register)})"
     return words + (f", vendor's bytes {vendor.hex(' ')}" if any(vendor) else "")
+
+
+def register_words(register: int) -> str:
+    """An error register (1001h) for people: `generic, communication`."""
+    return ", ".join(bit for place, bit in enumerate(ERROR_REGISTER) if register >> place & 1)
+
+
+def drive_words(status: int, emergency: int = 0) -> str:
+    """A status word (6041h) for people: `fault, warning (8130h life guard or heartbeat)`.
+
+    Args:
+        status: the word.
+        emergency: code of the error that the drive has (603Fh), 0 for none.
+    """
+    bits = ((WARNING, "warning"), (INTERNAL_LIMIT, "limits its torque"))
+    words = ", ".join([str(state_of(status)), *(name for bit, name in bits if status & bit)])
+    return f"{words} ({emergency_words(emergency)})" if emergency else words
 
 
 def abort_words(code: int) -> str:

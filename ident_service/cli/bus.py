@@ -1,6 +1,6 @@
-"""Verbs about fieldbuses: `bus load`.
+"""Verbs about fieldbuses: `bus load`, `bus scan`.
 
-Boundary: words to requests, results to words; the work is `service/bus.py`.
+Boundary: words to requests, results to words; the work is `service/bus.py` and `service/bus_scan.py`.
 """
 
 from __future__ import annotations
@@ -10,13 +10,18 @@ import argparse
 from ident_service.cli.answer import DONE, VERDICT_NO, Answer
 from ident_service.cli.words import Verbs, frequency
 
+_HELP_ARM = "description file, or the name of a shipped one"
+
 
 def add(verbs: Verbs) -> None:
     """Register the verbs."""
     bus = verbs.group("bus", "the fieldbus of an arm")
     load = bus.add("load", _load, "what every frame costs, and whether all of them fit (exit code 3: they do not)")
-    load.add_argument("arm", metavar="ARM", help="description file, or the name of a shipped one")
+    load.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     load.add_argument("--rate", type=frequency, metavar="HZ", help="cycles per second (default: control.rate)")
+    text = "who is on the buses: state, identity, errors; sends SDO uploads only (exit code 3: not who is configured)"
+    sub = bus.add("scan", _scan, text)
+    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
 
 
 def _load(arguments: argparse.Namespace) -> Answer:
@@ -26,3 +31,12 @@ def _load(arguments: argparse.Namespace) -> Answer:
     config = load_arm(arguments.arm)
     found = bus_load(config, arguments.rate)
     return DONE if found.fits else VERDICT_NO, bus_text(config.name, found), bus_document(config.name, found)
+
+
+def _scan(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.load import load_arm
+    from ident_service.service.bus_scan import bus_scan, scan_document, scan_text
+
+    config = load_arm(arguments.arm)
+    found = bus_scan(config)
+    return DONE if found.complete else VERDICT_NO, scan_text(config, found), scan_document(config, found)

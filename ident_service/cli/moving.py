@@ -17,6 +17,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.answer import DONE, Answer, state_folder, tell
+from ident_service.cli.words import Parser
 from ident_service.errors import MotionRefused, UsageError
 
 if TYPE_CHECKING:
@@ -118,7 +119,7 @@ def moved(
     """Move the arm and say how it went.
 
     Args:
-        arguments: with `out` and `state`.
+        arguments: with `out`, `state` and `can_log`.
         config: of the arm.
         motion: or destination.
         sentence: what is about to happen, told with the folder.
@@ -149,12 +150,20 @@ def moved(
         read_ticket(path),
         speed=speed,
         lease=LEASE_SECONDS if lease is None else lease,
+        log_frames=arguments.can_log,
         tell=lambda word: tell(arguments, word),
         stop_requested=stop_requested,
     )
     files = "".join(f"  {path.name}\n" for path in sorted(folder.iterdir()))
     text = _report_text(ran.report) + f"files: {folder}\n" + files
     return DONE, text, {"folder": str(folder), "report": ran.report}
+
+
+def add_can_log(sub: Parser) -> None:
+    """The option of every verb that moves an arm."""
+    sub.add_argument(
+        "--can-log", action="store_true", help="keep every frame of the fieldbus in can.log, beside the recording"
+    )
 
 
 def require_terminal(arguments: argparse.Namespace) -> int:
@@ -172,6 +181,7 @@ def require_terminal(arguments: argparse.Namespace) -> int:
 
 
 def _report_text(report: dict[str, Any]) -> str:
+    frames = f"can.log: {report['frames_logged']}\n" if "frames_logged" in report else ""
     warnings = ", ".join(f"{code} {count} times" for code, count in report["warnings"].items()) or "none"
     lateness, compute = report["lateness"], report["compute"]
     return (
@@ -181,4 +191,5 @@ def _report_text(report: dict[str, Any]) -> str:
         f"at worst {lateness['worst_us']:.0f} us\n"
         f"computed for below {compute['median_below_us']:g} us (median), {compute['p999_below_us']:g} us (99.9 %), "
         f"at worst {compute['worst_us']:.0f} us\n"
+        f"{frames}"
     )

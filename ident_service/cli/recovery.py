@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
-from ident_service.cli.moving import moved
+from ident_service.cli.moving import add_can_log, moved
 from ident_service.cli.words import Verbs
 from ident_service.errors import UsageError
 
@@ -30,12 +30,14 @@ def add(verbs: Verbs) -> None:
     sub = verbs.add("home", _home, "lead the arm home, at a tenth of its velocity limits at most")
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("--out", type=Path, metavar="DIR", help=_HELP_OUT)
+    add_can_log(sub)
     sub = verbs.add(
         "recover", _recover, "after a fault or a stop: what is in the way, and what to do (exit code 3: something is)"
     )
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("--leave-limit", action="store_true", help="MOVE the arm: slowly back inside its position limits")
     sub.add_argument("--out", type=Path, metavar="DIR", help=_HELP_OUT)
+    add_can_log(sub)
 
 
 def _home(arguments: argparse.Namespace) -> Answer:
@@ -57,6 +59,8 @@ def _recover(arguments: argparse.Namespace) -> Answer:
         return _slowly(arguments, config, Destination.INSIDE)
     if arguments.out is not None:
         raise UsageError("--out is for the recording of --leave-limit; without it nothing moves")
+    if arguments.can_log:
+        raise UsageError("--can-log is for --leave-limit; without it nothing moves")
     found = recover(config, state_folder(arguments))
     document = {
         "arm": found.arm,

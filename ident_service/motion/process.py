@@ -42,6 +42,7 @@ from ident_service.motion.states import State
 from ident_service.record.cycle import Cycle
 from ident_service.record.ring_sink import RingSink, SinkEnds
 
+FRAMES = "can.log"  # in the run folder, where they were asked for
 _STATES = frozenset(state.value for state in State)
 
 
@@ -136,6 +137,8 @@ def _moved(request: dict[str, Any], controls: ControlFile, latch: Latch) -> dict
     plan: Plan = GoTo(Destination(request["destination"])) if motion is None else Excite(motion, request["speed"])
     model = arm_model(config)
     arm = make_arm(config)
+    if request["log_frames"]:
+        arm.log_frames(Path(request["folder"]) / FRAMES)
     ring = RingSink(SinkEnds(*request["ends"]), request["recording"], lock_step=arm.clock.lock_step)
     sink = TimedSink(ring)
     lifeline = Lifeline(controls, sys.stdin.fileno(), lock_step=arm.clock.lock_step)
@@ -164,6 +167,7 @@ def _moved(request: dict[str, Any], controls: ControlFile, latch: Latch) -> dict
         "real_time": sentence,
         "lateness": sink.lateness.document(),
         "compute": sink.compute.document(),
+        **({"frames_logged": arm.logged()} if request["log_frames"] else {}),
     }
 
 

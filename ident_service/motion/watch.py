@@ -1,6 +1,6 @@
 """Watch: a look at an arm that cannot move it. Nothing is energised, no torque is sent, not even a stop.
 
-Only `open`, `describe`, `exchange(None)` and `close` of the contract are used.
+Only `look`, and `open`, `describe`, `exchange(None)` and `close` of what it returns, are used of the contract.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ class Watched:
         oldest: largest age of an answer [cycles].
         lost: frames lost since the arm was opened.
         status: last status word per axis; empty where the driver gives none.
+        drives: last words of each drive; empty where the driver gives none.
     """
 
     joint_names: tuple[str, ...]
@@ -45,6 +46,7 @@ class Watched:
     oldest: Counts
     lost: int
     status: tuple[int, ...]
+    drives: tuple[str, ...] = ()
 
 
 class _Sums:
@@ -120,6 +122,7 @@ def watch(
     """
     if not (0.0 < seconds <= _LONGEST) or (cycles is not None and cycles < 1):
         raise UsageError(f"watching for {seconds:g} s or {cycles} cycles; give at least one cycle, at most a day")
+    arm = arm.look()
     try:
         arm.open()
         described = arm.describe()
@@ -152,4 +155,5 @@ def _summary(described: ArmDescription, sums: _Sums, last: Sample) -> Watched:
         oldest=sums.oldest,
         lost=last.lost,
         status=last.status,
+        drives=last.drives,
     )

@@ -112,7 +112,7 @@ def watch_text(seen: Watched) -> str:
             f"{seen.velocity[k]:>11.2e} {seen.noise[k]:>10.2e} {seen.missing[k]:>8d} {seen.oldest[k]:>7d}  "
             f"{_drive(seen, k)}"
         )
-    return "\n".join([*lines, ""])
+    return "\n".join([*lines, *(f"  {words}" for words in seen.drives), ""])
 
 
 def watch_document(seen: Watched) -> dict[str, Any]:
@@ -124,6 +124,7 @@ def watch_document(seen: Watched) -> dict[str, Any]:
     return {
         "cycles": seen.cycles,
         "lost": seen.lost,
+        "drives": list(seen.drives),
         "joints": [
             {
                 "joint": name,

@@ -66,6 +66,7 @@ def run_motion(
     *,
     speed: float = 1.0,
     lease: float = LEASE_SECONDS,
+    log_frames: bool = False,
     tell: Callable[[str], None] = lambda _: None,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> Ran:
@@ -79,6 +80,7 @@ def run_motion(
         ticket: of the preflight; the motion process holds it against the open arm.
         speed: share of the motion's own speed; ways to a destination have theirs.
         lease: how long the arm moves on when this process is gone [s].
+        log_frames: whether every frame of the fieldbus is kept in `can.log`, too, in candump's format.
         tell: called with each state that is entered.
         stop_requested: asked several times a second.
 
@@ -128,6 +130,7 @@ def run_motion(
         "lease": lease,
         "ticket": ticket.to_json(),
         "speed": speed,
+        "log_frames": log_frames,
     }
     try:
         with recorder:

@@ -110,10 +110,14 @@ class Nmt:
             self._beat()
 
     def configure_consumers(self) -> None:
-        """Object 1016h has changed; awaiting begins with the next heartbeat heard (CiA 301, 7.2.8.2.2.3)."""
+        """Object 1016h has changed; awaiting begins with the next heartbeat heard (CiA 301, 7.2.8.2.2.3).
+
+        A heartbeat that is awaited no longer, or anew, is not missing.
+        """
         for number in range(128):
             self._node.stop(f"{_CONSUMER}{number}")
-        self.silent_nodes.clear()
+        while self.silent_nodes:
+            self._found(self.silent_nodes.pop())
 
     def heard(self, frame: Frame) -> None:
         """A heartbeat of another node."""

@@ -88,17 +88,16 @@ def test_a_paced_wire_takes_the_time_of_its_bits(name: str) -> None:
         listener.close()
 
 
-def test_a_link_hears_what_the_configuration_filters_and_not_itself(wire: Wire) -> None:
+def test_a_link_hears_sdo_and_all_else_of_canopen_but_not_itself(wire: Wire) -> None:
     (link,) = open_links(arm_on_bus(interface="ident_wire", channel=wire.name))
     assert isinstance(link, WireLink)
     drive = end_of(wire.name)
     greeted(wire, 2)
     link.send(Frame(0x080))
-    for identifier in (0x581, 0x181):
-        drive.send(Frame(identifier))
-    found = link.receive(soon())
-    assert found is not None
-    assert found.identifier == 0x181
+    for frame in (Frame(0x100, extended=True), Frame(0x581), Frame(0x181)):
+        drive.send(frame)
+    assert content(link.receive(soon())) == Frame(0x581)
+    assert content(link.receive(soon())) == Frame(0x181)
     assert content(drive.receive(soon())) == Frame(0x080)
     link.close()
     drive.close()
@@ -110,7 +109,7 @@ def test_without_a_wire_the_message_says_how_to_start_one(name: str) -> None:
     assert caught.value.kind == "absent"
     with pytest.raises(can.CanInitializationError, match="nobody runs this wire"):
         can.Bus(interface="ident_wire", channel=name)
-    with pytest.raises(DriverError, match=r"buses\.0\.options: ident_wire has none, found host"):
+    with pytest.raises(DriverError, match=r"buses\.0\.options: ident_wire has only pace, found host"):
         open_links(arm_on_bus(interface="ident_wire", channel=name, options={"host": True}))
 
 

@@ -67,30 +67,33 @@ def separate(**driver: Any) -> Bench:
     return Bench(arm, lambda: arm.truth.velocity, lambda: arm.truth.position)
 
 
-def canopen(faults: Sequence[dict[str, Any]] = ()) -> Bench:
-    """Two emulated drives with gears of 1, on a bus in virtual time; a thousandth is 1 mN m or 1 mN.
+def canopen_config(**driver: Any) -> ArmConfig:
+    """The bench behind two drives with gears of 1, on a bus in virtual time; a thousandth is 1 mN m or 1 mN."""
+    eds = (Path(__file__).parents[2] / "configs" / "puck.eds").read_text()
+    drive = {"counts": 65536, "rated_torque": 1.0, "max_speed": 6000.0}
+    section = {
+        "kind": "canopen",
+        "eds": {"name": "puck.eds", "text": eds},
+        "buses": [{"interface": "lock_step", "channel": "bench"}],
+        "drives": [drive | {"node": 1, "max_torque": 10.0}, drive | {"node": 2, "max_torque": 5.0}],
+        "emulation": {"truth": bench_config().model_dump(mode="json")["driver"]["truth"]},
+    }
+    content = bench_config().model_dump(mode="json", exclude={"driver"}) | {
+        "transmission": {"ratios": [1.0, 1.0], "drive_terms": "joints"},
+        "driver": section | driver,
+    }
+    return ArmConfig.model_validate(content)
 
-    Opening takes cycles too, so that faults are counted from the end of enabling here.
-    """
+
+def canopen(faults: Sequence[dict[str, Any]] = ()) -> Bench:
+    """Two emulated drives; opening takes cycles too, so that faults are counted from the end of enabling here."""
     from drivers.canopen.arm import CanopenArm
     from ident_service.config.simulation import SimulatedFault
     from sim_backend.machine import Truth
     from sim_backend.pucks.faults import configured
     from sim_backend.pucks.lock_step import LockStepArm
 
-    eds = (Path(__file__).parents[2] / "configs" / "puck.eds").read_text()
-    drive = {"counts": 65536, "rated_torque": 1.0, "max_speed": 6000.0}
-    content = bench_config().model_dump(mode="json", exclude={"driver"}) | {
-        "transmission": {"ratios": [1.0, 1.0], "drive_terms": "joints"},
-        "driver": {
-            "kind": "canopen",
-            "eds": {"name": "puck.eds", "text": eds},
-            "buses": [{"interface": "lock_step", "channel": "bench"}],
-            "drives": [drive | {"node": 1, "max_torque": 10.0}, drive | {"node": 2, "max_torque": 5.0}],
-            "emulation": {"truth": bench_config().model_dump(mode="json")["driver"]["truth"]},
-        },
-    }
-    config = ArmConfig.model_validate(content)
+    config = canopen_config()
     behind = LockStepArm(config)
     truths: list[Truth] = []
     behind.emulator.observer = truths.append
@@ -336,6 +339,28 @@ def test_a_reset_energises_nothing_and_releases_no_brake(broken):
     assert [word & AxisStatus.IDLE for word in idle[-1].status] == [word & AxisStatus.IDLE for word in before.status]
     with pytest.raises(DriverError):
         broken.arm.exchange(NONE)
+
+
+def test_an_arm_that_only_looks_sees_the_same_and_leaves_everything_as_it_is(broken):
+    before = told(broken.arm)
+    names, position = broken.arm.describe().joint_names, before.position
+    broken.arm.close()
+    for _ in range(2):
+        with broken.arm.look() as looking:
+            says = looking.describe()
+            samples = [looking.exchange(None) for _ in range(5)]
+        assert says.joint_names == names
+        assert 0.0 < says.rate <= 1e9 / PERIOD_NS
+        np.testing.assert_allclose(np.diff([sample.stamp_ns for sample in samples]), 1e9 / says.rate, rtol=1e-6)
+        for sample in samples:
+            assert sample.valid.all()
+            np.testing.assert_array_equal(sample.torque, 0.0)
+            assert sample.status[0] & AxisStatus.FAULT
+            assert not any(word & AxisStatus.POWERED for word in sample.status)
+        np.testing.assert_allclose(samples[-1].position, samples[0].position, atol=1e-3)
+        np.testing.assert_allclose(samples[-1].position, position, atol=0.05)
+    broken.arm.open()
+    assert broken.arm.exchange(None).status[0] & AxisStatus.FAULT
 
 
 def test_a_running_arm_is_not_reset(running):

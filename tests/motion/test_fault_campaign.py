@@ -10,6 +10,7 @@ import random
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import pytest
 from campaign_bench import PROMISES, Case
@@ -26,6 +27,9 @@ STATES = (
 )
 SEED = 5
 REHEARSAL = 0.1
+# A joint that slid slowly, and whose reference hardly moves on, is carried off by gravity, and its own encoder does not
+# tell (decision 0008). It is found at last, too late for its velocity limit.
+REMAINING = {"bench-frozen_encoder-resuming-0.13-0-at 0.1"}
 
 
 def cases(arm: str, times: int, joints: int) -> Iterator[Case]:
@@ -69,11 +73,14 @@ def test_a_sample_of_the_campaign(case: Case, tmp_path: Path) -> None:
     keeps_its_promise(case, tmp_path)
 
 
+def campaign() -> list[Any]:
+    """All cases; one that is known to fail must go on failing, or be taken off the list."""
+    every = [*cases("bench", 3, 2), *cases("wam", 2, 2), *slow_freezes("bench", 5), *slow_freezes("wam", 2)]
+    fails = pytest.mark.xfail(strict=True, raises=AssertionError, reason="decision 0008")
+    return [pytest.param(case, id=str(case), marks=fails if str(case) in REMAINING else ()) for case in every]
+
+
 @pytest.mark.campaign
-@pytest.mark.parametrize(
-    "case",
-    [*cases("bench", 3, 2), *cases("wam", 2, 2), *slow_freezes("bench", 5), *slow_freezes("wam", 2)],
-    ids=str,
-)
+@pytest.mark.parametrize("case", campaign())
 def test_the_campaign(case: Case, tmp_path: Path) -> None:
     keeps_its_promise(case, tmp_path)

@@ -67,9 +67,7 @@ def test_a_sample_of_the_campaign(case: Case, tmp_path: Path) -> None:
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize(
-    "case", [*cases("bench canopen", 3, 2), *cases("wam canopen", 1, 2), *two_buses()], ids=str
-)
+@pytest.mark.parametrize("case", [*cases("bench canopen", 3, 2), *cases("wam canopen", 1, 2), *two_buses()], ids=str)
 def test_the_campaign(case: Case, tmp_path: Path) -> None:
     let_go(case, keeps_its_promise(case, tmp_path))
 

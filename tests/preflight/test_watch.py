@@ -68,6 +68,16 @@ def test_watching_only_looks() -> None:
     assert seen.cycles == arm.cycle == 2000
 
 
+def test_the_arm_itself_is_not_even_opened_where_another_way_to_look_is_offered() -> None:
+    class Harmful(OnlyLooked):
+        def look(self) -> Arm:
+            return harmless
+
+    arm, harmless = Harmful(), OnlyLooked()
+    assert watch(arm, cycles=3).cycles == harmless.cycle == 3
+    assert (arm.calls, harmless.calls) == ([], ["open", "close"])
+
+
 def test_it_says_what_it_saw() -> None:
     seen = watch(OnlyLooked(), cycles=1000)
     np.testing.assert_allclose(seen.position, [1000.2997, 2.0], atol=5e-3)
@@ -121,3 +131,6 @@ def test_the_text_names_joints_and_drives() -> None:
     assert lines[2].endswith("powered")
     assert lines[3].endswith("emergency stop, watchdog")
     assert watch_document(replace(seen, status=(0, 0)))["joints"][0]["drive"] == "off"
+    told = replace(seen, drives=("node 1: fault, operational", "node 2: quick stop, stopped"))
+    assert watch_text(told).splitlines()[4:] == ["  node 1: fault, operational", "  node 2: quick stop, stopped"]
+    assert watch_document(told)["drives"] == list(told.drives)

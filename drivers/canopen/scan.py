@@ -1,0 +1,171 @@
+"""Who is on the buses of an arm: heartbeats overheard, then SDO uploads from every node number there is; nothing else.
+
+No NMT command, no write: a scan changes nothing. It takes the buses for itself, and asks nobody while another host
+streams, whose frames it would delay.
+
+Boundary: what nodes say. Whether they are the configured ones is the service's to judge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+from drivers.canopen import dictionary as od
+from drivers.canopen.bits import worst
+from drivers.canopen.bus_errors import BusError
+from drivers.canopen.frame import Frame
+from drivers.canopen.link import Link, open_links
+from drivers.canopen.lock import BusLock
+from drivers.canopen.overheard import Overheard
+from drivers.canopen.polling import BURST, Place, poll
+from drivers.canopen.sdo import DOES_NOT_EXIST, TIMEOUT, Objects, SdoRefused
+from drivers.canopen.setup import DRIVE_PROFILE, IDENTITY
+from ident_service.config.canopen import CanopenDriver
+from ident_service.config.schema import ArmConfig
+from ident_service.errors import DriverError
+
+T = TypeVar("T")
+NODES = range(1, 128)
+LISTEN = 1.0  # s: longest period of a heartbeat that is heard for sure
+PATIENCE = 0.05  # s for an answer, besides the time on the wire; those who are late are asked again with `TIMEOUT`
+_HISTORY = 8  # entries of 1003h that are read
+_SDO_BYTES = 8
+
+
+@dataclass
+class FoundNode:
+    """What one node says of itself; None for what it does not have.
+
+    Attributes:
+        bus: number of its bus, from 0.
+        node: its number.
+        nmt: state in words, from its heartbeat.
+        answers: whether it answers SDO requests, without which nothing below is known.
+        device_type: 1000h.
+        identity: 1018h, by the keys of `setup.IDENTITY`.
+        name: manufacturer's device name (1008h).
+        firmware: manufacturer's software version (100Ah).
+        error_register: 1001h.
+        history: 1003h, the latest first; the error code is in the lower 16 bits.
+        status: 6041h, of drives.
+        last_error: 603Fh, of drives.
+        unread: what could not be read, and why, in words.
+    """
+
+    bus: int
+    node: int
+    nmt: str
+    answers: bool
+    device_type: int | None = None
+    identity: dict[str, int] = field(default_factory=dict)
+    name: str | None = None
+    firmware: str | None = None
+    error_register: int | None = None
+    history: tuple[int, ...] = ()
+    status: int | None = None
+    last_error: int | None = None
+    unread: list[str] = field(default_factory=list)
+
+    @property
+    def is_drive(self) -> bool:
+        """Whether it says that it is a drive of CiA 402."""
+        return self.device_type is not None and self.device_type & 0xFFFF == DRIVE_PROFILE
+
+
+def scan(config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_links) -> list[FoundNode]:
+    """Everybody who is heard or answers, by bus and node number.
+
+    Args:
+        config: with a CANopen driver.
+        open_bus: gives the links, in the order of the buses.
+
+    Raises:
+        DriverError: another driver, a bus that is in use, by another host too, or that cannot be had.
+    """
+    driver = config.driver
+    if not isinstance(driver, CanopenDriver):
+        raise DriverError(f"{config.name}: the driver is not CANopen's")
+    locks: list[BusLock] = []
+    links: list[Link] = []
+    try:
+        if all(bus.interface != "lock_step" for bus in driver.buses):
+            locks += [BusLock(bus) for bus in driver.buses]
+        links += open_bus(config)
+        return _found(driver, links)
+    finally:
+        for link in links:
+            with suppress(Exception):
+                link.close()
+        for lock in locks:
+            lock.close()
+
+
+def _found(driver: CanopenDriver, links: list[Link]) -> list[FoundNode]:
+    heard, clock = Overheard(), links[0].clock
+    heard.listen(links, LISTEN)
+    if heard.streaming:
+        buses = ", ".join(driver.buses[bus].channel for bus in sorted(heard.streaming))
+        raise DriverError(f"another host sends SYNC on {buses}; a scan would delay its frames: stop it first")
+
+    def asked(places: set[Place], patience: float) -> dict[Place, int | None]:
+        answers = poll(links, places, od.DEVICE_TYPE, clock.now_ns() + round(patience * 1e9), heard.take)
+        return answers.values | dict.fromkeys(answers.aborts)
+
+    everybody = {(bus, node) for bus in range(len(links)) for node in NODES}
+    bursts = -(-len(NODES) // BURST)
+    wire = 2 * BURST * sum(worst(_SDO_BYTES)) / min(bus.bitrate for bus in driver.buses)
+    kinds = asked(everybody, bursts * (PATIENCE + wire))
+    doubtful = {*heard.nmt, *heard.answered, *((drive.bus, drive.node) for drive in driver.drives)} - kinds.keys()
+    if doubtful:
+        kinds |= asked(doubtful, -(-len(doubtful) // BURST) * TIMEOUT)
+    patience_ns = round(LISTEN * 1e9)
+    found = []
+    for place in sorted({*kinds, *heard.nmt}):
+        bus, number = place
+        words = heard.nmt_words(place, clock.now_ns(), patience_ns)
+        node = FoundNode(bus, number, words, place in kinds, kinds.get(place))
+        if node.answers:
+            _read(node, Objects(links[bus], number, _hearing(heard, bus)))
+        found.append(node)
+    return found
+
+
+def _hearing(heard: Overheard, bus: int) -> Callable[[Frame], None]:
+    return lambda frame: heard.take(bus, frame)
+
+
+def _read(node: FoundNode, objects: Objects) -> None:
+    """What a node says of itself; one that falls silent in the middle keeps what it has said."""
+
+    def tried(read: Callable[[], T]) -> T | None:
+        try:
+            return read()
+        except BusError:
+            raise
+        except SdoRefused as refused:
+            if refused.code not in DOES_NOT_EXIST:
+                node.unread.append(str(refused))
+        except DriverError as error:
+            node.unread.append(str(error))
+        return None
+
+    def number(entry: od.Entry) -> int | None:
+        return tried(lambda: objects.read(entry))
+
+    def text(index: int, name: str) -> str | None:
+        data = tried(lambda: objects.read_bytes(index, 0, name))
+        return None if data is None else data.decode("ascii", "replace").strip("\0 ")
+
+    for name, entry in IDENTITY.items():
+        if (value := number(entry)) is not None:
+            node.identity[name] = value
+    node.name, node.firmware = text(od.DEVICE_NAME_INDEX, "device name"), text(od.FIRMWARE_INDEX, "software version")
+    node.error_register = number(od.ERROR_REGISTER)
+    count = number(od.ERROR_COUNT) or 0
+    latest = (number(od.LAST_ERROR.at(sub)) for sub in range(1, min(count, _HISTORY) + 1))
+    node.history = tuple(entry for entry in latest if entry is not None)
+    if node.is_drive:
+        node.status, node.last_error = number(od.STATUS_WORD), number(od.LAST_EMERGENCY)
