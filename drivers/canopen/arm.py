@@ -84,6 +84,7 @@ class CanopenArm(Arm):
 
     def _reset_state(self) -> None:
         self._enabled = self._streaming = False
+        self._stops = 0  # told so far
         self._counts = [0] * len(self._limits)
         self._acting = _frozen(np.zeros(len(self._limits)))
         self._unwrapped: list[int] | None = None
@@ -200,6 +201,7 @@ class CanopenArm(Arm):
         """Tell every drive to let go, or to stop by itself; never raises. What was sent before acts until it does."""
         word = QUICK_STOP if kind is StopKind.QUICK_STOP else DISABLE_VOLTAGE
         self._enabled = False
+        self._stops += 1
         self._no_torque()
         if self._buses is not None:
             for number in range(len(self._limits)):
@@ -271,11 +273,15 @@ class CanopenArm(Arm):
         return round(low), round(high)
 
     def _through(self, buses: Buses, steps: Enabling | Resetting) -> None:
-        """Cycle with zero torque until the drives have gone where they are led."""
+        """Cycle with zero torque until the drives have gone where they are led; a stop meanwhile, as by a signal, wins."""
+        stops = self._stops
         while not steps.done:
             buses.cycle(self._counts if self._streaming else None)
             for number, word in steps.commands(self.clock.now_ns()):
-                buses.control(number, word)
+                if self._stops == stops:
+                    buses.control(number, word)
+            if self._stops != stops:
+                raise DriverError("the arm was stopped on its drives' way to another state")
 
     def _sample(self, buses: Buses, stamp_ns: int) -> Sample:
         drives = buses.drives
