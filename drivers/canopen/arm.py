@@ -108,8 +108,8 @@ class CanopenArm(Arm):
         """Lock and open every bus, and tell every drive what it is to do; nothing is energised.
 
         Raises:
-            DriverError: a bus is in use or cannot be had; a drive does not answer, is another one, or refuses a part
-                of its configuration. Nothing stays open.
+            DriverError: a bus is in use, also by another host on it, or cannot be had; a drive does not answer, is
+                another one, or refuses a part of its configuration. Nothing stays open.
         """
         if self._buses is not None:
             raise DriverError("the arm is already open")
@@ -122,8 +122,14 @@ class CanopenArm(Arm):
             if self._log_path is not None:
                 self._log, links = logged_links(links, self._log_path)
                 self._log_path = None
-            buses = self._buses = Buses(self._profiles, links, self._period_ns)
+            buses = Buses(self._profiles, links, self._period_ns)
             self.clock = buses.clock
+            try:
+                buses.listen()
+            except BaseException:
+                buses.close()  # without the farewell of `close`, which another host's drives would obey
+                raise
+            self._buses = buses
             buses.call()
             self._identities = tuple(self._configured(buses, number) for number in range(len(buses.drives)))
             buses.begin()
@@ -273,7 +279,7 @@ class CanopenArm(Arm):
         return round(low), round(high)
 
     def _through(self, buses: Buses, steps: Enabling | Resetting) -> None:
-        """Cycle with zero torque until the drives have gone where they are led; a stop meanwhile, as by a signal, wins."""
+        """Cycle with zero torque until the drives have gone where they are led; a stop meanwhile wins."""
         stops = self._stops
         while not steps.done:
             buses.cycle(self._counts if self._streaming else None)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from helpers.emulated_arms import EDS, Tapped, tapped, weightless_config
 
 from drivers.arm import StopKind
 from drivers.canopen.arm import CanopenArm
+from drivers.canopen.frame import Frame
 from drivers.canopen.words import DISABLE_VOLTAGE, ENABLE, SHUTDOWN, SWITCH_ON
 from drivers.status import AxisEventCode
 from ident_service.config.schema import ArmConfig
@@ -111,6 +112,32 @@ def test_a_drive_that_maps_no_dummies_says_so_in_words_whatever_its_data_sheet_s
         bench.arm.open()
     assert "cannot be mapped" in str(refused.value) or "does not exist" in str(refused.value)
     check_nothing_is_open(bench)
+
+
+@pytest.mark.parametrize("identifier", [0x080, 0x201, 0x302, 0x000, 0x77F])
+def test_an_arm_that_another_host_drives_is_left_alone(identifier: int) -> None:
+    bench = Bench(weightless_config())
+    links = bench._links
+
+    def busy(config: ArmConfig) -> list[Tapped]:
+        (tap,) = links(config)
+        drain, calls = tap.drain, iter(range(10))
+
+        def hears() -> Sequence[Frame]:
+            # Behind what has waited since before we came, which says nothing of now.
+            return [*drain(), Frame(identifier, bytes(4))] if next(calls) else drain()
+
+        tap.drain = hears  # type: ignore[method-assign]
+        return [tap]
+
+    arm = CanopenArm(weightless_config(), busy)
+    with pytest.raises(DriverError, match=f"bus bench: somebody else sends frames {identifier:03X}h.*drives this arm"):
+        arm.open()
+    arm.close()
+    assert bench.taps[0].sent == []
+    check_nothing_is_open(bench)
+    bench.arm.open()
+    bench.arm.close()
 
 
 @pytest.mark.parametrize("silent", [(1,), (0, 1)])

@@ -97,9 +97,8 @@ class EmulatedArm(WatchedArm):
     def exchange(self, torque: object) -> Sample:
         if self._strike is not None and self._strike.kind == "lost_torques":
             first, last = self._strike.at_cycle, self._strike.at_cycle + (self._strike.duration or 1)
-            for tap in self.taps:
-                lost = first <= self.cycle < last
-                tap.loses = lambda frame, lost=lost: lost and 0x200 <= frame.identifier < 0x280
+            lost = first <= self.cycle < last
+            self.taps[-1].loses = lambda frame: lost and 0x200 <= frame.identifier < 0x280
         return super().exchange(torque)  # type: ignore[arg-type]
 
     def _break(self, cycle: int) -> None:
