@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 
-from campaign_bench import _READ_WRONGLY, _UNTRUE, Promise, Strike, Subject, wam_config
+from campaign_bench import READ_WRONGLY, UNTRUE, Promise, Strike, Subject, wam_config
 from helpers.emulated_arms import EDS, Tapped, tapped
 from motion_bench import TRUTH, WatchedArm, bench_config
 
@@ -38,24 +38,25 @@ FOREIGN: dict[str, Frame] = {
 WIRE = ("lost_torques", *FOREIGN)
 # Two cycles: a fault may come after the answers of the cycle before which it was handed over.
 SOON = 3
-_TIMEOUT, _DEADLINE, _INHIBIT = 300, 10, 50  # cycles: heartbeat, torque frames, status reports
-_DROPPED = {"drive_fault", "drive_emergency", "feedback_gone", "drive_watchdog"}
+_TIMEOUT, _DEADLINE = 300, 10  # cycles that are waited for heartbeats, and for torque frames
+# A drive has limits of its own, of speed and position, at which it gives no torque and says so.
+_LIES, _MISREAD = UNTRUE | {"torque_ignored"}, READ_WRONGLY | {"torque_ignored"}
 
 CANOPEN_PROMISES: dict[str, Promise] = {
     "lost_feedback": Promise({"feedback_gone"}, duration=50, within=MAX_AGE + 1),
     "delayed_feedback": Promise({"feedback_gone"}, size=0.005, within=MAX_AGE + 1),
-    "hidden_delay": Promise(_READ_WRONGLY, size=0.02),
+    "hidden_delay": Promise(_MISREAD, size=0.02),
     "encoder_jump": Promise({"encoder_jumps"}, size=0.5, duration=2, within=SOON),
     "encoder_offset": Promise({"feedback_gone"}, size=0.5, within=MAX_AGE + 1),
-    "frozen_encoder": Promise(_UNTRUE, duration=10**6),
-    "position_sign": Promise(_READ_WRONGLY),
-    "stuck_torque": Promise(_UNTRUE, duration=10**6),
-    "torque_sign": Promise(_UNTRUE),
-    "torque_saturation": Promise(_UNTRUE, size=0.05),
+    "frozen_encoder": Promise(_LIES, duration=10**6),
+    "position_sign": Promise(_MISREAD),
+    "stuck_torque": Promise(_LIES, duration=10**6),
+    "torque_sign": Promise(_LIES),
+    "torque_saturation": Promise(_LIES, size=0.05),
     "drive_fault": Promise({"drive_emergency"}, within=SOON, words=("5400h power section",)),
     "node_silent": Promise({"feedback_gone"}, within=MAX_AGE + 1),
     "emergency_stop": Promise({"drive_emergency"}, within=SOON, words=("3220h under-voltage of the DC link",)),
-    "load_attached": Promise(_UNTRUE, size=2.0),
+    "load_attached": Promise(_LIES, size=2.0),
     "bus_gone": Promise({"driver"}, duration=10**6, within=SOON, words=("gone",)),
     "emergency": Promise({"drive_emergency"}, size=0x4310, within=SOON, words=("4310h drive too hot",)),
     "warning": Promise({"repeated_warnings"}, warns="drive_warning", words=("warns",)),
