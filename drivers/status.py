@@ -31,6 +31,7 @@ class AxisEventCode(StrEnum):
     DRIVE_SILENT = "drive_silent"  # its heartbeat is missing
     DRIVE_RESTARTED = "drive_restarted"  # it booted in the middle of a run
     DRIVE_LEFT = "drive_left"  # it left the state in which it takes torques
+    TORQUE_IGNORED = "torque_ignored"  # energised, it does not follow its torque any more
     SECOND_HOST = "second_host"  # somebody else sends what only this host may
     BUS_DEGRADED = "bus_degraded"  # so many errors that the host's controller or a drive's is in error passive
     BUS_OFF = "bus_off"  # the host's controller has left the bus

@@ -84,6 +84,7 @@ class CanopenArm(Arm):
 
     def _reset_state(self) -> None:
         self._enabled = self._streaming = False
+        self._stops = 0  # told so far
         self._counts = [0] * len(self._limits)
         self._acting = _frozen(np.zeros(len(self._limits)))
         self._unwrapped: list[int] | None = None
@@ -107,8 +108,8 @@ class CanopenArm(Arm):
         """Lock and open every bus, and tell every drive what it is to do; nothing is energised.
 
         Raises:
-            DriverError: a bus is in use or cannot be had; a drive does not answer, is another one, or refuses a part
-                of its configuration. Nothing stays open.
+            DriverError: a bus is in use, also by another host on it, or cannot be had; a drive does not answer, is
+                another one, or refuses a part of its configuration. Nothing stays open.
         """
         if self._buses is not None:
             raise DriverError("the arm is already open")
@@ -121,8 +122,14 @@ class CanopenArm(Arm):
             if self._log_path is not None:
                 self._log, links = logged_links(links, self._log_path)
                 self._log_path = None
-            buses = self._buses = Buses(self._profiles, links, self._period_ns)
+            buses = Buses(self._profiles, links, self._period_ns)
             self.clock = buses.clock
+            try:
+                buses.listen()
+            except BaseException:
+                buses.close()  # without the farewell of `close`, which another host's drives would obey
+                raise
+            self._buses = buses
             buses.call()
             self._identities = tuple(self._configured(buses, number) for number in range(len(buses.drives)))
             buses.begin()
@@ -200,6 +207,7 @@ class CanopenArm(Arm):
         """Tell every drive to let go, or to stop by itself; never raises. What was sent before acts until it does."""
         word = QUICK_STOP if kind is StopKind.QUICK_STOP else DISABLE_VOLTAGE
         self._enabled = False
+        self._stops += 1
         self._no_torque()
         if self._buses is not None:
             for number in range(len(self._limits)):
@@ -271,11 +279,15 @@ class CanopenArm(Arm):
         return round(low), round(high)
 
     def _through(self, buses: Buses, steps: Enabling | Resetting) -> None:
-        """Cycle with zero torque until the drives have gone where they are led."""
+        """Cycle with zero torque until the drives have gone where they are led; a stop meanwhile wins."""
+        stops = self._stops
         while not steps.done:
             buses.cycle(self._counts if self._streaming else None)
             for number, word in steps.commands(self.clock.now_ns()):
-                buses.control(number, word)
+                if self._stops == stops:
+                    buses.control(number, word)
+            if self._stops != stops:
+                raise DriverError("the arm was stopped on its drives' way to another state")
 
     def _sample(self, buses: Buses, stamp_ns: int) -> Sample:
         drives = buses.drives

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 from drivers.canopen.bits import worst
+from drivers.canopen.bus_event import EventCode
 from drivers.canopen.codec import BusCodec, Drive
 from drivers.canopen.dictionary import CST
 from drivers.canopen.frame import Frame
@@ -26,6 +27,8 @@ from drivers.clock import Clock
 from ident_service.errors import DriverError
 
 RECEIVE = 0.97  # of a period, within which a position counts for its cycle (FIELDBUS.md: the last is on the wire then)
+HUSH = 0.02  # s in which the last frames of a session before ours may still be on their way
+LISTEN = 0.12  # s before we send anything; another host's heartbeat comes within it
 AWAKE = 2.0  # s within which every drive must answer
 LEAST = 0.5  # of a period, between two SYNCs
 SETTLED = 5  # cycles in a row with everybody's position before an arm counts as open
@@ -95,6 +98,25 @@ class Buses:
     def profile(self, number: int) -> BusProfile:
         """Of the bus that a drive is on."""
         return self._at[number][0].profile
+
+    def listen(self) -> None:
+        """Wait whether another host drives this arm, which anything of ours would disturb in the midst of it.
+
+        Raises:
+            DriverError: one does; nothing has been sent.
+        """
+        self.clock.sleep_until_ns(self.clock.now_ns() + round(HUSH * 1e9))
+        for link in self._links:
+            link.drain()
+        self.clock.sleep_until_ns(self.clock.now_ns() + round(LISTEN * 1e9))
+        for codec, link in self._pairs:
+            for frame in link.drain():
+                codec.receive(frame)
+            others = [event.words for event in codec.take_events() if event.code is EventCode.SECOND_HOST]
+            if others:
+                raise DriverError(
+                    f"bus {codec.profile.bus.channel}: {'; '.join(others)}: another program or device drives this arm"
+                )
 
     def call(self) -> None:
         """Bring every drive to the NMT state in which it is configured, and wait until all of them answer.

@@ -15,7 +15,7 @@ _CODES: dict[EventCode, AxisEventCode] = {
     EventCode.EMERGENCY: AxisEventCode.EMERGENCY_MESSAGE,
     EventCode.BOOT_UP: AxisEventCode.DRIVE_RESTARTED,
     EventCode.LEFT: AxisEventCode.DRIVE_LEFT,
-    EventCode.DEAF: AxisEventCode.DRIVE_LEFT,
+    EventCode.DEAF: AxisEventCode.TORQUE_IGNORED,
     EventCode.DRIVE_WARNING: AxisEventCode.DRIVE_WARNING,
     EventCode.TORQUE_LIMITED: AxisEventCode.TORQUE_LIMITED,
     EventCode.DUPLICATE: AxisEventCode.STRANGE_FRAME,

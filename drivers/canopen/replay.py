@@ -1,7 +1,8 @@
 """A logged session played into a driver, in virtual time: what the drives said then, they say again.
 
-What was heard after the k-th SYNC of the log is heard after the driver's k-th SYNC, as much later as it was then. So
-a driver that computes faster or slower than the logged one still meets every answer in its cycle.
+What was heard after the k-th SYNC of the log is heard after the driver's k-th SYNC, as much later as it was then; what
+was heard before all SYNCs, so much after the first frame that was sent. So a driver that computes faster or slower than
+the logged one still meets every answer in its cycle.
 """
 
 from __future__ import annotations
@@ -135,16 +136,17 @@ class ReplayLink:
         self.sent: list[Frame] = []
         mine = [logged for logged in session if logged.bus == bus]
         self.logged = [logged.frame for logged in mine if logged.sent]
-        self._syncs = [frame.stamp_ns for frame in self.logged if frame.identifier == SYNC and not frame.extended]
-        self._heard: list[tuple[int, Frame]] = []  # after how many SYNCs, and what
-        cycle = 0
+        self._marks = [frame.stamp_ns for number, frame in enumerate(self.logged) if _marks(number, frame)]
+        self._heard: list[tuple[int, Frame]] = []  # after how many marks, and what
+        passed = sent = 0
         for logged in mine:
             if not logged.sent:
-                self._heard.append((cycle, logged.frame))
-            elif logged.frame.identifier == SYNC and not logged.frame.extended:
-                cycle += 1
+                self._heard.append((passed, logged.frame))
+            else:
+                passed += _marks(sent, logged.frame)
+                sent += 1
         self._next = 0
-        self._shift_ns = [self.clock.now_ns()]  # from the log's time to ours, by cycle
+        self._shift_ns = [self.clock.now_ns()]  # from the log's time to ours, by marks passed
 
     @property
     def finished(self) -> bool:
@@ -159,9 +161,9 @@ class ReplayLink:
         """
         check_sendable(frame, fd=True)
         now = self.clock.now_ns()
+        if _marks(len(self.sent), frame) and len(self._shift_ns) <= len(self._marks):
+            self._shift_ns.append(now - self._marks[len(self._shift_ns) - 1])
         self.sent.append(frame._replace(stamp_ns=now))
-        if frame.identifier == SYNC and not frame.extended and len(self._shift_ns) <= len(self._syncs):
-            self._shift_ns.append(now - self._syncs[len(self._shift_ns) - 1])
 
     def receive(self, deadline_ns: int) -> Frame | None:
         """The next frame of the log, None when none is due until the deadline [ns of the clock]."""
@@ -182,8 +184,13 @@ class ReplayLink:
     def _due(self, until_ns: int) -> Frame | None:
         if self.finished:
             return None
-        cycle, frame = self._heard[self._next]
-        if cycle >= len(self._shift_ns) or frame.stamp_ns + self._shift_ns[cycle] > until_ns:
+        passed, frame = self._heard[self._next]
+        if passed >= len(self._shift_ns) or frame.stamp_ns + self._shift_ns[passed] > until_ns:
             return None
         self._next += 1
-        return frame._replace(stamp_ns=frame.stamp_ns + self._shift_ns[cycle])
+        return frame._replace(stamp_ns=frame.stamp_ns + self._shift_ns[passed])
+
+
+def _marks(number: int, frame: Frame) -> bool:
+    """Whether this frame, after so many others that were sent, tells how the log's time and ours go together."""
+    return number == 0 or (frame.identifier == SYNC and not frame.extended)

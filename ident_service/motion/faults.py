@@ -121,6 +121,7 @@ FAULTS: dict[str, Rule] = {
     "drive_silent": Rule(_QUICK, "it has lost its power or its cable, or its program hangs"),
     "drive_restarted": Rule(_QUICK, "its power failed for a moment, or its program did"),
     "drive_left": Rule(_QUICK, "it takes no torque any more; somebody else commands it, or it lost us"),
+    "torque_ignored": Rule(_QUICK, "it is at a limit of its own, of speed or position, or its encoder is wrong"),
     "second_host": Rule(_QUICK, "another program or device drives the same arm"),
     "bus_off": Rule(_QUICK, "a short circuit, a wrong bit rate, or no other node on the bus"),
     "drive_watchdog": Rule(_QUICK, "the drive heard nothing from us in time"),

@@ -41,11 +41,11 @@ HOLD = 0.3  # s
 PERIOD = 1e-3
 PAUSED_FOR = 300  # cycles from the wish to pause to the wish to go on
 # What a drive that is stuck, weak, loaded or lies can end in: physics says in which.
-_UNTRUE = {
+UNTRUE = {
     *("following_error", "following_lost", "over_velocity", "runaway", "position_envelope", "position_limit"),
     *("far_outside", "torque_absurd", "frozen_encoder", "not_at_rest", "hold_lost", "repeated_warnings"),
 }
-_READ_WRONGLY = _UNTRUE | {"encoder_jumps", "feedback_gone"}
+READ_WRONGLY = UNTRUE | {"encoder_jumps", "feedback_gone"}
 
 
 @dataclass(frozen=True)
@@ -73,19 +73,19 @@ class Promise:
 PROMISES: dict[FaultKind, Promise] = {
     FaultKind.LOST_FEEDBACK: Promise({"feedback_gone"}, duration=50, within=MAX_AGE),
     FaultKind.DELAYED_FEEDBACK: Promise({"feedback_gone"}, size=0.005, within=1),
-    FaultKind.HIDDEN_DELAY: Promise(_READ_WRONGLY, size=0.02),
+    FaultKind.HIDDEN_DELAY: Promise(READ_WRONGLY, size=0.02),
     FaultKind.ENCODER_JUMP: Promise({"encoder_jumps"}, size=0.5, duration=2, within=2),
     FaultKind.ENCODER_OFFSET: Promise({"feedback_gone"}, size=0.5, within=MAX_AGE),
-    FaultKind.FROZEN_ENCODER: Promise(_UNTRUE, duration=10**6),
+    FaultKind.FROZEN_ENCODER: Promise(UNTRUE, duration=10**6),
     FaultKind.NAN_POSITION: Promise({"feedback_not_finite"}, within=1),
-    FaultKind.POSITION_SIGN: Promise(_READ_WRONGLY),
-    FaultKind.STUCK_TORQUE: Promise(_UNTRUE, duration=10**6),
-    FaultKind.TORQUE_SIGN: Promise(_UNTRUE),
-    FaultKind.TORQUE_SATURATION: Promise(_UNTRUE, size=0.05),
+    FaultKind.POSITION_SIGN: Promise(READ_WRONGLY),
+    FaultKind.STUCK_TORQUE: Promise(UNTRUE, duration=10**6),
+    FaultKind.TORQUE_SIGN: Promise(UNTRUE),
+    FaultKind.TORQUE_SATURATION: Promise(UNTRUE, size=0.05),
     FaultKind.DRIVE_FAULT: Promise({"drive_fault"}, within=1),
     FaultKind.NODE_SILENT: Promise({"feedback_gone"}, within=MAX_AGE),
     FaultKind.EMERGENCY_STOP: Promise({"emergency_stop"}, within=1),
-    FaultKind.LOAD_ATTACHED: Promise(_UNTRUE, size=2.0),
+    FaultKind.LOAD_ATTACHED: Promise(UNTRUE, size=2.0),
     FaultKind.BUS_GONE: Promise({"driver"}, duration=10**6, within=1),
     FaultKind.LATE_CYCLE: Promise({"late_cycles"}, size=0.4e-3, duration=50, within=FAULTS["late_cycle"].often + 1),
     FaultKind.CLOCK_JUMP: Promise({"clock_jump"}, size=-0.05, within=1),

@@ -7,18 +7,16 @@ own deadlines.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 
-from campaign_bench import _READ_WRONGLY, _UNTRUE, Promise, Strike, Subject, wam_config
+from campaign_bench import READ_WRONGLY, UNTRUE, Promise, Strike, Subject, wam_config
+from helpers.emulated_arms import EDS, Tapped, tapped
 from motion_bench import TRUTH, WatchedArm, bench_config
 
 from drivers.arm import Sample
 from drivers.canopen.arm import CanopenArm
 from drivers.canopen.frame import Frame
-from drivers.clock import Clock
-from ident_service.config.canopen import CanopenDriver
 from ident_service.config.limits import motion_limits
 from ident_service.config.schema import ArmConfig
 from ident_service.excitation.plan import excitation
@@ -26,10 +24,9 @@ from ident_service.model.arm_model import arm_model
 from ident_service.motion.checks import MAX_AGE
 from sim_backend.machine import Truth
 from sim_backend.pucks.faults import PUCK_FAULTS, PuckFault
-from sim_backend.pucks.lock_step import LockStepArm, LockStepLink
+from sim_backend.pucks.lock_step import LockStepArm
 
 PERIOD = 1e-3
-EDS = (Path(__file__).parents[2] / "configs" / "puck.eds").read_text(encoding="utf-8")
 # Sent by somebody else; a torque frame, a control word and an NMT command are those that would do harm.
 FOREIGN: dict[str, Frame] = {
     "foreign_sync": Frame(0x080),
@@ -41,79 +38,37 @@ FOREIGN: dict[str, Frame] = {
 WIRE = ("lost_torques", *FOREIGN)
 # Two cycles: a fault may come after the answers of the cycle before which it was handed over.
 SOON = 3
-_TIMEOUT, _DEADLINE, _INHIBIT = 300, 10, 50  # cycles: heartbeat, torque frames, status reports
-_DROPPED = {"drive_fault", "drive_emergency", "feedback_gone", "drive_watchdog"}
+_TIMEOUT, _DEADLINE = 300, 10  # cycles that are waited for heartbeats, and for torque frames
+# A drive has limits of its own, of speed and position, at which it gives no torque and says so.
+_LIES, _MISREAD = UNTRUE | {"torque_ignored"}, READ_WRONGLY | {"torque_ignored"}
 
 CANOPEN_PROMISES: dict[str, Promise] = {
     "lost_feedback": Promise({"feedback_gone"}, duration=50, within=MAX_AGE + 1),
     "delayed_feedback": Promise({"feedback_gone"}, size=0.005, within=MAX_AGE + 1),
-    "hidden_delay": Promise(_READ_WRONGLY, size=0.02),
+    "hidden_delay": Promise(_MISREAD, size=0.02),
     "encoder_jump": Promise({"encoder_jumps"}, size=0.5, duration=2, within=SOON),
     "encoder_offset": Promise({"feedback_gone"}, size=0.5, within=MAX_AGE + 1),
-    "frozen_encoder": Promise(_UNTRUE, duration=10**6),
-    "position_sign": Promise(_READ_WRONGLY),
-    "stuck_torque": Promise(_UNTRUE, duration=10**6),
-    "torque_sign": Promise(_UNTRUE),
-    "torque_saturation": Promise(_UNTRUE, size=0.05),
+    "frozen_encoder": Promise(_LIES, duration=10**6),
+    "position_sign": Promise(_MISREAD),
+    "stuck_torque": Promise(_LIES, duration=10**6),
+    "torque_sign": Promise(_LIES),
+    "torque_saturation": Promise(_LIES, size=0.05),
     "drive_fault": Promise({"drive_emergency"}, within=SOON, words=("5400h power section",)),
     "node_silent": Promise({"feedback_gone"}, within=MAX_AGE + 1),
     "emergency_stop": Promise({"drive_emergency"}, within=SOON, words=("3220h under-voltage of the DC link",)),
-    "load_attached": Promise(_UNTRUE, size=2.0),
+    "load_attached": Promise(_LIES, size=2.0),
     "bus_gone": Promise({"driver"}, duration=10**6, within=SOON, words=("gone",)),
     "emergency": Promise({"drive_emergency"}, size=0x4310, within=SOON, words=("4310h drive too hot",)),
     "warning": Promise({"repeated_warnings"}, warns="drive_warning", words=("warns",)),
     "heartbeat_lost": Promise({"drive_silent"}, within=_TIMEOUT + 12, words=("no heartbeat for 0.3 s",)),
     "reboot": Promise({"feedback_gone", "drive_restarted"}, within=MAX_AGE + 1),
-    "wrong_node": Promise(
-        {"repeated_warnings"}, within=25, words=("a second position in one cycle", "after its cycle")
-    ),
+    "wrong_node": Promise({"repeated_warnings"}, within=25, words=("second position", "after its cycle")),
     "short_frame": Promise({"feedback_gone"}, duration=50, within=MAX_AGE + 1),
     "bus_off": Promise({"bus_off"}, within=SOON, words=("bus-off",)),
     "error_passive": Promise({"bus_degraded"}, within=SOON, words=("passive",)),
     "lost_torques": Promise({"drive_emergency"}, duration=50, within=_DEADLINE + SOON, words=("8250h RPDO timeout",)),
     **{kind: Promise({"second_host"}, within=SOON, words=("somebody else",)) for kind in FOREIGN},
 }
-
-
-class Tapped:
-    """A link whose host may lose frames that it sends, and hear frames that a third party sends.
-
-    Attributes:
-        sent: by the host.
-        loses: which frames get lost.
-    """
-
-    def __init__(self, link: LockStepLink) -> None:
-        self._link = link
-        self._foreign: list[Frame] = []
-        self.sent: list[Frame] = []
-        self.loses: Callable[[Frame], bool] = lambda frame: False
-
-    @property
-    def clock(self) -> Clock:
-        return self._link.clock
-
-    def disturb(self, frames: Sequence[Frame], *, drives_hear: bool = True) -> None:
-        """Somebody else sends frames, which the host hears next, and the drives now."""
-        for frame in frames:
-            if drives_hear:
-                self._link.send(frame)
-            self._foreign.append(frame._replace(stamp_ns=self.clock.now_ns()))
-
-    def send(self, frame: Frame) -> None:
-        self.sent.append(frame)
-        if not self.loses(frame):
-            self._link.send(frame)
-
-    def receive(self, deadline_ns: int) -> Frame | None:
-        return self._foreign.pop(0) if self._foreign else self._link.receive(deadline_ns)
-
-    def drain(self) -> Sequence[Frame]:
-        heard, self._foreign = self._foreign, []
-        return [*heard, *self._link.drain()]
-
-    def close(self) -> None:
-        self._link.close()
 
 
 class EmulatedArm(WatchedArm):
@@ -127,7 +82,7 @@ class EmulatedArm(WatchedArm):
 
     def __init__(
         self, config: ArmConfig, strike: Strike | None = None, observer: Callable[[Truth], None] | None = None
-    ):
+    ) -> None:
         self.behind = LockStepArm(config)
         self.behind.emulator.observer = observer
         self.taps: list[Tapped] = []
@@ -137,16 +92,14 @@ class EmulatedArm(WatchedArm):
         self.before_exchange = self._break
 
     def _links(self, config: ArmConfig) -> list[Tapped]:
-        assert isinstance(config.driver, CanopenDriver)
-        self.taps = [Tapped(self.behind.link(number)) for number in range(len(config.driver.buses))]
+        self.taps = tapped(self.behind, config)
         return self.taps
 
     def exchange(self, torque: object) -> Sample:
         if self._strike is not None and self._strike.kind == "lost_torques":
             first, last = self._strike.at_cycle, self._strike.at_cycle + (self._strike.duration or 1)
-            for tap in self.taps:
-                lost = first <= self.cycle < last
-                tap.loses = lambda frame, lost=lost: lost and 0x200 <= frame.identifier < 0x280
+            lost = first <= self.cycle < last
+            self.taps[-1].loses = lambda frame: lost and 0x200 <= frame.identifier < 0x280
         return super().exchange(torque)  # type: ignore[arg-type]
 
     def _break(self, cycle: int) -> None:
