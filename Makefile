@@ -4,7 +4,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: demo test unit coverage lint types bench bench-design campaign clean
+.PHONY: demo test unit coverage lint types bench bench-design campaign test-foreign clean
 
 demo: $(READY)
 	$(BIN)/ident simulate
@@ -38,6 +38,11 @@ bench-design: $(READY)
 
 campaign: $(READY)
 	$(BIN)/pytest -m campaign --timeout 7200
+
+# An independent CANopen stack on the emulated drives; needs node, and npm's registry once.
+test-foreign: $(READY)
+	cd tests/foreign_stack && npm ci --ignore-scripts --no-audit --no-fund
+	$(BIN)/pytest tests/pucks/test_pucks_foreign_stack.py
 
 # pip 25.1 is the first to read dependency groups.
 $(READY): pyproject.toml
