@@ -221,14 +221,13 @@ class CanopenArm(Arm):
         with suppress(Exception):
             for _ in range(_FAREWELL):
                 buses.cycle(self._counts if self._streaming else None)
-        for number, drive in enumerate(buses.drives):
-            off = drive.status is not None and not axis_status(drive.status) & AxisStatus.POWERED
-            if off and drive.answered:
+        for number in range(len(buses.drives)):
+            with suppress(Exception):
                 objects = buses.objects(number)
-                with suppress(Exception):
+                # Asked for: a status report may be held back by its inhibit time.
+                if not axis_status(objects.read(od.STATUS_WORD)) & AxisStatus.POWERED:
                     objects.write(Write(od.ABORT_CONNECTION, 0))
-                with suppress(Exception):  # or it would report 8130h a moment after every session
-                    objects.write(Write(od.HEARTBEAT_CONSUMER, 0))
+                    objects.write(Write(od.HEARTBEAT_CONSUMER, 0))  # or 8130h would follow every session
         with suppress(Exception):
             buses.command(NmtCommand.ENTER_PRE_OPERATIONAL)
 

@@ -122,13 +122,13 @@ def test_an_operational_drive_keeps_streaming_state_and_watchdog() -> None:
     assert "powered" in watch_text(seen)
 
 
-def test_a_session_that_was_closed_leaves_nothing_to_be_missed() -> None:
+@pytest.mark.parametrize("cycles", [0, 1, 20, 100])
+def test_a_session_that_was_closed_leaves_nothing_to_be_missed(cycles: int) -> None:
     bench = Bench()
     with bench.arm as arm:
         arm.enable()
-        for _ in range(20):
+        for _ in range(cycles):
             arm.exchange(np.zeros(2))
-        arm.stop(StopKind.TORQUE_OFF)
     bench.settle(2000)
     assert bench.states() == ["pre operational, switch on disabled"] * 2
     seen = bench.watch()
