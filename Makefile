@@ -10,18 +10,18 @@ demo: $(READY)
 	$(BIN)/ident simulate
 
 test: lint types coverage
-	$(BIN)/pytest -m "not campaign"
+	$(BIN)/pytest -n 2 -m "not campaign"
 
 unit: $(READY)
 	$(BIN)/pytest -n 2 -m "not campaign and not slow"
 
 # Every branch of what stops an arm, by its own tests: less than all of them fails.
-GUARDED := checks faults guard latch owed states stop
+GUARDED := checks faults guard latch owed states stop told
 coverage: $(READY)
 	$(BIN)/pytest -m "not campaign and not slow" --cov-branch --cov-report=term-missing --cov-fail-under=100 \
 		$(GUARDED:%=--cov=ident_service.motion.%) tests/motion/test_motion_guard.py \
 		tests/motion/test_motion_guard_table.py tests/motion/test_motion_owed.py tests/motion/test_motion_states.py \
-		tests/motion/test_motion_stop.py
+		tests/motion/test_motion_stop.py tests/motion/test_motion_told.py
 
 lint: $(READY)
 	$(BIN)/ruff check .

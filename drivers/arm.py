@@ -170,7 +170,7 @@ class Arm(ABC):
     def stop(self, kind: StopKind) -> None:
         """Stop from any state, any number of times; never raises.
 
-        The torque of the last sample ends with its period.
+        The torque of the last sample ends with its period at the latest.
         """
 
     @abstractmethod

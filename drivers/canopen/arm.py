@@ -32,7 +32,7 @@ from drivers.canopen.profile import Write, bus_profiles
 from drivers.canopen.session_log import SessionLog, logged_links, require_format
 from drivers.canopen.setup import Setup, configure, identify
 from drivers.canopen.words import DISABLE_VOLTAGE, QUICK_STOP, NmtCommand, axis_status, joint_status
-from drivers.clock import Clock, RealClock
+from drivers.clock import Clock, RealClock, VirtualClock
 from drivers.status import AxisEvent, AxisEventCode, AxisStatus
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.schema import ArmConfig
@@ -73,7 +73,9 @@ class CanopenArm(Arm):
             f"{' and '.join(joints[j] for j in self._joints_of[k])}: drive {drive.node}"
             for k, drive in enumerate(config.driver.drives)
         ]
-        self.clock: Clock = RealClock()
+        # Until the buses are open and bring theirs.
+        in_step = all(bus.interface == "lock_step" for bus in config.driver.buses)
+        self.clock: Clock = VirtualClock() if in_step else RealClock()
         self._buses: Buses | None = None
         self._locks: list[BusLock] = []
         self._log_path: Path | None = None
@@ -113,7 +115,7 @@ class CanopenArm(Arm):
         self._reset_state()
         self._log = None
         try:
-            if all(bus.interface != "lock_step" for bus in self._driver.buses):
+            if not self.clock.lock_step:
                 self._locks = [BusLock(bus) for bus in self._driver.buses]
             links = self._open_bus(self._config)
             if self._log_path is not None:
@@ -152,7 +154,9 @@ class CanopenArm(Arm):
         self._no_torque()
         self._streaming = True
         try:
-            self._through(buses, Enabling(buses.drives, self._names, self._driver.bring_up, self.clock.now_ns()))
+            reports = self._driver.status.inhibit, self._driver.status.period
+            steps = Enabling(buses.drives, self._names, self._driver.bring_up, self.clock.now_ns(), reports)
+            self._through(buses, steps)
         except BaseException:
             self.stop(StopKind.TORQUE_OFF)
             raise

@@ -1,6 +1,8 @@
 """All buses of an arm in step: when a cycle begins, what is sent in it and in which order, until when answers count.
 
-A cycle begins one period after the one before; periods that are over are skipped, never made up for. On every bus the
+A cycle begins one period after the one before; periods that are over are skipped, never made up for. One that began
+late still has half a period, or the time that its frames need on the wire, before the next SYNC: positions carry no
+number, and one that came after the next SYNC would count for it. On every bus the
 torques go first, then SYNC on all of them back to back, so that all drives act and sample at one time. Our heartbeat is
 sent behind the answers, by this loop and nobody else: a loop that stops is missed by the drives.
 
@@ -12,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 
+from drivers.canopen.bits import worst
 from drivers.canopen.codec import BusCodec, Drive
 from drivers.canopen.dictionary import CST
 from drivers.canopen.frame import Frame
@@ -24,7 +27,9 @@ from ident_service.errors import DriverError
 
 RECEIVE = 0.97  # of a period, within which a position counts for its cycle (FIELDBUS.md: the last is on the wire then)
 AWAKE = 2.0  # s within which every drive must answer
+LEAST = 0.5  # of a period, between two SYNCs
 SETTLED = 5  # cycles in a row with everybody's position before an arm counts as open
+_POSITION_BYTES = 4
 _ASK = bytes([0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0])  # SDO upload of the device type, which every node has
 
 
@@ -58,9 +63,12 @@ class Buses:
                 drives[number], self._at[number] = drive, (codec, link)
         self.drives = [drives[number] for number in range(len(drives))]
         self._period_ns = period_ns
+        wire = max(_on_the_wire(profile) for profile in profiles)
+        self._least_ns = round(min(max(LEAST * period_ns, 1e9 * wire), RECEIVE * period_ns))
         self._heartbeat_period_ns = min(round(0.5e9 * profile.heartbeat_host) for profile in profiles)
         self._heartbeat_ns = 0
         self._next_ns: int | None = None
+        self._stamp_ns: int | None = None
 
     def close(self) -> None:
         """Give all links back; never raises."""
@@ -146,7 +154,7 @@ class Buses:
     def forget_events(self) -> None:
         """What happened until now was expected, or has been told otherwise."""
         for codec in self.codecs:
-            codec.take_events()
+            codec.forget_events()
         self.lost = 0
 
     def cycle(self, counts: Sequence[int] | None) -> int:
@@ -161,9 +169,10 @@ class Buses:
         Raises:
             DriverError: a bus is gone, or torques that cannot be sent, of which none has been.
         """
-        now_ns = self.clock.now_ns()
-        begin_ns = now_ns if self._next_ns is None else self._next_ns
-        self.clock.sleep_until_ns(begin_ns)
+        begin_ns = self.clock.now_ns() if self._next_ns is None else self._next_ns
+        self.clock.sleep_until_ns(
+            begin_ns if self._stamp_ns is None else max(begin_ns, self._stamp_ns + self._least_ns)
+        )
         begin_ns += max(0, self.clock.now_ns() - begin_ns) // self._period_ns * self._period_ns
         self._next_ns = begin_ns + self._period_ns
         torques = [[] if counts is None else codec.torque_frames(counts) for codec in self.codecs]
@@ -174,10 +183,10 @@ class Buses:
                 link.send(frame)
         for codec, link in self._pairs:
             link.send(codec.sync())
-        stamp_ns = self.clock.now_ns()
+        stamp_ns = self._stamp_ns = self.clock.now_ns()
         for codec in self.codecs:
             codec.begin_cycle(stamp_ns)
-        deadline = begin_ns + round(RECEIVE * self._period_ns)
+        deadline = max(begin_ns + round(RECEIVE * self._period_ns), stamp_ns + self._least_ns)
         for codec, link in self._pairs:
             while not codec.complete:
                 answer = link.receive(deadline)
@@ -196,3 +205,14 @@ class Buses:
             self._heartbeat_ns = now_ns + self._heartbeat_period_ns
             for codec, link in self._pairs:
                 link.send(codec.heartbeat(NmtState.OPERATIONAL))
+
+
+def _on_the_wire(profile: BusProfile) -> float:
+    """How long the frames of a cycle take at most [s]."""
+    lengths = [
+        0,
+        *(2 * len(frame.drives) for frame in profile.torque_frames),
+        *(_POSITION_BYTES for _ in profile.nodes),
+    ]
+    bus = profile.bus
+    return sum(worst(length, fd=profile.fd).seconds(bus.bitrate, bus.data_bitrate) for length in lengths)

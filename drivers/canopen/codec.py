@@ -13,8 +13,8 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from enum import StrEnum
 
+from drivers.canopen.bus_event import HOST, MILD, Event, EventCode
 from drivers.canopen.controller import ControllerState, controller_state, error_words, overflowed
 from drivers.canopen.frame import Frame
 from drivers.canopen.profile import (
@@ -30,6 +30,7 @@ from drivers.canopen.profile import (
     BusProfile,
 )
 from drivers.canopen.words import (
+    FOLLOWS,
     INTERNAL_LIMIT,
     WARNING,
     DriveState,
@@ -41,47 +42,10 @@ from drivers.canopen.words import (
 )
 from ident_service.errors import DriverError
 
-HOST = 0  # the node of events that are of the bus or the host's own controller
 _POSITION, _STATUS, _CONTROL = struct.Struct("<i"), struct.Struct("<Hh"), struct.Struct("<Hb")
 _EMERGENCY_BYTES = 8
-_MOST_EVENTS = 256  # that wait to be taken; a flood must not eat the memory
+_MOST_EVENTS = 256  # that wait to be taken; a flood must neither eat the memory nor hide what matters
 _FOLLOWED = 64  # identifiers of strangers that are remembered
-
-
-class EventCode(StrEnum):
-    """What can happen on a bus beside what is asked for."""
-
-    EMERGENCY = "emergency"
-    EMERGENCY_RESET = "emergency_reset"
-    BOOT_UP = "boot_up"
-    NMT_STATE = "nmt_state"  # another one than before
-    DRIVE_FAULT = "drive_fault"  # fault or fault reaction in the status word
-    DRIVE_STATE = "drive_state"  # any other change of state
-    DRIVE_WARNING = "drive_warning"  # bit 7 of the status word, on or off
-    TORQUE_LIMITED = "torque_limited"  # bit 11, internal limit active, on or off
-    DUPLICATE = "duplicate"
-    LATE = "late"
-    WRONG_LENGTH = "wrong_length"
-    STRANGER = "stranger"  # a frame of nobody who should be on this bus
-    SECOND_HOST = "second_host"  # somebody else sends what only we may
-    CONTROLLER = "controller"  # the host's controller changed its state, or recovered
-    BUS_ERROR = "bus_error"
-    OVERFLOW = "overflow"  # frames were lost in the host's controller
-
-
-@dataclass(frozen=True, slots=True)
-class Event:
-    """Something that happened.
-
-    Attributes:
-        code: what.
-        node: whose; `HOST` for the bus as a whole.
-        words: for people, without the node.
-    """
-
-    code: EventCode
-    node: int
-    words: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,6 +129,14 @@ class _Packed:
     pack: Callable[..., bytes] = field(repr=False)
 
 
+# Bits of the status word that are told when they come and when they go.
+_BITS = (
+    (WARNING, EventCode.DRIVE_WARNING, "warns"),
+    (INTERNAL_LIMIT, EventCode.TORQUE_LIMITED, "limits its torque"),
+)
+_CONTROLLER = {ControllerState.PASSIVE: EventCode.ERROR_PASSIVE, ControllerState.BUS_OFF: EventCode.BUS_OFF}
+
+
 class BusCodec:
     """The drives of one bus.
 
@@ -184,6 +156,7 @@ class BusCodec:
         self._now_ns = 0
         self._events: list[Event] = []
         self._strangers: set[int] = set()
+        self._foreign: set[int] = set()
         self._frames = [
             _Packed(frame.cob_id, frame.drives, struct.Struct(f"<{len(frame.drives)}h").pack)
             for frame in profile.torque_frames
@@ -266,6 +239,12 @@ class BusCodec:
         taken, self._events = self._events, []
         return taken
 
+    def forget_events(self) -> None:
+        """What happened until now was expected, or told otherwise; who disturbs the bus still is told of anew."""
+        self._events = []
+        self._strangers.clear()
+        self._foreign.clear()
+
     def receive(self, frame: Frame) -> None:
         """Take one frame, whatever it is; never raises."""
         if frame.error:
@@ -309,11 +288,12 @@ class BusCodec:
             words = f"{state} (status word {status:04X}h)" + ("" if was is None else f", was {was}")
             self._tell(EventCode.DRIVE_FAULT if bad else EventCode.DRIVE_STATE, drive.node, words)
         changed = status ^ (before or 0)
-        if changed & WARNING:
-            self._tell(EventCode.DRIVE_WARNING, drive.node, "warns" if status & WARNING else "warns no longer")
-        if changed & INTERNAL_LIMIT:
-            words = "limits its torque" if status & INTERNAL_LIMIT else "limits its torque no longer"
-            self._tell(EventCode.TORQUE_LIMITED, drive.node, words)
+        for bit, code, words in _BITS:
+            if changed & bit:
+                on = bool(status & bit)
+                self._tell(code if on else EventCode.OVER, drive.node, words if on else f"{words} no longer")
+        if changed & FOLLOWS and not status & FOLLOWS and state is was is DriveState.OPERATION_ENABLED:
+            self._tell(EventCode.DEAF, drive.node, "does not follow its torque any more (status word, bit 12)")
 
     def _on_emergency(self, drive: Drive, frame: Frame) -> None:
         data = frame.data
@@ -338,10 +318,11 @@ class BusCodec:
         drive.nmt, drive.heartbeat_ns = state, frame.stamp_ns or self._now_ns
         if state == NmtState.BOOT_UP:
             drive.boots += 1
+            drive.status = None  # what it was told is forgotten; what it said before is no longer true
             self._tell(EventCode.BOOT_UP, drive.node, "has booted")
         elif before != state and before is not None:
             words = f"NMT state {nmt_words(state)}, was {nmt_words(before)}"
-            self._tell(EventCode.NMT_STATE, drive.node, words)
+            self._tell(EventCode.NMT_STATE if state == NmtState.OPERATIONAL else EventCode.LEFT, drive.node, words)
 
     def _on_other(self, frame: Frame) -> None:
         identifier = frame.identifier
@@ -349,13 +330,13 @@ class BusCodec:
             self.counters.ignored += 1
             return
         self.counters.strangers += 1
-        if identifier in self._strangers or len(self._strangers) >= _FOLLOWED:
-            return
-        self._strangers.add(identifier)
         if identifier in self._ours:
-            words = f"somebody else sends frames {identifier:03X}h, which only this host may"
-            self._tell(EventCode.SECOND_HOST, HOST, words)
-        else:
+            if identifier not in self._foreign:
+                self._foreign.add(identifier)
+                words = f"somebody else sends frames {identifier:03X}h, which only this host may"
+                self._tell(EventCode.SECOND_HOST, HOST, words)
+        elif identifier not in self._strangers and len(self._strangers) < _FOLLOWED:
+            self._strangers.add(identifier)
             self._tell(EventCode.STRANGER, identifier & 0x7F, f"frames {identifier:03X}h of a node that is not ours")
 
     def _on_error(self, frame: Frame) -> None:
@@ -363,7 +344,7 @@ class BusCodec:
         before, self.controller = self.controller, controller_state(frame, self.controller)
         if self.controller is not before:
             words = f"the host's CAN controller is {self.controller.name.lower().replace('_', '-')}"
-            self._tell(EventCode.CONTROLLER, HOST, words)
+            self._tell(_CONTROLLER.get(self.controller, EventCode.CONTROLLER), HOST, words)
         if overflowed(frame):
             self._tell(EventCode.OVERFLOW, HOST, "frames were lost in the host's CAN controller")
         if words := error_words(frame):
@@ -375,7 +356,7 @@ class BusCodec:
         self._tell(EventCode.WRONG_LENGTH, drive.node, words)
 
     def _tell(self, code: EventCode, node: int, words: str) -> None:
-        if len(self._events) >= _MOST_EVENTS:
+        if len(self._events) >= (_MOST_EVENTS if code in MILD else 2 * _MOST_EVENTS):
             self.counters.events_lost += 1
             return
         self._events.append(Event(code, node, words))

@@ -3,6 +3,9 @@
 Ready, switched on, a few cycles with zero torque and everybody's position, enabled: each step has one deadline for all
 drives. Commands go to those who have not come so far, and again where one was lost.
 
+The last step is taken when the drives may tell it at once: a status report is not sent within the inhibit time of the
+one before, and an arm without brakes would sink unnoticed, and without torque, until it is.
+
 Boundary: which command to whom; who sends it, and the cycles themselves, are `arm.py`'s.
 """
 
@@ -23,7 +26,9 @@ _FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION)
 class Enabling:
     """From switched off to `operation enabled`."""
 
-    def __init__(self, drives: Sequence[Drive], names: Sequence[str], step: float, now_ns: int) -> None:
+    def __init__(
+        self, drives: Sequence[Drive], names: Sequence[str], step: float, now_ns: int, reports: tuple[float, float]
+    ) -> None:
         """Begin.
 
         Args:
@@ -31,8 +36,12 @@ class Enabling:
             names: what people call them.
             step: how long all drives together may take for one step [s].
             now_ns: of the link's clock.
+            reports: least and longest time between two status reports of a drive [s].
         """
         self._drives, self._names = drives, names
+        self._inhibit_ns, self._report_ns = (round(seconds * 1e9) for seconds in reports)
+        self._reported_ns = [now_ns] * len(drives)
+        self._ready_ns: int | None = None
         self._step_ns = round(step * 1e9)
         self._deadline_ns = now_ns + self._step_ns
         self._target = 0
@@ -52,10 +61,13 @@ class Enabling:
         """
         if bad := [drive for drive in self._drives if drive.state in _FAULTS]:
             raise DriverError(f"{_told(self._drives, self._names, bad)}; only a reset clears it (`ident recover`)")
+        for number, drive in enumerate(self._drives):
+            if drive.status_age <= 1:  # came in this cycle, or before it
+                self._reported_ns[number] = now_ns
         fresh = all(drive.answered for drive in self._drives)
         self._seeded = self._seeded + 1 if fresh else 0
         while not self.done and self._reached():
-            if self._target == 1 and self._seeded < SEEDED:
+            if self._target == 1 and not self._may_enable(now_ns):
                 break
             self._target += 1
             self._deadline_ns = now_ns + self._step_ns
@@ -76,6 +88,15 @@ class Enabling:
                 self._sent[number] = drive.state, now_ns
                 words.append((number, word))
         return words
+
+    def _may_enable(self, now_ns: int) -> bool:
+        """Whether the seed is sown and no drive's next report would have to wait; the latter not for ever."""
+        if self._seeded < SEEDED:
+            return False
+        self._ready_ns = now_ns if self._ready_ns is None else self._ready_ns
+        ages = [now_ns - reported for reported in self._reported_ns]
+        soon = min(ages) > self._inhibit_ns and max(ages) < self._report_ns - self._inhibit_ns // 10
+        return soon or now_ns - self._ready_ns > 3 * self._report_ns
 
     def _reached(self) -> bool:
         return all(self._there(drive) for drive in self._drives)
@@ -122,6 +143,7 @@ def _told(drives: Sequence[Drive], names: Sequence[str], chosen: Sequence[Drive]
         if drive in chosen:
             last = drive.emergency
             why = "" if last is None else f" ({emergency_words(last.code, last.register, last.vendor)})"
-            says = "has told no status word" if drive.status is None else f"is in the state {drive.state}{why}"
+            silent = "has told no status word" + (" since it booted" if drive.boots else "")
+            says = silent if drive.status is None else f"is in the state {drive.state}{why}"
             words.append(f"{name} {says}")
     return "; ".join(words)

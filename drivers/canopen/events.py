@@ -7,15 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from drivers.canopen.codec import HOST, BusCodec, Event, EventCode
-from drivers.canopen.controller import ControllerState
-from drivers.canopen.words import NmtState
+from drivers.canopen.bus_event import HOST, Event, EventCode
+from drivers.canopen.codec import BusCodec
 from drivers.status import AxisEvent, AxisEventCode
 
 _CODES: dict[EventCode, AxisEventCode] = {
     EventCode.EMERGENCY: AxisEventCode.EMERGENCY_MESSAGE,
     EventCode.BOOT_UP: AxisEventCode.DRIVE_RESTARTED,
-    EventCode.NMT_STATE: AxisEventCode.DRIVE_LEFT,
+    EventCode.LEFT: AxisEventCode.DRIVE_LEFT,
+    EventCode.DEAF: AxisEventCode.DRIVE_LEFT,
     EventCode.DRIVE_WARNING: AxisEventCode.DRIVE_WARNING,
     EventCode.TORQUE_LIMITED: AxisEventCode.TORQUE_LIMITED,
     EventCode.DUPLICATE: AxisEventCode.STRANGE_FRAME,
@@ -23,12 +23,13 @@ _CODES: dict[EventCode, AxisEventCode] = {
     EventCode.WRONG_LENGTH: AxisEventCode.STRANGE_FRAME,
     EventCode.STRANGER: AxisEventCode.STRANGE_FRAME,
     EventCode.SECOND_HOST: AxisEventCode.SECOND_HOST,
+    EventCode.ERROR_PASSIVE: AxisEventCode.BUS_DEGRADED,
+    EventCode.BUS_OFF: AxisEventCode.BUS_OFF,
     EventCode.OVERFLOW: AxisEventCode.STRANGE_FRAME,
     EventCode.BUS_ERROR: AxisEventCode.STRANGE_FRAME,
 }
 # Emergencies of a drive that is in trouble with the bus itself (CiA 301, table 26).
 _ERROR_PASSIVE = "8120h"
-_CONTROLLER = {ControllerState.BUS_OFF: AxisEventCode.BUS_OFF, ControllerState.PASSIVE: AxisEventCode.BUS_DEGRADED}
 
 
 def axis_events(events: Iterable[Event], codec: BusCodec, joint_of: Mapping[int, int]) -> list[AxisEvent]:
@@ -41,16 +42,11 @@ def axis_events(events: Iterable[Event], codec: BusCodec, joint_of: Mapping[int,
         joint_of: first joint that each node moves.
     """
     bus = codec.profile.bus.channel
-    operational = {drive.node for drive in codec.drives if drive.nmt == NmtState.OPERATIONAL}
     found = []
     for event in events:
         code = _CODES.get(event.code)
-        if event.code is EventCode.CONTROLLER:
-            code = _CONTROLLER.get(codec.controller)
-        elif event.code is EventCode.EMERGENCY and event.words.startswith(_ERROR_PASSIVE):
+        if event.code is EventCode.EMERGENCY and event.words.startswith(_ERROR_PASSIVE):
             code = AxisEventCode.BUS_DEGRADED
-        elif event.code is EventCode.NMT_STATE and event.node in operational:
-            code = None
         if code is not None:
             words = f"{bus}: {event.words}" if event.node == HOST else f"node {event.node}: {event.words}"
             found.append(AxisEvent(code, joint_of.get(event.node), words))

@@ -22,6 +22,7 @@ import can
 from drivers.canopen.bus_errors import BusError, BusOffWatch, Kind, kind_of
 from drivers.canopen.frame import Frame
 from drivers.canopen.heard import HEARD, MOST_AT_ONCE
+from drivers.canopen.kernel_interface import check_interface
 from drivers.canopen.sendable import check_sendable
 from drivers.clock import RealClock
 from ident_service.config.canopen import CanBus, CanopenDriver
@@ -29,7 +30,7 @@ from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError
 
 _OURS = ("interface", "channel", "bitrate", "data_bitrate", "fd", "receive_own_messages", "can_filters")
-_HEARS_ITSELF = "udp_multicast"
+_HEARS_ITSELF, _KERNELS = "udp_multicast", "socketcan"
 _PLAUSIBLE_S = 1.0
 
 
@@ -37,7 +38,7 @@ def from_config(config: ArmConfig, bus_number: int) -> PythonCanLink:
     """The link of one bus of an arm; entry point `python_can`.
 
     Raises:
-        BusError: no such interface, or it cannot be opened.
+        BusError: no such interface, it is down or without the CAN FD asked for, or it cannot be opened.
         DriverError: the driver section is not CANopen's, or sets an option that is the link's.
     """
     if not isinstance(config.driver, CanopenDriver):
@@ -45,7 +46,16 @@ def from_config(config: ArmConfig, bus_number: int) -> PythonCanLink:
     bus = config.driver.buses[bus_number]
     if taken := [name for name in _OURS if name in bus.options]:
         raise DriverError(f"driver.buses.{bus_number}.options: {', '.join(taken)} cannot be set here")
-    return PythonCanLink(open_bus(bus, can_filters=_filters()), bus)
+    if bus.interface == _KERNELS:
+        check_interface(bus)
+    link = PythonCanLink(open_bus(bus, can_filters=_filters()), bus)
+    try:
+        # The kernel's error of an interface that is down waits, and so do frames that came before the filters.
+        link.drain()
+    except BaseException:
+        link.close()
+        raise
+    return link
 
 
 def open_bus(bus: CanBus, **more: Any) -> can.BusABC:

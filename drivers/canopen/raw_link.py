@@ -14,12 +14,12 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
-from pathlib import Path
 
 from drivers.canopen.bus_errors import CONTROLLER, RX_OVERFLOW, BusError, BusOffWatch, kind_of
 from drivers.canopen.frame import Frame
 from drivers.canopen.heard import HEARD, MOST_AT_ONCE
 from drivers.canopen.kernel_frame import EXTENDED, FD_BYTES, from_kernel, to_kernel
+from drivers.canopen.kernel_interface import AF_CAN, CAN_RAW, check_interface
 from drivers.canopen.sendable import check_sendable
 from drivers.clock import RealClock
 from ident_service.config.canopen import CanopenDriver
@@ -27,7 +27,7 @@ from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError
 
 # Values of the kernel's headers; Python defines the CAN ones only where it was built with them.
-_AF_CAN, _CAN_RAW, _SOL_CAN_RAW = 29, 1, 101
+_SOL_CAN_RAW = 101
 _RAW_FILTER, _RAW_ERR_FILTER, _RAW_LOOPBACK, _RAW_RECV_OWN, _RAW_FD_FRAMES = 1, 2, 3, 4, 5
 _SO_TIMESTAMPNS, _SO_RXQ_OVFL = 35, 40
 _ALL_ERRORS = 0x1FFF_FFFF
@@ -41,7 +41,7 @@ def from_config(config: ArmConfig, bus_number: int) -> RawLink:
     """The link of one bus of an arm; entry point `raw`.
 
     Raises:
-        BusError: the interface is missing or down, or this kernel has no CAN sockets.
+        BusError: the interface is missing, down, or without the CAN FD asked for, or this kernel has no CAN sockets.
         DriverError: the driver section is not CANopen's, or has options, which this interface does not know.
     """
     if not isinstance(config.driver, CanopenDriver):
@@ -49,12 +49,8 @@ def from_config(config: ArmConfig, bus_number: int) -> RawLink:
     bus = config.driver.buses[bus_number]
     if bus.options:
         raise DriverError(f"driver.buses.{bus_number}.options: interface raw has none, found {', '.join(bus.options)}")
+    check_interface(bus)
     fd = bus.data_bitrate is not None
-    if fd and not _carries_fd(bus.channel):
-        remedy = f"carries no CAN FD: `ip link set {bus.channel} up type can bitrate {bus.bitrate} " + (
-            f"dbitrate {bus.data_bitrate} fd on`, or leave data_bitrate out"
-        )
-        raise BusError("refused", bus.channel, remedy=remedy)
     return RawLink(open_socket(bus.channel, bus.bitrate, fd=fd), bus.channel, bus.bitrate, fd=fd)
 
 
@@ -70,7 +66,7 @@ def open_socket(channel: str, bitrate: int = 1_000_000, *, fd: bool = False) -> 
         BusError: the interface is missing or down, or this kernel has no CAN sockets.
     """
     try:
-        sock = socket.socket(_AF_CAN, socket.SOCK_RAW, _CAN_RAW)
+        sock = socket.socket(AF_CAN, socket.SOCK_RAW, CAN_RAW)
     except OSError as error:
         detail = "this kernel has no CAN sockets; load the modules: `modprobe can-raw`, or choose another interface"
         raise BusError("refused", channel, bitrate, f"{detail}: {error.strerror}") from None
@@ -95,14 +91,6 @@ def open_socket(channel: str, bitrate: int = 1_000_000, *, fd: bool = False) -> 
         sock.close()
         raise BusError(kind_of(error.errno), channel, bitrate, error.strerror or str(error)) from None
     return sock
-
-
-def _carries_fd(channel: str) -> bool:
-    """False where an interface is known to carry classic frames only; its largest packet is then 16 bytes."""
-    try:
-        return int((Path("/sys/class/net") / channel / "mtu").read_text()) >= FD_BYTES
-    except (OSError, ValueError):
-        return True
 
 
 class RawLink:

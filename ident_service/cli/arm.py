@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -88,6 +89,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
     from ident_service.motion.factory import make_arm
     from ident_service.motion.preflight import preflight
     from ident_service.motion.preflight_check import Verdict
+    from ident_service.motion.realtime import asked
     from ident_service.service.arm_state import ticket_path
     from ident_service.service.preflight import ticket_document, ticket_text, write_ticket
 
@@ -101,7 +103,10 @@ def _check(arguments: argparse.Namespace) -> Answer:
     if arguments.home and arguments.motion is not None:
         raise UsageError("give a motion or --home, not both")
     motion = None if arguments.home else _chosen(config, arguments.motion)
-    ticket = preflight(make_arm(config), arm_model(config), motion, confirm=confirm)
+    arm, model = make_arm(config), arm_model(config)
+    # The rate is measured with what a run gets of the kernel.
+    with nullcontext() if arm.clock.lock_step else asked():
+        ticket = preflight(arm, model, motion, confirm=confirm)
     path = ticket_path(state_folder(arguments), config.name)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_ticket(path, ticket)

@@ -36,12 +36,14 @@ def add(verbs: Verbs) -> None:
 
 def _emulate(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
+    from ident_service.motion.realtime import asked
     from sim_backend.pucks.process import emulate
 
     config = load_arm(arguments.arm)
     tell(arguments, f"{config.name}: emulated drives; Ctrl-C ends")
     stopping = StopOnSignal()
-    with stopping:
+    # On another core than the motion process, if there is one.
+    with stopping, asked(core_from_last=1):
         done = emulate(
             config,
             faults=arguments.fault,

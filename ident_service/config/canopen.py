@@ -154,6 +154,16 @@ class CanopenDriver(Section):
     status: StatusReports = StatusReports()
     emulation: Emulation = Emulation()
 
+    @property
+    def watchdog(self) -> float:
+        """How long a drive goes on without torque frames [s]."""
+        return self.torque_deadline
+
+    @property
+    def report_delay(self) -> float:
+        """How much later than it happens a drive may tell it [s]."""
+        return self.status.inhibit
+
     @model_validator(mode="after")
     def _nodes_apart(self) -> CanopenDriver:
         places = [(drive.bus, drive.node) for drive in self.drives]

@@ -14,19 +14,12 @@ from ident_service.config.drivers import SimulatedDriver
 from ident_service.config.quantities import Section
 from ident_service.config.recording import RecordingFormat
 from ident_service.config.schema import ArmConfig, DHTable, FourierMotion
+from ident_service.config.shipped import shipped_arms as shipped_arms
 from ident_service.config.source import KeyPath, Tree, read_tree
 from ident_service.errors import ConfigError, Problem, UsageError
 
-# In a wheel the descriptions lie inside the package, in a checkout beside it.
-_SHIPPED = (Path(__file__).parent.parent / "configs", Path(__file__).parent.parent.parent / "configs")
 _Described = TypeVar("_Described", bound=Section)
 _PER_JOINT = ("encoder_resolution", "torque_resolution", "torque_noise")
-
-
-def shipped_arms() -> dict[str, Path]:
-    """Names and files of the arm descriptions that come with this package."""
-    folder = next((folder for folder in _SHIPPED if folder.is_dir()), None)
-    return {} if folder is None else {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
 def find_arm(arm: str) -> Path:

@@ -15,6 +15,7 @@ from typing import Any, cast
 import yaml
 
 from ident_service.config.quantities import MAX_FILE_BYTES, LocatedStr
+from ident_service.config.shipped import shipped_arms
 from ident_service.errors import ConfigError, Problem
 
 KeyPath = tuple[str | int, ...]
@@ -40,7 +41,7 @@ class Tree:
 
 
 def read_tree(path: Path, _chain: tuple[Path, ...] = ()) -> Tree:
-    """Read a YAML file and, underneath it, the file that its `extends` names.
+    """Read a YAML file and, underneath it, the file that its `extends` names, or the shipped description of that name.
 
     Mappings merge key by key, everything else is replaced.
 
@@ -59,6 +60,8 @@ def read_tree(path: Path, _chain: tuple[Path, ...] = ()) -> Tree:
     if not isinstance(parent, str):
         raise ConfigError([tree.problem(("extends",), "extends takes one file name", path)])
     base_path = path.parent / parent
+    if not base_path.is_file():
+        base_path = shipped_arms().get(parent, base_path)
     if not base_path.is_file():
         raise ConfigError([tree.problem(("extends",), f"no such file: {base_path}", path)])
     base = read_tree(base_path, (*_chain, path))

@@ -35,6 +35,7 @@ from ident_service.motion.faults import Findings
 from ident_service.motion.faults import Reaction as Reaction
 from ident_service.motion.owed import Owed
 from ident_service.motion.reference import Setpoint
+from ident_service.motion.told import told
 
 ABSURD = 3.0  # times the torque limit: no controller of ours asks for that
 # Change of torque: libfranka's 1000 N m/s; on small joints, of whom that asks nothing, from none to full in 10 ms.
@@ -138,9 +139,16 @@ class Guard:
         if held and self._plain(sample):
             # Copied, in case that a driver fills the same array again.
             self._position = self._shown = sample.position.copy()
-            return sample.valid, None
-        with np.errstate(all="ignore"):
-            return self._judged(sample, reference.position, velocity)
+            usable, fault = sample.valid, None
+        else:
+            with np.errstate(all="ignore"):
+                usable, fault = self._judged(sample, reference.position, velocity)
+        if sample.events:
+            event = told(sample.events, self._names, self.findings)
+            # Of equals, what a drive says of itself tells more than what its status word does.
+            if event is not None and (fault is None or event.reaction >= fault.reaction):
+                fault = event
+        return usable, fault
 
     def torque(self, wanted: Vector) -> tuple[Vector, Fault | None]:
         """Judge and limit a torque; the change to the first one is not limited, because the support gives way to it.

@@ -9,6 +9,7 @@ sign that has not been proven yet.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,7 +34,10 @@ SUNK = 0.02  # rad or m: what sinks farther while torque fades has no support, a
 
 @dataclass(frozen=True)
 class Trace:
-    """Cycles of the loop, as arrays of one row per cycle.
+    """What happened, as arrays of one row per period from the first cycle's stamp on.
+
+    In a period in which no cycle came, because the machine was late, positions and references are between those around
+    it, and the torque before it acted on.
 
     Attributes:
         position: measured [rad or m], shape (cycles, joints).
@@ -48,6 +52,29 @@ class Trace:
     reference: Vector
     rate: Vector
     period: float
+
+
+def trace_of(rows: Sequence[tuple[Sample, Setpoint]], period: float) -> Trace:
+    """Cycles with their references, the earliest first, as a trace.
+
+    Args:
+        rows: at least one; stamps rise.
+        period: [s].
+    """
+    stamps = np.array([sample.stamp_ns for sample, _ in rows])
+    index = np.rint((stamps - stamps[0]) * 1e-9 / period).astype(int)
+    position = np.array([sample.position for sample, _ in rows])
+    torque = np.array([sample.torque for sample, _ in rows])
+    reference = np.array([setpoint.position for _, setpoint in rows])
+    rate = np.array([setpoint.velocity for _, setpoint in rows])
+    grid = np.arange(index[-1] + 1)
+    if len(grid) != len(rows):
+        position, reference, rate = (
+            np.column_stack([np.interp(grid, index, column) for column in values.T])
+            for values in (position, reference, rate)
+        )
+        torque = torque[np.searchsorted(index, grid, side="right") - 1]
+    return Trace(position, torque, reference, rate, period)
 
 
 class Session:
@@ -138,13 +165,7 @@ class Session:
 
     def trace(self) -> Trace:
         """The cycles of the last `follow`, also of one that a fault ended."""
-        return Trace(
-            np.array([sample.position for sample, _ in self._rows]),
-            np.array([sample.torque for sample, _ in self._rows]),
-            np.array([setpoint.position for _, setpoint in self._rows]),
-            np.array([setpoint.velocity for _, setpoint in self._rows]),
-            self._period,
-        )
+        return trace_of(self._rows, self._period)
 
     def release(self) -> None:
         """Hand the arm back to its support: torque fades, then the drives are switched off."""

@@ -17,7 +17,7 @@ from ident_service.motion.preflight_check import Check, Verdict, failed, judged,
 CODE = "watchdog"
 # What a drive may take where the driver's section does not say: the longest that others use (moteus 0.1 s).
 LONGEST_SILENCE = 0.1
-_LATER = 2.0  # times the configured time, and some cycles, until a drive has said so
+_LATER = 2.0  # times the configured time, some cycles, and what its report may wait, until a drive has said so
 _CYCLES = 10
 REMEDY = (
     "Set the drives' own deadline for torque frames (CANopen: RPDO event timer 1400h:05, and 1016h with 6007h), or "
@@ -75,8 +75,9 @@ def watchdog_check(arm: Arm, model: ArmModel, period: float) -> Check:
     Raises:
         DriverError: the arm does not answer.
     """
-    configured = getattr(model.config.driver, "watchdog", None)
-    most = _LATER * configured + _CYCLES * period if isinstance(configured, int | float) else LONGEST_SILENCE
+    driver = model.config.driver
+    configured, told = getattr(driver, "watchdog", None), getattr(driver, "report_delay", 0.0)
+    most = _LATER * configured + _CYCLES * period + told if isinstance(configured, int | float) else LONGEST_SILENCE
     names = model.chain.names
     begin_ns: int | None = None
     gave_up: dict[str, float] = {}

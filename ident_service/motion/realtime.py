@@ -9,6 +9,8 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 _PRIORITY = 50  # of SCHED_FIFO, below the kernel's own threads; ros2_control's choice (FIELDBUS.md 5.1)
@@ -48,8 +50,12 @@ class Granted:
         return f"real time: got {', '.join(got) or 'nothing'}" + "".join(f"; {reason}" for reason in self.refusals)
 
 
-def ask() -> Granted:
-    """Ask for everything; call it once, in the process of the loop, when all that it needs is loaded."""
+def ask(core_from_last: int = 0) -> Granted:
+    """Ask for everything; call it once, in the process of the loop, when all that it needs is loaded.
+
+    Args:
+        core_from_last: which core, counted back from the last; for a second loop beside the first.
+    """
     refusals = []
     scheduling = memory = False
     core: int | None = None
@@ -67,8 +73,9 @@ def ask() -> Granted:
     if len(cores) > 1:
         try:
             # The last one: interrupts and whoever started us prefer the first.
-            os.sched_setaffinity(0, {cores[-1]})
-            core = cores[-1]
+            wanted = cores[-1 - core_from_last % len(cores)]
+            os.sched_setaffinity(0, {wanted})
+            core = wanted
         except OSError as error:
             refusals.append(f"a core of its own refused ({error.strerror})")
     else:
@@ -77,3 +84,25 @@ def ask() -> Granted:
     gc.freeze()
     gc.disable()
     return Granted(scheduling, memory, core, True, tuple(refusals))
+
+
+@contextmanager
+def asked(core_from_last: int = 0) -> Iterator[Granted]:
+    """The same for a while, for a loop in a process that does other things afterwards.
+
+    Args:
+        core_from_last: as for `ask`.
+    """
+    policy, cores, collecting = os.sched_getscheduler(0), os.sched_getaffinity(0), gc.isenabled()
+    parameter = os.sched_getparam(0)
+    try:
+        yield ask(core_from_last)
+    finally:
+        with suppress(OSError):
+            os.sched_setscheduler(0, policy, parameter)
+        with suppress(OSError):
+            os.sched_setaffinity(0, cores)
+        ctypes.CDLL(None).munlockall()
+        gc.unfreeze()
+        if collecting:
+            gc.enable()

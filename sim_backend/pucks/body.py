@@ -2,8 +2,8 @@
 
 Between two instants at which something changes, motors do the same, and the plant moves in one step; a longer silence
 is divided into steps near the nominal period, between which `watch` is called, so that whoever limits torques by
-position and speed can. A step of exactly the nominal period is the simulated arm's. Until all motors
-have been powered, somebody holds the arm.
+position and speed can. A step of exactly the nominal period is the simulated arm's. Somebody holds the arm until all
+motors are powered and one of them has been given torque: drives are enabled with none.
 
 Boundary: motors to plant; no protocol, no clock.
 """
@@ -138,12 +138,12 @@ class Body:
         before, self._outputs = self._outputs, outputs
         self._torque = self.gears.joint_torque(np.array([torque for _, torque in outputs]))
         self._torque.setflags(write=False)
+        if self.supported:
+            self.supported = not (all(power is Power.TORQUE for power, _ in outputs) and self._torque.any())
         if [power for power, _ in before] == [power for power, _ in outputs]:
             return
         powered = np.array([power is Power.TORQUE for power, _ in outputs], dtype=float)
         self._driven = self.gears.driven(powered)
-        if powered.all():
-            self.supported = False
         braked = np.array([m.braking if m.power is Power.BRAKE else 0.0 for m in self.motors])
         damping = self.gears.joint_damping(braked)
         self.plant.brake(damping if (damping != np.diag(np.diag(damping))).any() else np.diag(damping).copy())

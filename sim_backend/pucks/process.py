@@ -25,6 +25,8 @@ from sim_backend.pucks.faults import PuckFault, parse_fault
 from sim_backend.pucks.injection import Sent
 from sim_backend.pucks.lock_step import INTERFACE
 from sim_backend.pucks.station import Station
+from sim_backend.pucks.wires import INTERFACE as OUR_WIRE
+from sim_backend.pucks.wires import Wires
 
 _POLL_NS = 20_000_000  # commands, stop and states are looked at this often
 _AT_ONCE = 256  # frames handled before time is looked at again
@@ -88,7 +90,10 @@ def emulate(
     emulator = build_emulator(config)
     emulator.add_configured(parse_fault(text, emulator.names) for text in faults)
     assert isinstance(driver, CanopenDriver)  # noqa: S101 or there would be no emulator
-    station = Station(driver.buses)
+    ours = {bus.interface == OUR_WIRE for bus in driver.buses}
+    if len(ours) > 1:
+        raise DriverError(f"{config.name}: either all buses are {OUR_WIRE} or none is, for one loop to serve them")
+    station = Wires(driver.buses) if ours == {True} else Station(driver.buses)
     try:
         return _Run(emulator, station, tell, commands).until(seconds, stop_requested)
     finally:
@@ -97,7 +102,11 @@ def emulate(
 
 class _Run:
     def __init__(
-        self, emulator: Emulator, station: Station, tell: Callable[[str], None], commands: Callable[[], str | None]
+        self,
+        emulator: Emulator,
+        station: Station | Wires,
+        tell: Callable[[str], None],
+        commands: Callable[[], str | None],
     ) -> None:
         self._emulator, self._station = emulator, station
         self._tell, self._commands = tell, commands
@@ -115,8 +124,10 @@ class _Run:
         begun = looked = clock.now_ns()
         end = None if seconds is None else begun + round(seconds * 1e9)
         # What has been built stays; the collector need not look at it again in the middle of a cycle.
+        collecting = gc.isenabled()
         gc.collect()
         gc.freeze()
+        gc.disable()
         emulator.power_up(begun)
         try:
             while not self._quit:
@@ -137,6 +148,8 @@ class _Run:
                 self._pass_on(emulator.tick(clock.now_ns()))
         finally:
             gc.unfreeze()
+            if collecting:
+                gc.enable()
         now = clock.now_ns()
         self._look(now)
         return Emulated(

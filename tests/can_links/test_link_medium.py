@@ -10,10 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from link_bench import frames
 
+from drivers.canopen.bits import exact
 from drivers.canopen.bus_errors import BUS_OFF, CONTROLLER, COUNTERS, PASSIVE_RX, PASSIVE_TX, RESTARTED, WARNING_TX
 from drivers.canopen.frame import Frame
 from drivers.canopen.heard import HEARD
-from drivers.canopen.wire.frame_bits import ERROR_BITS, frame_bits
+from drivers.canopen.wire.hub import ERROR_BITS
 from drivers.canopen.wire.medium import INBOX, QUEUE, Medium, Port, priority
 
 
@@ -46,18 +47,18 @@ def counted_bits(frame: Frame) -> int:
 
 @given(frames())
 def test_bits_of_a_frame_are_those_of_a_bit_by_bit_count(frame: Frame) -> None:
-    assert frame_bits(frame) == counted_bits(frame)
+    assert exact(frame).nominal == counted_bits(frame)
 
 
 @given(frames())
 def test_bits_of_a_standard_frame_lie_between_the_formulas(frame: Frame) -> None:
     if not frame.extended:
         n = len(frame.data)
-        assert 47 + 8 * n <= frame_bits(frame) <= 47 + 8 * n + (33 + 8 * n) // 4
+        assert 47 + 8 * n <= exact(frame).nominal <= 47 + 8 * n + (33 + 8 * n) // 4
 
 
 def test_bits_of_a_sync() -> None:
-    assert frame_bits(Frame(0x080)) == 51  # FIELDBUS 2.1
+    assert exact(Frame(0x080)).nominal == 51  # FIELDBUS 2.1
 
 
 @given(frames(), frames())
@@ -70,7 +71,7 @@ def test_who_wins_is_who_sends_the_first_dominant_bit(one: Frame, other: Frame) 
 
 
 def on_wire(count: int, bitrate: int = 0) -> tuple[Medium, list[Port]]:
-    duration = (lambda frame: frame_bits(frame) * 1_000_000_000 // bitrate) if bitrate else None
+    duration = (lambda frame: exact(frame).nominal * 1_000_000_000 // bitrate) if bitrate else None
     medium = Medium(duration, ERROR_BITS * 1_000_000_000 // bitrate if bitrate else 0)
     ports = [Port(f"port {k}") for k in range(count)]
     for port in ports:

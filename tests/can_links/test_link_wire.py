@@ -109,7 +109,7 @@ def test_without_a_wire_the_message_says_how_to_start_one(name: str) -> None:
     assert caught.value.kind == "absent"
     with pytest.raises(can.CanInitializationError, match="nobody runs this wire"):
         can.Bus(interface="ident_wire", channel=name)
-    with pytest.raises(DriverError, match=r"buses\.0\.options: ident_wire has none, found host"):
+    with pytest.raises(DriverError, match=r"buses\.0\.options: ident_wire has only pace, found host"):
         open_links(arm_on_bus(interface="ident_wire", channel=name, options={"host": True}))
 
 

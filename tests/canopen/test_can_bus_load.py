@@ -90,7 +90,7 @@ def test_arms_without_a_bus_have_no_load(capsys: pytest.CaptureFixture[str]) -> 
 
 def test_config_check_says_the_load_or_refuses_it(arms: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["config", "check", str(arms / "wam7_canopen.yaml")]) == DONE
-    assert capsys.readouterr().out.startswith("bus 0 (can0): 98.9 % worst, 87.6 % typical at 1000 Hz; up to 1010 Hz\n")
+    assert "\nbus 0 (can0): 98.9 % worst, 87.6 % typical at 1000 Hz; up to 1010 Hz\n" in capsys.readouterr().out
     path = extended(arms, "torque_frames: single")
     document = answered(capsys, "config", "check", path)
     assert document["exit_code"] == USAGE

@@ -10,7 +10,8 @@ from can_arms import wam_driver
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from drivers.canopen.codec import HOST, BusCodec, Event, EventCode
+from drivers.canopen.bus_event import HOST, Event, EventCode
+from drivers.canopen.codec import BusCodec
 from drivers.canopen.controller import ControllerState
 from drivers.canopen.frame import Frame
 from drivers.canopen.profile import bus_profiles
@@ -110,10 +111,10 @@ def test_status_words_are_told_when_they_change() -> None:
     assert [event.code for event in events] == [
         EventCode.DRIVE_STATE,
         EventCode.TORQUE_LIMITED,
-        EventCode.TORQUE_LIMITED,
+        EventCode.OVER,
         EventCode.DRIVE_WARNING,
         EventCode.DRIVE_FAULT,
-        EventCode.DRIVE_WARNING,
+        EventCode.OVER,
     ]
     assert events[0].words == "operation enabled (status word 1637h)"
     assert events[4].words == "fault (status word 0218h), was operation enabled"
@@ -163,8 +164,8 @@ def test_heartbeats_tell_who_lives_and_who_has_booted() -> None:
     events = bus.take_events()
     assert [(event.code, event.node) for event in events] == [
         (EventCode.BOOT_UP, 2),
-        (EventCode.NMT_STATE, 2),
-        (EventCode.NMT_STATE, 3),
+        (EventCode.LEFT, 2),
+        (EventCode.LEFT, 3),
     ]
     assert events[2].words == "NMT state stopped, was operational"
     assert bus.drives[1].boots == 1
@@ -186,6 +187,9 @@ def test_strangers_and_a_second_host_are_told_once() -> None:
     ]
     assert bus.counters.strangers == 9
     assert bus.counters.ignored == 3
+    bus.forget_events()
+    bus.receive(Frame(0x201, bytes(8)))
+    assert told(bus) == [(EventCode.SECOND_HOST, HOST)]  # still there after what was expected
 
 
 def controller(identifier: int, *data: int) -> Frame:
@@ -205,7 +209,13 @@ def test_the_controllers_state_follows_its_error_frames() -> None:
     for frame, state in steps:
         bus.receive(frame)
         assert bus.controller is state
-    assert told(bus) == [(EventCode.CONTROLLER, HOST)] * 5
+    assert [code for code, node in told(bus) if node == HOST] == [
+        EventCode.CONTROLLER,
+        EventCode.ERROR_PASSIVE,
+        EventCode.CONTROLLER,
+        EventCode.BUS_OFF,
+        EventCode.CONTROLLER,
+    ]
     bus.receive(controller(0x004, 0, 0x01))
     bus.receive(controller(0x020))
     events = bus.take_events()
@@ -222,6 +232,35 @@ def test_a_flood_of_events_is_bounded_and_counted() -> None:
     assert bus.counters.events_lost > 9000
     bus.receive(Frame(0x181, b"\x00"))
     assert len(bus.take_events()) == 1
+
+
+def test_a_flood_hides_neither_an_emergency_nor_a_second_host() -> None:
+    bus = codec()
+    for identifier in range(0x400, 0x500):
+        bus.receive(Frame(identifier))
+    for _ in range(1000):
+        bus.receive(Frame(0x181, b"\x00"))
+    bus.receive(Frame(0x082, struct.pack("<HB5x", 0x5400, 1)))
+    bus.receive(Frame(0x080))
+    events = bus.take_events()
+    assert [event.code for event in events[-2:]] == [EventCode.EMERGENCY, EventCode.SECOND_HOST]
+    assert len(events) < 300
+
+
+def test_a_drive_that_stops_following_its_torque_is_told_of() -> None:
+    bus = codec()
+    for status in (0x0227, 0x1227, 0x0227, 0x1227, 0x0221):
+        bus.receive(Frame(0x281, struct.pack("<Hh", status, 0)))
+    codes = [event.code for event in bus.take_events()]
+    assert codes.count(EventCode.DEAF) == 1  # neither before it followed nor when it was switched off
+
+
+def test_what_a_drive_said_before_it_booted_is_no_longer_true() -> None:
+    bus = codec()
+    bus.receive(Frame(0x281, struct.pack("<Hh", 0x1227, 0)))
+    assert bus.drives[0].state is DriveState.OPERATION_ENABLED
+    bus.receive(Frame(0x701, b"\x00"))
+    assert bus.drives[0].state is DriveState.UNKNOWN
 
 
 def test_wrong_lengths_change_nothing() -> None:

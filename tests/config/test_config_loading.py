@@ -261,3 +261,12 @@ def test_home_defaults_to_the_place_nearest_to_zero(tmp_path: Path) -> None:
     assert limits.home.tolist() == [0.5, -1.0]
     assert limits.lower.tolist() == [0.5, -2.0]
     assert limits.upper.tolist() == [2.0, 1.0]
+
+
+def test_a_description_may_extend_a_shipped_one_by_its_name(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("extends: wam7_sim\nname: mine\n", encoding="utf-8")
+    assert load_arm(path).model_copy(update={"name": "wam7_sim"}) == load_arm("wam7_sim")
+    # A file beside it comes first.
+    (tmp_path / "wam7_sim").write_text(f"extends: {shipped_arms()['planar2']}\n", encoding="utf-8")
+    assert load_arm(path).joints == load_arm("planar2").joints

@@ -1,8 +1,14 @@
-"""What the fault campaign injects, what the table promises of it, and how one case is run and looked at."""
+"""What the fault campaign injects, what the table promises of it, and how one case is run.
+
+Boundary: the simulated arms are here, arms of emulated drives are `campaign_canopen.py`; what a run is held to is
+`campaign_checks.py`.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -13,6 +19,7 @@ from motion_bench import Story, WatchedArm, bench_config
 from ident_service.config.limits import MotionLimits, motion_limits
 from ident_service.config.load import load_arm
 from ident_service.config.schema import ArmConfig
+from ident_service.config.simulation import FAULT_RULES
 from ident_service.errors import ArmFault
 from ident_service.excitation.excitation import Excitation
 from ident_service.excitation.plan import excitation
@@ -22,11 +29,11 @@ from ident_service.motion.checks import MAX_AGE
 from ident_service.motion.controls import Switches
 from ident_service.motion.faults import FAULTS
 from ident_service.motion.latch import Latch
-from ident_service.motion.run import run
+from ident_service.motion.run import Sink, run
 from ident_service.motion.states import State
 from ident_service.record.cycle import Cycle
 from ident_service.record.writer import RecordingWriter
-from sim_backend.arm import SimulatedArm, Truth, from_config
+from sim_backend.arm import Truth, from_config
 from sim_backend.faults import Fault, FaultKind
 
 Array = np.ndarray
@@ -51,12 +58,16 @@ class Promise:
         duration: in cycles; None for what the kind does by itself.
         within: cycles until the fault is found, in every state that is energised; None where the run may also end as if
             nothing had been, because nobody could tell.
+        warns: what a run that goes on must have told.
+        words: one of these is in the sentence that a person reads.
     """
 
     codes: set[str]
     size: float = 0.0
     duration: int | None = None
     within: int | None = None
+    warns: str | None = None
+    words: tuple[str, ...] = ()
 
 
 PROMISES: dict[FaultKind, Promise] = {
@@ -82,12 +93,37 @@ PROMISES: dict[FaultKind, Promise] = {
 
 
 @dataclass(frozen=True)
+class Strike:
+    """One fault of an arm that counts its faults from when they are handed over.
+
+    Attributes:
+        at_cycle: exchange before which it comes.
+        kind: its name.
+        joint: index of the joint, or of its drive; None for all.
+        duration: in cycles; None for what the kind does by itself.
+        size: of the fault.
+        later: share of a cycle by which it comes later still.
+    """
+
+    at_cycle: int
+    kind: str
+    joint: int | None
+    duration: int | None
+    size: float
+    later: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
 class Subject:
     """An arm to break.
 
     Attributes:
         pause: cycle of a script that pauses.
         stop: cycle of a script that stops.
+        build: makes the arm, not open, with faults in it and an eye on the truth; None for the simulated arm.
+        promises: of every kind, by its name.
+        of_joint: which kinds may be one joint's.
+        torque_step: by which rounding to the drives' steps may exceed a torque limit [N m or N], shape (joints,).
     """
 
     config: ArmConfig
@@ -96,20 +132,34 @@ class Subject:
     limits: MotionLimits
     pause: int
     stop: int
+    build: Callable[[Strike | None, Callable[[Truth], None]], WatchedArm] | None = None
+    promises: Mapping[str, Promise] = field(
+        default_factory=lambda: {kind.value: promise for kind, promise in PROMISES.items()}
+    )
+    of_joint: Callable[[str], bool] = lambda kind: FAULT_RULES[FaultKind(kind)].of_joint
+    torque_step: Array | float = 0.0
 
 
 @cache
 def subject(name: str) -> Subject:
-    """`bench` or `wam`."""
+    """`bench` or `wam`; of emulated drives `bench canopen`, `wam canopen`, and with two buses `wam two buses`."""
+    if "canopen" in name or "buses" in name:
+        from campaign_canopen import canopen_subject
+
+        return canopen_subject(name)
     if name == "bench":
         config, pause = bench_config(), 900
     else:
-        motions = {"identification": {"kind": "seeded", "seed": 7, "base_frequency": 0.4, "harmonics": 3, "periods": 1}}
-        document = load_arm("wam7_sim").model_dump(mode="json", by_alias=True)
-        config, pause = ArmConfig.model_validate(document | {"motions": motions}), 2600
+        config, pause = wam_config("wam7_sim"), 2600
     model = arm_model(config)
-    motion = excitation(model, "identification")
-    return Subject(config, model, motion, motion_limits(config), pause, pause)
+    return Subject(config, model, excitation(model, "identification"), motion_limits(config), pause, pause)
+
+
+def wam_config(name: str, **changes: Any) -> ArmConfig:
+    """A shipped WAM with a short motion; `changes` replace top-level sections."""
+    motions = {"identification": {"kind": "seeded", "seed": 7, "base_frequency": 0.4, "harmonics": 3, "periods": 1}}
+    document = load_arm(name).model_dump(mode="json", by_alias=True)
+    return ArmConfig.model_validate(document | {"motions": motions} | changes)
 
 
 @dataclass(frozen=True)
@@ -117,7 +167,7 @@ class Case:
     """One fault in one state."""
 
     arm: str
-    kind: FaultKind
+    kind: str
     state: State
     share: float  # of the state's time at which it strikes
     joint: int | None
@@ -125,21 +175,22 @@ class Case:
 
     def __str__(self) -> str:
         slow = "" if self.speed == 1.0 else f"-at {self.speed:g}"
-        return f"{self.arm}-{self.kind.value}-{self.state.value}-{self.share:.2f}-{self.joint}{slow}"
+        return f"{self.arm}-{self.kind}-{self.state.value}-{self.share:.2f}-{self.joint}{slow}"
 
 
 class Script(Switches):
     """Somebody who pauses and goes on, or stops, at given cycles of the loop."""
 
-    def __init__(self, which: Subject, state: State, speed: float = 1.0) -> None:
+    def __init__(self, arm: WatchedArm, which: Subject, state: State, speed: float = 1.0) -> None:
         super().__init__()
+        self._arm = arm
         pausing = state in (State.PAUSING, State.PAUSED, State.RESUMING)
         stopping = state in (State.STOPPING, State.STOPPED)
         self._pause = round(which.pause / speed) if pausing else 10**9
         self._stop = round(which.stop / speed) if stopping else 10**9
 
     def lease_ok(self, now_ns: int) -> bool:
-        cycle = now_ns // 1_000_000
+        cycle = self._arm.cycle - 1
         self.pause = self._pause <= cycle < self._pause + PAUSED_FOR + 200
         self.stop = cycle >= self._stop
         return True
@@ -173,25 +224,35 @@ class _Both:
         return self._story.event(stamp_ns, level, message)
 
 
-def play(which: Subject, state: State, faults: tuple[Fault, ...], path: Path | None, speed: float = 1.0) -> Outcome:
+def play(
+    which: Subject, state: State, faults: tuple[Fault | Strike, ...], path: Path | None, speed: float = 1.0
+) -> Outcome:
     """One run on a new arm, with what the script of a state does, recorded if a path is given."""
     truth: list[Truth] = []
-    inner = from_config(which.config, faults=faults, observer=truth.append)
-    assert isinstance(inner, SimulatedArm)
-    arm, story, latch, fault = WatchedArm(inner), Story(), Latch(), None
+    if which.build is None:
+        inner = from_config(which.config, faults=[f for f in faults if isinstance(f, Fault)], observer=truth.append)
+        arm = WatchedArm(inner)
+    else:
+        (strike,) = [f for f in faults if isinstance(f, Strike)] or [None]
+        arm = which.build(strike, truth.append)
+    story, latch, fault = Story(), Latch(), None
     options: dict[str, Any] = {"latch": latch, "hold_seconds": HOLD, "speed": speed}
-    script = Script(which, state, speed)
+    script = Script(arm, which, state, speed)
     try:
-        if path is None:
-            with arm:
-                run(arm, which.model, which.motion, story, script, **options)
-        else:
-            text = urdf_text(which.model, which.model.prior)
-            with arm, RecordingWriter(path, which.model.chain.names, text, 0) as writer:
-                run(arm, which.model, which.motion, _Both(story, writer), script, **options)
+        with arm, ExitStack() as stack:
+            sink: Sink = story
+            if path is not None:
+                text = urdf_text(which.model, which.model.prior)
+                writer = RecordingWriter(path, which.model.chain.names, text, 0)
+                sink = _Both(story, stack.enter_context(writer))
+            try:
+                run(arm, which.model, which.motion, sink, script, **options)
+            finally:
+                moments = list(truth)
+                arm.left_alone()
     except ArmFault as error:
         fault = error
-    return Outcome(story, arm, truth, latch, fault)
+    return Outcome(story, arm, moments, latch, fault)
 
 
 @cache
@@ -199,14 +260,20 @@ def windows(name: str, state: State, speed: float = 1.0) -> dict[str, tuple[int,
     """First and last cycle of every state of a healthy run of a script."""
     healthy = play(subject(name), state, (), None, speed)
     assert healthy.fault is None
-    begins = [(message, stamp // 1_000_000) for stamp, level, message in healthy.story.events if level == 20]
+    first, told = healthy.story.samples[0], [event for event in healthy.story.events if event[1] == 20]
+    # Enabling may take time that has no cycles.
+    since = [max(-1, round((stamp - first["stamp_ns"]) * 1e-9 / PERIOD)) for stamp, _, _ in told]
+    begins = [(message, first["cycle"] + cycles) for (_, _, message), cycles in zip(told, since, strict=True)]
     ends = [begin for _, begin in begins[1:]] + [healthy.story.samples[-1]["cycle"]]
     return {message: (begin + 1, end) for (message, begin), end in zip(begins, ends, strict=True)}
 
 
-def injected(case: Case) -> Fault:
+def injected(case: Case) -> Fault | Strike:
     """The fault of a case, at its time."""
+    which = subject(case.arm)
     first, last = windows(case.arm, case.state, case.speed)[case.state.value]
-    promise = PROMISES[case.kind]
+    promise = which.promises[case.kind]
     cycle = first + round(case.share * (last - 1 - first))
-    return Fault(cycle, case.kind, case.joint, promise.duration, promise.size)
+    if which.build is None:
+        return Fault(cycle, FaultKind(case.kind), case.joint, promise.duration, promise.size)
+    return Strike(cycle, case.kind, case.joint, promise.duration, promise.size, case.share)

@@ -15,7 +15,7 @@ from ident_service.excitation.excitation import Excitation
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.record.cycle import Cycle
-from sim_backend.arm import SimulatedArm, Truth, from_config
+from sim_backend.arm import Truth, from_config
 from sim_backend.faults import Fault
 
 Array = np.ndarray
@@ -62,7 +62,7 @@ def bench_excitation() -> Excitation:
 class WatchedArm(Arm):
     """An arm that remembers what was asked of it, and fails where a test says so."""
 
-    def __init__(self, inner: SimulatedArm) -> None:
+    def __init__(self, inner: Arm) -> None:
         self.inner = inner
         self.clock = inner.clock
         self.torques: list[Array] = []
@@ -77,6 +77,7 @@ class WatchedArm(Arm):
 
     def open(self) -> None:
         self.inner.open()
+        self.clock = self.inner.clock
 
     def describe(self) -> ArmDescription:
         return self.inner.describe()
@@ -103,6 +104,9 @@ class WatchedArm(Arm):
         self.inner.stop(kind)
         if self.stop_error is not None:
             raise self.stop_error
+
+    def left_alone(self) -> None:
+        """A run has ended, and whoever ran it may have died: for arms that must then stop by themselves."""
 
     def close(self) -> None:
         self.inner.close()

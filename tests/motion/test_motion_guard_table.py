@@ -11,7 +11,7 @@ from guard_bench import HOME, LIMITS, LOWER, NAMES, OFF, PERIOD, QUICK, STOP, WA
 from motion_bench import bench_model
 
 from drivers.arm import StopKind
-from drivers.status import AxisStatus
+from drivers.status import AxisEventCode, AxisStatus
 from ident_service.model.contact import Contact
 from ident_service.motion.checks import (
     ENVELOPE,
@@ -212,6 +212,7 @@ FOUND_ELSEWHERE = {
     *("late_cycle", "late_cycles", "bus_silent", "clock_jump"),
     *("driver", "recorder_behind", "program", "lease_lost", "controls_failed", "no_way_back"),
     *("not_at_rest", "hold_lost", "workspace"),
+    *(code.value for code in AxisEventCode),
 }
 
 
@@ -234,11 +235,13 @@ def test_every_fault_of_the_table_is_triggered() -> None:
 def test_the_reactions_are_those_of_the_fault_table() -> None:
     by_reaction = {reaction: {code for code in FAULTS if FAULTS[code].reaction is reaction} for reaction in Reaction}
     assert by_reaction[WARN] == {
-        *("torque_saturated", "torque_rate", "torque_not_applied", "encoder_jump", "lost_feedback", "late_cycle")
+        *("torque_saturated", "torque_rate", "torque_not_applied", "encoder_jump", "lost_feedback", "late_cycle"),
+        *("drive_warning", "torque_limited", "strange_frame"),
     }
     assert by_reaction[STOP] == {
         *("repeated_warnings", "late_cycles", "encoder_jumps", "position_envelope", "position_limit", "over_velocity"),
         *("following_error", "workspace", "lease_lost", "controls_failed", "no_way_back", "recorder_behind"),
+        "bus_degraded",
     }
     assert by_reaction[LOWER] == {"following_lost"}
     assert by_reaction[OFF] == {"emergency_stop", "feedback_not_finite", "frozen_encoder", "far_outside", "runaway"}

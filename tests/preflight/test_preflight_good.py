@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from flight_bench import LIMIT, TRUTH, Flight, check_of, verdicts
 
+from drivers.arm import Sample
 from drivers.clock import VirtualClock
 from ident_service.config.load import load_arm
 from ident_service.excitation.plan import excitation
@@ -16,6 +17,8 @@ from ident_service.model.arm_model import arm_model
 from ident_service.motion.factory import make_arm
 from ident_service.motion.preflight import preflight
 from ident_service.motion.preflight_check import CODES, Verdict
+from ident_service.motion.preflight_session import trace_of
+from ident_service.motion.reference import Setpoint
 
 
 def test_a_good_arm_passes_all_that_virtual_time_can_tell() -> None:
@@ -101,3 +104,18 @@ def test_a_shipped_arm_with_geometry_and_noise_passes() -> None:
     assert ticket.verdict is Verdict.PASSED
     assert any(one.what == "clearance" for one in check_of(ticket, "motion_proven").measures)
     assert any("clearance" in one.what for one in check_of(ticket, "ways_clear").measures)
+
+
+def test_a_period_without_a_cycle_is_filled_in_and_the_torque_before_it_acted_on() -> None:
+    def row(cycle: int) -> tuple[Sample, Setpoint]:
+        q = np.array([0.1 * cycle, -cycle])
+        flags, age = np.ones(2, dtype=bool), np.zeros(2, dtype=np.int64)
+        # Stamps of a real clock are a little off their grid.
+        sample = Sample(cycle, 7_000_000 + 2_000_000 * cycle + 90_000 * (cycle % 2), q, None, 10.0 * q, flags, age)
+        return sample, Setpoint(q + 1.0, q + 2.0, np.zeros(2))
+
+    whole, gaps = trace_of([row(k) for k in range(8)], 2e-3), trace_of([row(k) for k in (0, 1, 4, 5, 7)], 2e-3)
+    for name in ("position", "reference", "rate"):
+        np.testing.assert_allclose(getattr(gaps, name), getattr(whole, name), atol=1e-12)
+    assert gaps.torque[:, 1].tolist() == [-0.0, -10.0, -10.0, -10.0, -40.0, -50.0, -50.0, -70.0]
+    np.testing.assert_array_equal(whole.torque[:, 1], -10.0 * np.arange(8))

@@ -106,14 +106,18 @@ def test_a_long_silence_is_watched_in_steps(tmp_path: Path) -> None:
     assert max(np.diff([0, *seen, 10 * MS])) <= 1.5 * MS
 
 
-def test_nobody_falls_before_all_motors_had_power(tmp_path: Path) -> None:
+def test_nobody_falls_before_all_motors_have_power_and_some_torque(tmp_path: Path) -> None:
     body = body_of(tmp_path)
     start = body.plant.position
     body.motors[0].drive(1.0, 0)
     body.advance(100 * MS)
     assert body.plant.position is start
     body.motors[1].drive(0.0, 100 * MS)
+    body.motors[0].drive(0.0, 100 * MS)
     body.advance(200 * MS)
+    assert body.plant.position is start
+    body.motors[0].drive(1e-3, 200 * MS)
+    body.advance(300 * MS)
     assert (body.plant.position != start).any()
 
 

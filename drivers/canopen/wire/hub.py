@@ -19,14 +19,15 @@ from threading import RLock
 from types import TracebackType
 from typing import Final, Self
 
+from drivers.canopen.bits import exact
 from drivers.canopen.bus_errors import BusError
 from drivers.canopen.frame import Frame
 from drivers.canopen.wire import address, packets
-from drivers.canopen.wire.frame_bits import ERROR_BITS, frame_bits
 from drivers.canopen.wire.medium import Medium, Port, overflow
 from ident_service.errors import DriverError
 
 MOST_ENDS: Final = 32
+ERROR_BITS: Final = 20  # flag and delimiter of an error, and the interframe space; superposed flags make it up to 26
 _SELECT_LIMIT: Final = 1024  # descriptors that select, whose timeout alone is finer than milliseconds, can watch
 
 
@@ -71,7 +72,7 @@ class Wire:
         self.name, self.bitrate, self.fd = name, bitrate, fd
         error_ns = 0
         if bitrate:
-            duration_ns = duration_ns or (lambda frame: frame_bits(frame) * 1_000_000_000 // bitrate)
+            duration_ns = duration_ns or (lambda frame: exact(frame).nominal * 1_000_000_000 // bitrate)
             error_ns = ERROR_BITS * 1_000_000_000 // bitrate
         self.medium = Medium(duration_ns, error_ns)
         self.lock = RLock()
@@ -124,15 +125,7 @@ class Wire:
         if self._listener is None:
             raise BusError("gone", f"ident_wire {self.name}", remedy="this wire is closed")
         listener = self._listener.fileno()
-        with self.lock:
-            watched: list[int] = [listener, self._wake]
-            # A port whose queue is full is not read: its socket fills up, and its sender is told.
-            watched += [
-                number
-                for number, end in self._ends.items()
-                if end.port is None or self.medium.room(end.port) >= packets.MAX_FRAMES
-            ]
-            end_ns = self.medium.end_ns
+        watched, end_ns = self.watched()
         until = deadline_ns if end_ns is None else min(deadline_ns, end_ns)
         remaining = max(0, until - time.monotonic_ns())
         ready = select.select(watched, [], [], remaining * 1e-9)[0]
@@ -147,6 +140,19 @@ class Wire:
                 elif (end := self._ends.get(number)) is not None:
                     self._read(end, now)
             self.turn(time.monotonic_ns())
+
+    def watched(self) -> tuple[list[int], int | None]:
+        """What to wait for where one loop hosts several wires: descriptors, and when a frame ends."""
+        with self.lock:
+            if self._listener is None:
+                return [], None
+            # A port whose queue is full is not read: its socket fills up, and its sender is told.
+            ends = [
+                number
+                for number, end in self._ends.items()
+                if end.port is None or self.medium.room(end.port) >= packets.MAX_FRAMES
+            ]
+            return [self._listener.fileno(), self._wake, *ends], self.medium.end_ns
 
     def turn(self, now_ns: int) -> None:
         """Move frames and hand out what was heard, without taking anything from a socket."""

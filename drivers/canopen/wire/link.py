@@ -33,13 +33,13 @@ def from_config(config: ArmConfig, bus_number: int) -> WireLink:
 
     Raises:
         BusError: nobody runs the wire, or it refuses.
-        DriverError: the driver section is not CANopen's, or has options, which the driver's end does not know.
+        DriverError: the driver section is not CANopen's, or an option that nobody knows; `pace` is the host's.
     """
     if not isinstance(config.driver, CanopenDriver):
         raise DriverError(f"{config.name}: the driver is not CANopen's")
     bus = config.driver.buses[bus_number]
-    if bus.options:
-        raise DriverError(f"driver.buses.{bus_number}.options: ident_wire has none, found {', '.join(bus.options)}")
+    if unknown := sorted(set(bus.options) - {"pace"}):
+        raise DriverError(f"driver.buses.{bus_number}.options: ident_wire has only pace, found {', '.join(unknown)}")
     return WireLink(Connection(bus.channel, packets.Hello("driver", filters=HEARD)))
 
 

@@ -1,0 +1,214 @@
+"""Arms of emulated drives on a lock-step bus to break, and what is promised of every fault that drives can have.
+
+Beside the faults of the drives there are those of the host's side of the wire (`WIRE`): torque frames that get lost,
+and another host that sends what only ours may. An arm that has been left alone must have let go within its drives'
+own deadlines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
+
+from campaign_bench import _READ_WRONGLY, _UNTRUE, Promise, Strike, Subject, wam_config
+from motion_bench import TRUTH, WatchedArm, bench_config
+
+from drivers.arm import Sample
+from drivers.canopen.arm import CanopenArm
+from drivers.canopen.frame import Frame
+from drivers.clock import Clock
+from ident_service.config.canopen import CanopenDriver
+from ident_service.config.limits import motion_limits
+from ident_service.config.schema import ArmConfig
+from ident_service.excitation.plan import excitation
+from ident_service.model.arm_model import arm_model
+from ident_service.motion.checks import MAX_AGE
+from sim_backend.machine import Truth
+from sim_backend.pucks.faults import PUCK_FAULTS, PuckFault
+from sim_backend.pucks.lock_step import LockStepArm, LockStepLink
+
+PERIOD = 1e-3
+EDS = (Path(__file__).parents[2] / "configs" / "puck.eds").read_text(encoding="utf-8")
+# Sent by somebody else; a torque frame, a control word and an NMT command are those that would do harm.
+FOREIGN: dict[str, Frame] = {
+    "foreign_sync": Frame(0x080),
+    "foreign_torque": Frame(0x201, bytes(4)),
+    "foreign_control": Frame(0x301, bytes([0x06, 0x00, 10])),
+    "foreign_nmt": Frame(0x000, bytes([0x01, 0x01])),
+    "foreign_heartbeat": Frame(0x77F, b"\x05"),
+}
+WIRE = ("lost_torques", *FOREIGN)
+# Two cycles: a fault may come after the answers of the cycle before which it was handed over.
+SOON = 3
+_TIMEOUT, _DEADLINE, _INHIBIT = 300, 10, 50  # cycles: heartbeat, torque frames, status reports
+_DROPPED = {"drive_fault", "drive_emergency", "feedback_gone", "drive_watchdog"}
+
+CANOPEN_PROMISES: dict[str, Promise] = {
+    "lost_feedback": Promise({"feedback_gone"}, duration=50, within=MAX_AGE + 1),
+    "delayed_feedback": Promise({"feedback_gone"}, size=0.005, within=MAX_AGE + 1),
+    "hidden_delay": Promise(_READ_WRONGLY, size=0.02),
+    "encoder_jump": Promise({"encoder_jumps"}, size=0.5, duration=2, within=SOON),
+    "encoder_offset": Promise({"feedback_gone"}, size=0.5, within=MAX_AGE + 1),
+    "frozen_encoder": Promise(_UNTRUE, duration=10**6),
+    "position_sign": Promise(_READ_WRONGLY),
+    "stuck_torque": Promise(_UNTRUE, duration=10**6),
+    "torque_sign": Promise(_UNTRUE),
+    "torque_saturation": Promise(_UNTRUE, size=0.05),
+    "drive_fault": Promise({"drive_emergency"}, within=SOON, words=("5400h power section",)),
+    "node_silent": Promise({"feedback_gone"}, within=MAX_AGE + 1),
+    "emergency_stop": Promise({"drive_emergency"}, within=SOON, words=("3220h under-voltage of the DC link",)),
+    "load_attached": Promise(_UNTRUE, size=2.0),
+    "bus_gone": Promise({"driver"}, duration=10**6, within=SOON, words=("gone",)),
+    "emergency": Promise({"drive_emergency"}, size=0x4310, within=SOON, words=("4310h drive too hot",)),
+    "warning": Promise({"repeated_warnings"}, warns="drive_warning", words=("warns",)),
+    "heartbeat_lost": Promise({"drive_silent"}, within=_TIMEOUT + 12, words=("no heartbeat for 0.3 s",)),
+    "reboot": Promise({"feedback_gone", "drive_restarted"}, within=MAX_AGE + 1),
+    "wrong_node": Promise(
+        {"repeated_warnings"}, within=25, words=("a second position in one cycle", "after its cycle")
+    ),
+    "short_frame": Promise({"feedback_gone"}, duration=50, within=MAX_AGE + 1),
+    "bus_off": Promise({"bus_off"}, within=SOON, words=("bus-off",)),
+    "error_passive": Promise({"bus_degraded"}, within=SOON, words=("passive",)),
+    "lost_torques": Promise({"drive_emergency"}, duration=50, within=_DEADLINE + SOON, words=("8250h RPDO timeout",)),
+    **{kind: Promise({"second_host"}, within=SOON, words=("somebody else",)) for kind in FOREIGN},
+}
+
+
+class Tapped:
+    """A link whose host may lose frames that it sends, and hear frames that a third party sends.
+
+    Attributes:
+        sent: by the host.
+        loses: which frames get lost.
+    """
+
+    def __init__(self, link: LockStepLink) -> None:
+        self._link = link
+        self._foreign: list[Frame] = []
+        self.sent: list[Frame] = []
+        self.loses: Callable[[Frame], bool] = lambda frame: False
+
+    @property
+    def clock(self) -> Clock:
+        return self._link.clock
+
+    def disturb(self, frames: Sequence[Frame], *, drives_hear: bool = True) -> None:
+        """Somebody else sends frames, which the host hears next, and the drives now."""
+        for frame in frames:
+            if drives_hear:
+                self._link.send(frame)
+            self._foreign.append(frame._replace(stamp_ns=self.clock.now_ns()))
+
+    def send(self, frame: Frame) -> None:
+        self.sent.append(frame)
+        if not self.loses(frame):
+            self._link.send(frame)
+
+    def receive(self, deadline_ns: int) -> Frame | None:
+        return self._foreign.pop(0) if self._foreign else self._link.receive(deadline_ns)
+
+    def drain(self) -> Sequence[Frame]:
+        heard, self._foreign = self._foreign, []
+        return [*heard, *self._link.drain()]
+
+    def close(self) -> None:
+        self._link.close()
+
+
+class EmulatedArm(WatchedArm):
+    """The driver's arm over emulated drives, that breaks before one of its exchanges.
+
+    Attributes:
+        behind: the drives.
+        taps: on the buses, as opened last.
+        states: of the drives, after they have been left alone.
+    """
+
+    def __init__(
+        self, config: ArmConfig, strike: Strike | None = None, observer: Callable[[Truth], None] | None = None
+    ):
+        self.behind = LockStepArm(config)
+        self.behind.emulator.observer = observer
+        self.taps: list[Tapped] = []
+        self.states: tuple[str, ...] = ()
+        self._config, self._strike = config, strike
+        super().__init__(CanopenArm(config, self._links))
+        self.before_exchange = self._break
+
+    def _links(self, config: ArmConfig) -> list[Tapped]:
+        assert isinstance(config.driver, CanopenDriver)
+        self.taps = [Tapped(self.behind.link(number)) for number in range(len(config.driver.buses))]
+        return self.taps
+
+    def exchange(self, torque: object) -> Sample:
+        if self._strike is not None and self._strike.kind == "lost_torques":
+            first, last = self._strike.at_cycle, self._strike.at_cycle + (self._strike.duration or 1)
+            for tap in self.taps:
+                lost = first <= self.cycle < last
+                tap.loses = lambda frame, lost=lost: lost and 0x200 <= frame.identifier < 0x280
+        return super().exchange(torque)  # type: ignore[arg-type]
+
+    def _break(self, cycle: int) -> None:
+        strike = self._strike
+        if strike is None or cycle != strike.at_cycle or strike.kind == "lost_torques":
+            return
+        if strike.kind in FOREIGN:
+            self.taps[-1].disturb([FOREIGN[strike.kind]])
+            return
+        duration = None if strike.duration is None else strike.duration * PERIOD
+        self.behind.inject(PuckFault(strike.kind, strike.joint, strike.later * PERIOD, duration, strike.size))
+
+    def left_alone(self) -> None:
+        """Longer than the drives wait for torque frames, and for a ramp."""
+        self.behind.settle(self.clock.now_ns() + 50_000_000)
+        self.states = self.behind.emulator.states
+
+
+def bench_canopen_config() -> ArmConfig:
+    """The bench's arm behind two drives with gears of 1; a thousandth is 1 mN m."""
+    drive = {"counts": 1 << 20, "rated_torque": 1.0, "max_speed": 6000.0}
+    return bench_config(
+        transmission={"ratios": [1.0, 1.0], "drive_terms": "joints"},
+        driver={
+            "kind": "canopen",
+            "eds": {"name": "puck.eds", "text": EDS},
+            "buses": [{"interface": "lock_step", "channel": "bench"}],
+            "drives": [drive | {"node": 1, "max_torque": 30.0}, drive | {"node": 2, "max_torque": 15.0}],
+            "emulation": {"truth": TRUTH},
+        },
+    )
+
+
+def wam_canopen_config(buses: int = 1) -> ArmConfig:
+    """The shipped WAM of drives, with its differentials; on two buses the wrist has its own."""
+    shipped = wam_config("wam7_canopen")
+    driver = shipped.model_dump(mode="json", by_alias=True)["driver"]
+    driver["buses"] = [{"interface": "lock_step", "channel": f"can{number}"} for number in range(buses)]
+    for drive in driver["drives"][4:]:
+        drive["bus"] = buses - 1
+    return wam_config("wam7_canopen", driver=driver)
+
+
+@cache
+def canopen_subject(name: str) -> Subject:
+    """`bench canopen`, `wam canopen`, or `wam two buses`."""
+    if name == "bench canopen":
+        config, pause = bench_canopen_config(), 900
+    else:
+        config, pause = wam_canopen_config(2 if name == "wam two buses" else 1), 2600
+    model = arm_model(config)
+    with EmulatedArm(config) as arm:
+        step = arm.describe().torque_resolution
+    return Subject(
+        config,
+        model,
+        excitation(model, "identification"),
+        motion_limits(config),
+        pause,
+        pause,
+        lambda strike, observer: EmulatedArm(config, strike, observer),
+        CANOPEN_PROMISES,
+        lambda kind: kind not in WIRE and PUCK_FAULTS[kind].of_joint,
+        step,
+    )

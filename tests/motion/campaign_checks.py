@@ -1,0 +1,126 @@
+"""What every run of the fault campaign is held to, on whatever arm it is.
+
+It must end in what the table in `motion/faults.py` promises, within its time, latched, with one plain sentence and a
+readable recording. As the plant sees it, torque never exceeds its limit. Velocity may reach the guard's threshold of
+torque off, `VELOCITY_OFF` times the limit, and what a joint gains while the velocity filter (30 Hz) and two cycles have
+not shown it yet; what an arm does after its torque is gone is physics.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from campaign_bench import HOLD, PERIOD, Case, Outcome, Promise, Subject, injected, play, subject, windows
+from motion_bench import LOOKED
+
+from drivers.arm import StopKind
+from ident_service.errors import MotionRefused
+from ident_service.motion.checks import VELOCITY_OFF
+from ident_service.motion.faults import FAULTS, LOWER, LOWER_AFTER, SETTLE, Reaction
+from ident_service.motion.loop import REST_CYCLES
+from ident_service.motion.run import run
+from ident_service.record.open import open_recording
+
+
+def keeps_its_promise(case: Case, folder: Path) -> Outcome:
+    which, fault, path = subject(case.arm), injected(case), folder / "run.mcap"
+    outcome = play(which, case.state, (fault,), path, case.speed)
+    plant_stays_within_limits(which, outcome)
+    recording_is_readable(which, outcome, path)
+    promise = which.promises[case.kind]
+    if outcome.fault is None:
+        went_on(case, promise, fault.at_cycle, outcome)
+        return outcome
+    assert outcome.fault.code in promise.codes, outcome.fault
+    assert any(words in str(outcome.fault) for words in promise.words or ("",)), outcome.fault
+    is_latched(which, outcome)
+    ends_as_the_table_says(outcome)
+    ends_in_time(which, outcome)
+    if promise.within is not None:
+        assert found_in(outcome) < fault.at_cycle + promise.within
+        assert found_in(outcome) >= fault.at_cycle
+    return outcome
+
+
+def went_on(case: Case, promise: Promise, at_cycle: int, outcome: Outcome) -> None:
+    """The run ended as if nothing had been: nobody could tell, it was but a warning, or there was no time left."""
+    if promise.within is not None:
+        assert outcome.arm.cycle <= at_cycle + promise.within, "not found"
+    assert outcome.latch.faults == ()
+    assert list(dict.fromkeys(outcome.story.states)) == list(windows(case.arm, case.state, case.speed))
+    if promise.warns is not None:
+        (told,) = [message for _, _, message in outcome.story.events if message.startswith(f"{promise.warns}: ")]
+        assert any(words in told for words in promise.words), told
+
+
+def plant_stays_within_limits(which: Subject, outcome: Outcome) -> None:
+    limits, truth = which.limits, outcome.truth
+    torque = np.abs([moment.torque for moment in truth])
+    assert (torque <= limits.torque * (1 + 1e-9) + which.torque_step).all()
+    speed, acceleration = (np.abs([getattr(moment, name) for moment in truth]) for name in ("velocity", "acceleration"))
+    unseen = 1.0 / (2.0 * np.pi * which.config.control.velocity_cutoff) + 2.0 * PERIOD
+    gained = acceleration[-20:].max(axis=0) * unseen
+    assert (speed <= VELOCITY_OFF * limits.velocity + gained).all()
+
+
+def recording_is_readable(which: Subject, outcome: Outcome, path: Path) -> None:
+    blocks = list(open_recording(path, which.model.chain.names).blocks())
+    assert sum(len(block.position) for block in blocks) == len(outcome.story.samples)
+
+
+def is_latched(which: Subject, outcome: Outcome) -> None:
+    assert outcome.fault is not None
+    codes = [fault.code for fault in outcome.latch.faults]
+    assert codes[-1] == outcome.fault.code
+    reactions = [FAULTS[code].reaction for code in codes]
+    assert reactions == sorted(set(reactions))  # one-way
+    for fault in outcome.latch.faults:
+        assert "\n" not in fault.cause
+        assert fault.cause.endswith(FAULTS[fault.code].means)
+        assert len(fault.cause) > len(FAULTS[fault.code].means) + 10
+        assert f"{fault.code}: {fault.cause}" in outcome.story.errors
+    with pytest.raises(MotionRefused, match=codes[0]):
+        run(outcome.arm, which.model, which.motion, outcome.story, latch=outcome.latch)
+    for code in codes:
+        outcome.latch.acknowledge(code)
+    assert outcome.latch.faults == ()
+
+
+def ends_as_the_table_says(outcome: Outcome) -> None:
+    """The last state, how torque ended, and that none was sent after it had."""
+    assert outcome.fault is not None
+    reaction = FAULTS[outcome.fault.code].reaction
+    controlled = reaction is Reaction.CONTROLLED_STOP
+    if controlled:
+        assert outcome.story.states[-2:] == ["stopping", "stopped"]
+    else:
+        assert outcome.story.states[-1] == "faulted"
+    kind = reaction.stop_kind
+    assert outcome.arm.stops == [kind]
+    assert kind is (StopKind.TORQUE_OFF if reaction is Reaction.TORQUE_OFF else StopKind.QUICK_STOP)
+    assert len(outcome.arm.torques) == outcome.arm.cycle - LOOKED
+
+
+def ends_in_time(which: Subject, outcome: Outcome) -> None:
+    """From the first fault that is more than a warning to the end."""
+    assert outcome.fault is not None
+    limits = which.limits
+    stop = (limits.velocity + 0.5 * limits.acceleration**2 / limits.jerk) / limits.acceleration
+    stop = stop + 2.0 * limits.acceleration / limits.jerk
+    controlled = float(stop.max()) + SETTLE + REST_CYCLES * PERIOD + HOLD
+    promised = {Reaction.CONTROLLED_STOP: controlled, Reaction.DAMPED_LOWERING: controlled + LOWER_AFTER + LOWER}
+    # Every reaction on the way there may have taken its time.
+    reactions = [FAULTS[message.split(":")[0]].reaction for message in outcome.story.errors]
+    worst = max(promised.get(reaction, 0.0) for reaction in reactions)
+    assert (outcome.arm.cycle - 1 - found_in(outcome)) * PERIOD <= worst + 2.0 * PERIOD
+
+
+def found_in(outcome: Outcome) -> int:
+    """The cycle in which the first fault that is more than a warning was found."""
+    first = outcome.story.errors[0]
+    if FAULTS[first.split(":")[0]].reaction >= Reaction.QUICK_STOP:
+        return outcome.arm.cycle - 1
+    stamp = next(stamp for stamp, _, message in outcome.story.events if message == first)
+    return int(next(sample["cycle"] for sample in outcome.story.samples if sample["stamp_ns"] == stamp))

@@ -1,0 +1,86 @@
+"""Every fault that emulated drives on a bus can have, in every moving state, on the driver that moves real ones.
+
+Two joints behind two drives, the WAM with its differentials on one bus, and on two. Beside what every arm of the
+campaign is held to (`campaign_checks.py`), drives that are left alone afterwards must have let go by themselves, and
+what a drive tells is told with its node or its joint. `make campaign` runs all; a seeded sample runs always.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+
+import pytest
+from campaign_bench import Case, Outcome, subject
+from campaign_canopen import CANOPEN_PROMISES, WIRE, EmulatedArm
+from campaign_checks import keeps_its_promise
+from test_fault_campaign import STATES
+
+from ident_service.motion.faults import FAULTS
+from ident_service.motion.states import State
+from sim_backend.pucks.faults import PUCK_FAULTS
+from sim_backend.pucks.motor import Power
+
+SEED = 11
+DRIVES = {"bench canopen": 2, "wam canopen": 7, "wam two buses": 7}
+# Codes of faults that a drive, not the bus or the loop, tells.
+TOLD = {"drive_fault", "drive_emergency", "drive_silent", "drive_restarted", "drive_left", "feedback_gone"}
+
+
+def cases(arm: str, times: int, drives: int) -> Iterator[Case]:
+    """All kinds in all states, at some random times, on some random drives."""
+    rng, of_joint = random.Random(f"{SEED} {arm}"), subject(arm).of_joint  # noqa: S311 - not for secrets
+    for kind, state, _ in product(CANOPEN_PROMISES, STATES, range(times)):
+        chosen: list[int | None] = [*rng.sample(range(DRIVES[arm]), drives)] if of_joint(kind) else [None]
+        for drive in chosen:
+            yield Case(arm, kind, state, rng.random(), drive)
+
+
+def sample() -> list[Case]:
+    """One of each kind on the small arm, a few on the large one, one on its two buses."""
+    rng = random.Random(SEED)  # noqa: S311 - not for secrets
+    small, large, divided = list(cases("bench canopen", 1, 1)), list(cases("wam canopen", 1, 1)), list(two_buses())
+    chosen = [rng.choice([case for case in small if case.kind == kind]) for kind in CANOPEN_PROMISES]
+    chosen += rng.sample([case for case in large if case.state is State.EXCITING], 2)
+    return chosen + rng.sample(divided, 1)
+
+
+def two_buses() -> Iterator[Case]:
+    """What one of two buses, or drives on either, can have."""
+    kinds = {"drive_fault", "node_silent", "reboot", "lost_feedback", "lost_torques", "bus_off", "heartbeat_lost"}
+    return (case for case in cases("wam two buses", 1, 2) if case.kind in kinds | {"foreign_sync", "emergency"})
+
+
+def test_every_kind_of_fault_has_its_promise() -> None:
+    assert set(CANOPEN_PROMISES) == set(PUCK_FAULTS) | set(WIRE)
+    for promise in CANOPEN_PROMISES.values():
+        assert promise.codes
+        assert promise.codes <= set(FAULTS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", sample(), ids=str)
+def test_a_sample_of_the_campaign(case: Case, tmp_path: Path) -> None:
+    let_go(case, keeps_its_promise(case, tmp_path))
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("case", [*cases("bench canopen", 3, 2), *cases("wam canopen", 1, 2), *two_buses()], ids=str)
+def test_the_campaign(case: Case, tmp_path: Path) -> None:
+    let_go(case, keeps_its_promise(case, tmp_path))
+
+
+def let_go(case: Case, outcome: Outcome) -> None:
+    arm = outcome.arm
+    assert isinstance(arm, EmulatedArm)
+    assert not [state for state in arm.states if "operation enabled" in state]
+    stuck = case.joint if case.kind == "stuck_torque" else None
+    motors = arm.behind.emulator.body.motors
+    assert not [k for k, motor in enumerate(motors) if motor.power is Power.TORQUE and k != stuck]
+    if outcome.fault is not None and outcome.fault.code in TOLD and case.joint is not None:
+        assert f"node {case.joint + 1}:" in str(outcome.fault) or any(
+            subject(case.arm).model.chain.names[k] in str(outcome.fault)
+            for k in arm.inner._joints_of[case.joint]  # type: ignore[attr-defined]
+        )
