@@ -131,6 +131,7 @@ def test_a_session_that_was_closed_leaves_nothing_to_be_missed(cycles: int) -> N
             arm.exchange(np.zeros(2))
     bench.settle(2000)
     assert bench.states() == ["pre operational, switch on disabled"] * 2
+    assert not any(face.objects.number(0x1003) for face in bench.behind.emulator.faces)  # type: ignore[attr-defined]
     seen = bench.watch()
     assert seen.status == (0, 0)
     assert drives_of(seen) == ["switch on disabled, pre-operational"] * 2
