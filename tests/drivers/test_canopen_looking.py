@@ -270,3 +270,19 @@ def test_a_dead_bus_ends_it() -> None:
     with pytest.raises(DriverError, match="gone"):
         looking.exchange(None)
     looking.close()
+
+
+def test_a_host_that_begins_to_stream_ends_the_look() -> None:
+    bench = Bench()
+    begun: list[Frame] = []
+
+    class Later(Tap):
+        def drain(self) -> Sequence[Frame]:
+            return [*super().drain(), *begun]
+
+    looking = CanopenArm(bench.config, lambda _: [Later(bench.behind.link(0), bench.sent)]).look()
+    with looking:
+        looking.exchange(None)
+        begun.append(Frame(0x080))
+        with pytest.raises(DriverError, match="another host sends SYNC"):
+            looking.exchange(None)
