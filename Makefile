@@ -4,7 +4,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: demo test unit coverage lint types bench bench-design campaign test-socketcan clean
+.PHONY: demo test unit coverage lint types bench bench-design campaign test-socketcan test-foreign clean
 
 demo: $(READY)
 	$(BIN)/ident simulate
@@ -42,6 +42,11 @@ campaign: $(READY)
 # Over the kernel's CAN sockets: here where this kernel has them, else in a guest.
 test-socketcan: $(READY)
 	tests/socketcan/guest/run $(BIN)/python
+
+# An independent CANopen stack on the emulated drives; needs node, and npm's registry once.
+test-foreign: $(READY)
+	cd tests/foreign_stack && npm ci --ignore-scripts --no-audit --no-fund
+	$(BIN)/pytest tests/pucks/test_pucks_foreign_stack.py
 
 # pip 25.1 is the first to read dependency groups.
 $(READY): pyproject.toml

@@ -29,6 +29,7 @@ from drivers.canopen.link import Link, open_links
 from drivers.canopen.lock import BusLock
 from drivers.canopen.looking import LookingArm
 from drivers.canopen.profile import Write, bus_profiles
+from drivers.canopen.sdo import Objects
 from drivers.canopen.session_log import SessionLog, logged_links, require_format
 from drivers.canopen.setup import Setup, configure, identify
 from drivers.canopen.words import DISABLE_VOLTAGE, QUICK_STOP, NmtCommand, axis_status, joint_status
@@ -233,16 +234,23 @@ class CanopenArm(Arm):
         with suppress(Exception):
             for _ in range(_FAREWELL):
                 buses.cycle(self._counts if self._streaming else None)
-        for number, drive in enumerate(buses.drives):
-            off = drive.status is not None and not axis_status(drive.status) & AxisStatus.POWERED
-            if off and drive.answered:
+        there: dict[int, Objects] = {}  # by bus
+        for number, drive in enumerate(self._driver.drives):
+            with suppress(Exception):
+                # Between two conversations, so that the others do not miss their torque frames.
+                buses.cycle(self._counts if self._streaming else None)
                 objects = buses.objects(number)
-                with suppress(Exception):
+                # Asked for: a status report may be held back by its inhibit time.
+                off = not axis_status(objects.read(od.STATUS_WORD)) & AxisStatus.POWERED
+                there[drive.bus] = objects
+                if off:
                     objects.write(Write(od.ABORT_CONNECTION, 0))
-                with suppress(Exception):  # or it would report 8130h a moment after every session
-                    objects.write(Write(od.HEARTBEAT_CONSUMER, 0))
+                    objects.write(Write(od.HEARTBEAT_CONSUMER, 0))  # or 8130h would follow every session
         with suppress(Exception):
             buses.command(NmtCommand.ENTER_PRE_OPERATIONAL)
+        for objects in there.values():
+            with suppress(Exception):  # its answer comes behind all commands, which closing a link could cut off
+                objects.read(od.DEVICE_TYPE)
 
     def _open(self) -> Buses:
         if self._buses is None:

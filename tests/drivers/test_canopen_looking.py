@@ -122,15 +122,16 @@ def test_an_operational_drive_keeps_streaming_state_and_watchdog() -> None:
     assert "powered" in watch_text(seen)
 
 
-def test_a_session_that_was_closed_leaves_nothing_to_be_missed() -> None:
+@pytest.mark.parametrize("cycles", [0, 1, 20, 100])
+def test_a_session_that_was_closed_leaves_nothing_to_be_missed(cycles: int) -> None:
     bench = Bench()
     with bench.arm as arm:
         arm.enable()
-        for _ in range(20):
+        for _ in range(cycles):
             arm.exchange(np.zeros(2))
-        arm.stop(StopKind.TORQUE_OFF)
     bench.settle(2000)
     assert bench.states() == ["pre operational, switch on disabled"] * 2
+    assert not any(face.objects.number(0x1003) for face in bench.behind.emulator.faces)  # type: ignore[attr-defined]
     seen = bench.watch()
     assert seen.status == (0, 0)
     assert drives_of(seen) == ["switch on disabled, pre-operational"] * 2
@@ -269,3 +270,19 @@ def test_a_dead_bus_ends_it() -> None:
     with pytest.raises(DriverError, match="gone"):
         looking.exchange(None)
     looking.close()
+
+
+def test_a_host_that_begins_to_stream_ends_the_look() -> None:
+    bench = Bench()
+    begun: list[Frame] = []
+
+    class Later(Tap):
+        def drain(self) -> Sequence[Frame]:
+            return [*super().drain(), *begun]
+
+    looking = CanopenArm(bench.config, lambda _: [Later(bench.behind.link(0), bench.sent)]).look()
+    with looking:
+        looking.exchange(None)
+        begun.append(Frame(0x080))
+        with pytest.raises(DriverError, match="another host sends SYNC"):
+            looking.exchange(None)
