@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -118,11 +119,11 @@ class Said:
         return "".join(self.lines)
 
     def says(self, words: str, after: int = 0) -> None:
-        """Wait for a line that has these words, among those after the first ones; or for the end, which fails."""
+        """Wait for a line with a match of this expression, after the first ones; or for the end, which fails."""
 
         def found() -> bool:
             ended = self.process.poll() is not None
-            if any(words in line for line in self.lines[after:]):
+            if any(re.search(words, line) for line in self.lines[after:]):
                 return True
             assert not ended, f"never said {words!r}: {self.text}"
             return False
