@@ -169,9 +169,7 @@ class Buses:
             DriverError: a bus is gone, or torques that cannot be sent, of which none has been.
         """
         begin_ns = self.clock.now_ns() if self._next_ns is None else self._next_ns
-        self.clock.sleep_until_ns(
-            begin_ns if self._stamp_ns is None else max(begin_ns, self._stamp_ns + self._least_ns)
-        )
+        self.clock.sleep_until_ns(begin_ns)
         begin_ns += max(0, self.clock.now_ns() - begin_ns) // self._period_ns * self._period_ns
         self._next_ns = begin_ns + self._period_ns
         torques = [[] if counts is None else codec.torque_frames(counts) for codec in self.codecs]
@@ -182,6 +180,7 @@ class Buses:
                 link.send(frame)
         for codec, link in self._pairs:
             link.send(codec.sync())
+        # Not before: a drive acts when it hears SYNC.
         stamp_ns = self.clock.now_ns()
         for codec in self.codecs:
             codec.begin_cycle(stamp_ns)
