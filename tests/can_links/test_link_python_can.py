@@ -62,7 +62,7 @@ def test_a_frame_arrives_at_the_other_and_not_at_its_sender(pair: tuple[Link, Li
         heard.append(found._replace(stamp_ns=0))
         if heard[-1] == last:
             break
-    wanted = not frame.extended and not 0x580 <= frame.identifier < 0x680
+    wanted = not frame.extended and not 0x600 <= frame.identifier < 0x680
     assert heard == ([frame, last] if wanted else [last])
     assert one.drain() == []
 

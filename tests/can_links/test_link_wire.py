@@ -94,7 +94,7 @@ def test_a_link_hears_what_the_configuration_filters_and_not_itself(wire: Wire) 
     drive = end_of(wire.name)
     greeted(wire, 2)
     link.send(Frame(0x080))
-    for identifier in (0x581, 0x181):
+    for identifier in (0x601, 0x181):
         drive.send(Frame(identifier))
     found = link.receive(soon())
     assert found is not None
