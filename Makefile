@@ -4,7 +4,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: demo test unit coverage lint types bench bench-design campaign test-socketcan test-foreign clean
+.PHONY: demo test unit coverage lint types bench bench-design bench-canopen campaign test-socketcan test-foreign clean
 
 demo: $(READY)
 	$(BIN)/ident simulate
@@ -35,6 +35,9 @@ bench: $(READY)
 
 bench-design: $(READY)
 	$(BIN)/python -m benchmarks.design
+
+bench-canopen: $(READY)
+	$(BIN)/python -m benchmarks.canopen
 
 campaign: $(READY)
 	$(BIN)/pytest -m campaign --timeout 7200

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from benchmarks import estimation, real_data
+from benchmarks import canopen, estimation, real_data
 from benchmarks.harness import Row, median_seconds, table, write
 from ident_service.config.load import load_arm
 from ident_service.estimation.equations import equations
@@ -37,6 +37,7 @@ def main() -> None:
     model = arm_model(load_arm("wam7_sim"))
     with tempfile.TemporaryDirectory() as folder:
         rows = [*_model(model), *_run(model, Path(folder)), *_estimation(model, Path(folder)), *estimation.measure()]
+    rows += canopen.in_one_process()
     if real_data.DATA.is_dir():
         found, text = real_data.measure()
         rows += found

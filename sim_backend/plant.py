@@ -106,6 +106,11 @@ class Plant:
             self._braking = damping
             self._damp()
 
+    def rest(self) -> None:
+        """Stand still where it is, as an arm that somebody holds."""
+        still = np.zeros(self._chain.joints)
+        self._set(self._position, still, still)
+
     def load(self, loads: tuple[Load, ...]) -> None:
         """Attach point masses to the last link, in place of those attached before.
 

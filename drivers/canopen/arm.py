@@ -21,7 +21,7 @@ import numpy as np
 from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector
 from drivers.canopen import dictionary as od
 from drivers.canopen.buses import Buses
-from drivers.canopen.codec import BusCodec, Drive
+from drivers.canopen.codec import BusCodec, Drive, Emergency
 from drivers.canopen.coordinates import Coordinates, coordinates, unwrapped
 from drivers.canopen.enabling import Enabling, Resetting
 from drivers.canopen.events import axis_events
@@ -89,6 +89,8 @@ class CanopenArm(Arm):
         self._counts = [0] * len(self._limits)
         self._acting = _frozen(np.zeros(len(self._limits)))
         self._unwrapped: list[int] | None = None
+        self._told: list[tuple[int | None, Emergency | None]] = []
+        self._status: tuple[int, ...] = ()
         self._cycle = 0
         self._silent: set[int] = set()
         self._identities: tuple[str, ...] = ()
@@ -316,10 +318,18 @@ class CanopenArm(Arm):
             age == 0,
             age,
             buses.lost,
-            tuple(_status([drives[k] for k in needed]) for needed in self._drives_of),
+            self._statuses(drives),
             max(drive.status_age for drive in drives),
             tuple(self._events(buses)),
         )
+
+    def _statuses(self, drives: Sequence[Drive]) -> tuple[int, ...]:
+        """Of the joints; put together again only when a drive has told something new."""
+        told = [(drive.status, drive.emergency) for drive in drives]
+        if told != self._told:
+            self._told = told
+            self._status = tuple(_status([drives[k] for k in needed]) for needed in self._drives_of)
+        return self._status
 
     def _events(self, buses: Buses) -> list[AxisEvent]:
         found: list[AxisEvent] = []

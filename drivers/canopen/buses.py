@@ -1,8 +1,8 @@
 """All buses of an arm in step: when a cycle begins, what is sent in it and in which order, until when answers count.
 
-A cycle begins one period after the one before; periods that are over are skipped, never made up for. One that began
-late still has half a period, or the time that its frames need on the wire, before the next SYNC: positions carry no
-number, and one that came after the next SYNC would count for it. On every bus the
+A cycle begins one period after the one before; periods that are over are skipped, never made up for. While positions
+are missing, one that began late waits for them half a period, or as long as its frames need on the wire: positions
+carry no number, and one that came after the next SYNC would count for it. On every bus the
 torques go first, then SYNC on all of them back to back, so that all drives act and sample at one time. Our heartbeat is
 sent behind the answers, by this loop and nobody else: a loop that stops is missed by the drives.
 
@@ -30,7 +30,7 @@ RECEIVE = 0.97  # of a period, within which a position counts for its cycle (FIE
 HUSH = 0.02  # s in which the last frames of a session before ours may still be on their way
 LISTEN = 0.12  # s before we send anything; another host's heartbeat comes within it
 AWAKE = 2.0  # s within which every drive must answer
-LEAST = 0.5  # of a period, between two SYNCs
+LEAST = 0.5  # of a period, from SYNC on, that positions are waited for in any case
 SETTLED = 5  # cycles in a row with everybody's position before an arm counts as open
 _POSITION_BYTES = 4
 _ASK = bytes([0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0])  # SDO upload of the device type, which every node has
@@ -71,7 +71,6 @@ class Buses:
         self._heartbeat_period_ns = min(round(0.5e9 * profile.heartbeat_host) for profile in profiles)
         self._heartbeat_ns = 0
         self._next_ns: int | None = None
-        self._stamp_ns: int | None = None
 
     def close(self) -> None:
         """Give all links back; never raises."""
@@ -192,9 +191,7 @@ class Buses:
             DriverError: a bus is gone, or torques that cannot be sent, of which none has been.
         """
         begin_ns = self.clock.now_ns() if self._next_ns is None else self._next_ns
-        self.clock.sleep_until_ns(
-            begin_ns if self._stamp_ns is None else max(begin_ns, self._stamp_ns + self._least_ns)
-        )
+        self.clock.sleep_until_ns(begin_ns)
         begin_ns += max(0, self.clock.now_ns() - begin_ns) // self._period_ns * self._period_ns
         self._next_ns = begin_ns + self._period_ns
         torques = [[] if counts is None else codec.torque_frames(counts) for codec in self.codecs]
@@ -205,7 +202,8 @@ class Buses:
                 link.send(frame)
         for codec, link in self._pairs:
             link.send(codec.sync())
-        stamp_ns = self._stamp_ns = self.clock.now_ns()
+        # Not before: a drive acts when it hears SYNC.
+        stamp_ns = self.clock.now_ns()
         for codec in self.codecs:
             codec.begin_cycle(stamp_ns)
         deadline = max(begin_ns + round(RECEIVE * self._period_ns), stamp_ns + self._least_ns)

@@ -153,6 +153,7 @@ class BusCodec:
         self.controller = ControllerState.ACTIVE
         self.counters = Counters()
         self._open = False
+        self._missing = len(self.drives)  # answers that have not come in this cycle
         self._now_ns = 0
         self._events: list[Event] = []
         self._strangers: set[int] = set()
@@ -212,7 +213,7 @@ class BusCodec:
         Args:
             now_ns: when [ns of the link's clock], for frames that nobody stamped.
         """
-        self._open, self._now_ns = True, now_ns
+        self._open, self._now_ns, self._missing = True, now_ns, len(self.drives)
         for drive in self.drives:
             drive.answered = False
             drive.age += 1
@@ -225,7 +226,7 @@ class BusCodec:
     @property
     def complete(self) -> bool:
         """Whether every drive has answered in this cycle."""
-        return all(drive.answered for drive in self.drives)
+        return self._missing == 0
 
     def silent(self, now_ns: int) -> list[int]:
         """Nodes whose heartbeat has been missing for longer than the configured time, those never heard included."""
@@ -271,6 +272,7 @@ class BusCodec:
         else:
             (drive.position,) = _POSITION.unpack(frame.data)
             drive.seen = drive.answered = True
+            self._missing -= 1
             drive.age = 0
             drive.answers += 1
 

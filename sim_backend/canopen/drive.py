@@ -100,6 +100,12 @@ class CanopenDrive:
         errors = "".join(f", error 0x{code:04X}" for code in self.emergency.active)
         return f"{self.nmt.state.name}, {self.power.state.name}".lower().replace("_", " ") + errors
 
+    @property
+    def released(self) -> bool:
+        """Whether a host has switched it off and has left, all in order."""
+        off = self.power.state is PowerState.SWITCH_ON_DISABLED
+        return off and self.nmt.commanded and self.nmt.state is State.PRE_OPERATIONAL
+
     def power_up(self, now_ns: int) -> None:
         """Power comes: the boot-up message follows at once."""
         self._node.now_ns = now_ns

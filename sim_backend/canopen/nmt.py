@@ -50,6 +50,7 @@ class Nmt:
     Attributes:
         state: the present one.
         silent_nodes: whose heartbeats stay away.
+        commanded: whether the last command, or else something of its own, brought it there.
     """
 
     def __init__(
@@ -77,9 +78,11 @@ class Nmt:
         self._entered, self._reset, self._lost, self._found = entered, reset, lost, found
         self.state = State.INITIALISING
         self.silent_nodes: set[int] = set()
+        self.commanded = False
 
     def boot(self, delay_ns: int) -> None:
         """Initialise, and say so after a while."""
+        self.commanded = False
         self._to(State.INITIALISING)
         self._node.stop(_PRODUCER)
         self.configure_consumers()
@@ -92,6 +95,7 @@ class Nmt:
         if data[0] in (Command.RESET_NODE, Command.RESET_COMMUNICATION):
             self.reset(Command(data[0]))
         elif data[0] in tuple(_TARGETS):
+            self.commanded = True
             self._to(_TARGETS[Command(data[0])])
 
     def reset(self, command: Command) -> None:
@@ -101,6 +105,7 @@ class Nmt:
 
     def leave_operational(self) -> None:
         """What a communication error does where object 1029h:01 does not say otherwise."""
+        self.commanded = False
         self._to(State.PRE_OPERATIONAL)
 
     def configure_producer(self) -> None:

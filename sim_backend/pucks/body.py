@@ -101,6 +101,14 @@ class Body:
             if number < steps:
                 self.watch(end)
 
+    def support(self, now_ns: int) -> None:
+        """Somebody holds the arm where it stands, until all motors are powered again."""
+        if not self.supported:
+            self.advance(now_ns)
+            self.plant.rest()
+            self._seen = None
+            self.supported = True
+
     def catch_up(self, now_ns: int) -> None:
         """Move the plant after a silence of more than a step, before what ends the silence has any effect."""
         if now_ns - self.now_ns > _LONGEST * self._period_ns:

@@ -3,7 +3,8 @@
 It has neither a clock nor a bus: `lock_step.py` runs it in virtual time, `process.py` on real interfaces. Callers call
 `tick` for what is due before they hand over what has come since.
 
-Faults of the configuration count from the first SYNC.
+Faults of the configuration count from the first SYNC. Whoever watches the arm holds it where it stands when its host
+has switched all drives off and has left in order; after anything else it sinks.
 """
 
 from __future__ import annotations
@@ -133,6 +134,9 @@ class Emulator:
                 self._deadline = None
                 is_sync = is_sync or frame.identifier == face.sync_identifier
                 sent += self._injection.on_the_way(drive, face.receive(frame, now_ns), now_ns)
+        if not self.body.supported and all(face.released for face in self.faces):
+            self.body.support(now_ns)
+            self._deadline = None
         if is_sync and not (frame.error or frame.remote or frame.extended):
             self._sync(bus, now_ns)
         return sent

@@ -38,6 +38,10 @@ class Face(Protocol):
         """In words, for people."""
 
     @property
+    def released(self) -> bool:
+        """Whether a host has led it, has switched it off and has left, all in order."""
+
+    @property
     def sync_identifier(self) -> int:
         """Of the frames with which the host begins a cycle."""
 

@@ -1,0 +1,168 @@
+"""`ident emulate` and `ident run` in two processes, by the machine's clock, and either of them killed.
+
+The rate is one that a busy machine keeps; how fast it can be is a benchmark. A run that a stall of the machine ended is
+run again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from canopen_run_bench import (
+    STALLS,
+    TRIES,
+    Said,
+    canopen,
+    channel,
+    checked,
+    child,
+    described,
+    emulated,
+    truth,
+    wait_for,
+    write,
+)
+
+from ident_service.cli import main
+from ident_service.config.load import load_arm
+from ident_service.model.arm_model import arm_model
+from ident_service.model.base import base_parameters
+from ident_service.record.open import open_recording
+from ident_service.service.arm_state import fault_file
+
+NAME, RATE, KP, KD = "far", 50.0, 100.0, 16.0
+DEADLINE, BRAKING = 0.2, [4.0, 2.0]
+STOPPED = "(quick stop active|switch on disabled|fault reaction active|fault)"
+NAMES = ("shoulder", "elbow")
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+
+
+class Bench:
+    """An arm's file and state, checked once; its drives are new for each run."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.state = folder, folder / "state"
+        bus = {"interface": "ident_wire", "channel": channel()}
+        tree = canopen(described(NAME, RATE, KP, KD), bus, 1, torque_deadline=DEADLINE)
+        tree["driver"]["emulation"]["braking"] = BRAKING  # it sinks to rest in a few seconds
+        self.arm = write(folder, tree)
+        self.faults = fault_file(self.state, NAME)
+        self._runs = 0
+        for _ in range(TRIES):
+            with emulated(self.arm):
+                if checked(self.arm, NAME, self.state):
+                    return
+        raise AssertionError("preflight never passed")
+
+    def started(self) -> tuple[Said, Path]:
+        """An `ident run` in the background, and its folder."""
+        self._runs += 1
+        run = self.folder / f"run{self._runs}"
+        return Said("run", self.arm, "--out", run, "--state", self.state), run
+
+    def acknowledge(self) -> None:
+        for code in list(self.faults.latched()):
+            assert main(["ack", str(self.arm), code, "--state", str(self.state)]) == 0
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    return Bench(tmp_path_factory.mktemp("far"))
+
+
+@pytest.fixture(autouse=True)
+def acknowledged(bench: Bench) -> Iterator[None]:
+    yield
+    bench.acknowledge()
+
+
+def moving(bench: Bench, drives: Said) -> tuple[Said, Path]:
+    """A run that excites the arm."""
+    for _ in range(TRIES):
+        run, folder = bench.started()
+        try:
+            run.says("exciting")
+        except AssertionError:
+            with run:
+                assert any(word in run.text for word in STALLS), run.text
+            bench.acknowledge()
+            continue
+        time.sleep(1.0)
+        return run, folder
+    raise AssertionError("the machine stalls all the time")
+
+
+def samples(folder: Path) -> int:
+    """That can be read of a run, torn or whole."""
+    path = folder / "run.mcap"
+    path = path if path.exists() else folder / "run.mcap.partial"
+    return sum(len(block.position) for block in open_recording(path, NAMES).blocks())
+
+
+def test_a_run_against_drives_in_another_process_finds_the_arms_parameters(bench: Bench, tmp_path: Path) -> None:
+    for _ in range(TRIES):
+        with emulated(bench.arm) as drives:
+            run, folder = bench.started()
+            with run:
+                code = run.code()
+            if code == 0:
+                drives.says("node 2: pre operational", len(drives.lines) - 4)
+                break
+        assert any(word in run.text for word in STALLS), run.text
+        bench.acknowledge()
+    else:
+        raise AssertionError("the machine stalls all the time")
+    ended = json.loads((folder / "ended.json").read_text())
+    assert ended["state"] == "done"
+    assert ended["lateness"]["count"] > 9.0 * RATE  # the motion lasts 10 s
+    out = tmp_path / "out"
+    assert main(["identify", str(folder / "run.mcap"), "--arm", str(bench.arm), "--out", str(out)]) == 0
+    document = json.loads((out / "parameters.json").read_text())["base_parameters"]
+    model = arm_model(load_arm(bench.arm))
+    base = base_parameters(model.chain, model.layout)
+    true = base.K @ np.array([truth().get(name, 0.0) for name in model.layout.names])
+    z = (np.array(document["values"]) - true) / np.array(document["standard_deviations"])
+    assert np.abs(z).max() < 5.0, z
+
+
+def test_drives_stop_by_themselves_when_the_motion_process_is_killed(bench: Bench) -> None:
+    with emulated(bench.arm) as drives:
+        run, folder = moving(bench, drives)
+        with run:
+            pid = child(run.process.pid, "motion.process")
+            assert pid is not None
+            before = len(drives.lines)
+            os.kill(pid, signal.SIGKILL)
+            for node in (1, 2):
+                drives.says(rf"node {node}: operational, {STOPPED}, error 0x8250", before)
+            for node in (1, 2):  # and without our heartbeat they leave the network's operational state
+                drives.says(rf"node {node}: pre operational, {STOPPED}, error 0x8130", before)
+            drives.says("the arm is at rest", before)
+            assert run.code() == 4
+    assert "motion_process" in bench.faults.latched()
+    assert samples(folder) > 0
+
+
+def test_the_guard_stops_a_run_whose_drives_vanish(bench: Bench) -> None:
+    with emulated(bench.arm) as drives:
+        run, folder = moving(bench, drives)
+        with run:
+            os.kill(drives.process.pid, signal.SIGKILL)
+            assert run.code() == 4
+            assert "ident: " in run.text
+    latched = wait_for(bench.faults.latched, "no fault was latched")
+    assert set(latched) <= {"driver", "bus_silent", "feedback_gone"}
+    assert samples(folder) > 0
+    with emulated(bench.arm):  # drives that are there again do not clear it
+        again, _ = bench.started()
+        with again:
+            assert again.code() == 3
+            assert "acknowledge" in again.text
