@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
 from ident_service.cli.moving import RELEASED, HeldKey, add_can_log, moved, require_terminal
 from ident_service.cli.words import Parser, Verbs, seconds, speed
-from ident_service.errors import MotionRefused, UsageError
+from ident_service.errors import DriverError, MotionRefused, UsageError
 
 if TYPE_CHECKING:
     from ident_service.config.schema import ArmConfig
@@ -73,24 +73,31 @@ def _chosen(config: ArmConfig, motion: Path | None) -> Excitation:
 
 def _watch(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
+    from ident_service.motion.control_file import mover
     from ident_service.motion.factory import make_arm
     from ident_service.motion.watch import watch
+    from ident_service.service.arm_state import control_path
     from ident_service.service.preflight import watch_document, watch_text
 
+    config = load_arm(arguments.arm)
+    if (pid := mover(control_path(state_folder(arguments), config.name))) is not None:
+        raise DriverError(f"{config.name}: process {pid} moves the arm; its recording shows what it does")
     stopping = StopOnSignal()
     with stopping:
-        seen = watch(make_arm(load_arm(arguments.arm)), arguments.seconds, stop_requested=stopping.requested)
+        seen = watch(make_arm(config), arguments.seconds, stop_requested=stopping.requested)
     return DONE, watch_text(seen), watch_document(seen)
 
 
 def _check(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
     from ident_service.model.arm_model import arm_model
+    from ident_service.motion.control_file import ControlFile
     from ident_service.motion.factory import make_arm
     from ident_service.motion.preflight import preflight
     from ident_service.motion.preflight_check import Verdict
     from ident_service.motion.realtime import asked
-    from ident_service.service.arm_state import ticket_path
+    from ident_service.motion.stoppable import StoppableArm
+    from ident_service.service.arm_state import control_path, fault_file, ticket_path
     from ident_service.service.preflight import ticket_document, ticket_text, write_ticket
 
     config = load_arm(arguments.arm)
@@ -103,12 +110,16 @@ def _check(arguments: argparse.Namespace) -> Answer:
     if arguments.home and arguments.motion is not None:
         raise UsageError("give a motion or --home, not both")
     motion = None if arguments.home else _chosen(config, arguments.motion)
+    state = state_folder(arguments)
+    path, faults = ticket_path(state, config.name), fault_file(state, config.name)
+    faults.require_none(faults.latched())
     arm, model = make_arm(config), arm_model(config)
-    # The rate is measured with what a run gets of the kernel.
-    with nullcontext() if arm.clock.lock_step else asked():
-        ticket = preflight(arm, model, motion, confirm=confirm)
-    path = ticket_path(state_folder(arguments), config.name)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    # Whoever looks for the one who moves the arm finds this process, and its stop ends the preflight.
+    with ControlFile.take(control_path(state, config.name), None) as controls:
+        stoppable = StoppableArm(arm, lambda: controls.stop)
+        # The rate is measured with what a run gets of the kernel.
+        with nullcontext() if arm.clock.lock_step else asked():
+            ticket = preflight(stoppable, model, motion, confirm=confirm)
     write_ticket(path, ticket)
     code = DONE if ticket.verdict is Verdict.PASSED else VERDICT_NO
     return code, ticket_text(ticket) + f"ticket: {path}\n", {"path": str(path), "ticket": ticket_document(ticket)}

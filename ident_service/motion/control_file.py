@@ -54,9 +54,13 @@ class ControlFile:
 
         Raises:
             DriverError: another process moves the arm.
+            UsageError: the file cannot be made.
         """
-        path.parent.mkdir(parents=True, exist_ok=True)
-        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            raise UsageError(f"{path}: cannot be made: {error.strerror}; give another state folder") from None
         if not _locked(fd):
             pid = _pid_in(fd)
             os.close(fd)
@@ -134,11 +138,20 @@ class ControlFile:
         self.close()
 
 
+def mover(path: Path) -> int | None:
+    """The process that moves the arm whose control file this is, or None."""
+    try:
+        with ControlFile.reach(path) as controls:
+            return controls.pid
+    except UsageError:
+        return None
+
+
 def in_use(path: Path) -> bool:
     """Whether a process moves the arm whose control file this is."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return False
     try:
         fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)

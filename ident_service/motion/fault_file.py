@@ -82,7 +82,8 @@ class FaultFile:
         """Raise MotionRefused, which names the faults, if there are any."""
         if faults:
             words = "; ".join(f"{code} ({cause})" for code, cause in faults.items())
-            raise MotionRefused(f"{self._arm}: faults that nobody has acknowledged: {words}; `ident ack FAULT`")
+            acks = ", ".join(f"`ident ack {self._arm} {code}`" for code in faults)
+            raise MotionRefused(f"{self._arm}: faults that nobody has acknowledged: {words}; {acks}")
 
     def latch(self, code: str, cause: str) -> None:
         """Remember a fault; one that is latched already keeps its first cause.

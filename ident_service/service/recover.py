@@ -15,8 +15,8 @@ from drivers.arm import Arm
 from drivers.status import TRIPPED, AxisStatus
 from ident_service.config.limits import MotionLimits, motion_limits
 from ident_service.config.schema import ArmConfig
-from ident_service.errors import DriverError, MotionRefused, UsageError
-from ident_service.motion.control_file import ControlFile
+from ident_service.errors import DriverError, MotionRefused
+from ident_service.motion.control_file import mover
 from ident_service.motion.factory import make_arm
 from ident_service.motion.fault_file import Remembered
 from ident_service.motion.loop import REST_SPEED
@@ -73,13 +73,13 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None) -> Recovery:
     """
     limits = motion_limits(config)
     faults = fault_file(state, config.name).remembered()
-    mover = _mover(control_path(state, config.name))
-    if mover is not None:
+    pid = mover(control_path(state, config.name))
+    if pid is not None:
         stop_first = (
-            f"`ident stop {config.name}` brings it to rest; process {mover} moves it.",
+            f"`ident stop {config.name}` brings it to rest; process {pid} moves it.",
             f"`ident recover {config.name}` again, when it stands.",
         )
-        return Recovery(config.name, faults, mover, None, "", (), {}, (), stop_first, False)
+        return Recovery(config.name, faults, pid, None, "", (), {}, (), stop_first, False)
     arm = make_arm(config) if arm is None else arm
     seen, unreachable, refusal = None, "", ""
     reset: tuple[str, ...] = ()
@@ -97,14 +97,6 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None) -> Recovery:
     usable = not before
     steps = (*before, _at_last(config.name, seen, limits, bool(out)))
     return Recovery(config.name, faults, None, seen, unreachable, reset, tripped, tuple(out), steps, usable)
-
-
-def _mover(path: Path) -> int | None:
-    try:
-        with ControlFile.reach(path) as controls:
-            return controls.pid
-    except UsageError:
-        return None
 
 
 def _tripped(seen: Watched) -> dict[str, str]:

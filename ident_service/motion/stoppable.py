@@ -1,0 +1,51 @@
+"""An arm whose next cycle fails once somebody asks for a stop: for whoever moves it without a loop that asks.
+
+Preflight moves an arm by hand's breadths, and ends whatever goes wrong with torque off; so does a stop in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector
+from ident_service.errors import DriverError
+
+
+class StoppableArm(Arm):
+    """Another arm, which is asked for a stop before every torque."""
+
+    def __init__(self, arm: Arm, asked: Callable[[], bool]) -> None:
+        """Take an arm, and who says whether it is to stop."""
+        self._arm, self._asked = arm, asked
+        self.clock = arm.clock
+
+    def open(self) -> None:
+        """Open it; the clock is its then."""
+        self._arm.open()
+        self.clock = self._arm.clock
+
+    def describe(self) -> ArmDescription:
+        """As the arm says."""
+        return self._arm.describe()
+
+    def enable(self) -> None:
+        """As the arm does."""
+        self._arm.enable()
+
+    def reset(self) -> None:
+        """As the arm does."""
+        self._arm.reset()
+
+    def exchange(self, torque: Vector | None) -> Sample:
+        """As the arm does; raises DriverError instead of sending a torque once a stop was asked for."""
+        if torque is not None and self._asked():
+            raise DriverError("somebody asked for a stop")
+        return self._arm.exchange(torque)
+
+    def stop(self, kind: StopKind) -> None:
+        """As the arm does."""
+        self._arm.stop(kind)
+
+    def close(self) -> None:
+        """As the arm does."""
+        self._arm.close()
