@@ -20,11 +20,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.harness import Row, table, write
+from drivers.canopen.bits import exact
 from drivers.canopen.frame import Frame
 from drivers.canopen.link import Link
 from drivers.canopen.python_can_link import PythonCanLink, open_bus
 from drivers.canopen.session_log import SessionLog
-from drivers.canopen.wire.frame_bits import frame_bits
 from drivers.canopen.wire.host import LocalPort
 from drivers.canopen.wire.hub import Wire
 from drivers.canopen.wire.link import Connection, WireLink
@@ -115,10 +115,10 @@ def _percentiles(name: str, nanoseconds: np.ndarray) -> list[Row]:
 
 def _bits() -> list[Row]:
     frame, repeats = Frame(0x181, b"\x12\x34\x56\x78"), 20_000
-    frame_bits(frame)
+    exact(frame).nominal
     begin = time.perf_counter()
     for _ in range(repeats):
-        frame_bits(frame)
+        exact(frame).nominal
     return [Row("exact bits of a frame", (time.perf_counter() - begin) / repeats * 1e6, "us")]
 
 
