@@ -94,6 +94,8 @@ def _problems(error: ValidationError, tree: Tree, path: Path) -> Iterator[Proble
         message = mistake["msg"].removeprefix("Value error, ")
         if mistake["type"] == "extra_forbidden":
             message = f"unknown key {where[-1]!r}"
+        elif mistake["type"] == "tuple_type":
+            message = "must be a list"
         elif mistake["type"] == "missing":
             message = f"{mistake['loc'][-1]!r} is missing"
         name = ".".join(str(part) for part in where)
@@ -127,12 +129,12 @@ def _disagreements(config: ArmConfig) -> Iterator[tuple[KeyPath, str]]:
     for label, motion in (("identification", config.motions.identification), ("validation", config.motions.validation)):
         if isinstance(motion, FourierMotion) and names and tuple(motion.joints) != names:
             yield ("motions", label, "joints"), f"motions.{label}.joints: must be {', '.join(names)}, in this order"
-    if isinstance(config.driver, SimulatedDriver) and names:
+    if isinstance(config.driver, SimulatedDriver):
         for key in _PER_JOINT:
             given = getattr(config.driver, key)
-            if isinstance(given, tuple) and len(given) != len(names):
+            if names and isinstance(given, tuple) and len(given) != len(names):
                 yield ("driver", key), f"driver.{key}: {len(given)} values for {len(names)} joints"
-        yield from simulation.disagreements(config.driver, names)
+        yield from simulation.disagreements(config.driver, names, config.control.rate)
     if isinstance(config.driver, CanopenDriver):
         yield from canopen.disagreements(config.driver, config.transmission, names, config.control.rate)
     yield from recording.disagreements(config.recording, config.transmission, names)

@@ -87,6 +87,7 @@ FAULT_RULES: dict[FaultKind, FaultRule] = {
     FaultKind.LATE_CYCLE: FaultRule("exchange returns late", "lateness [s]", of_joint=False),
     FaultKind.CLOCK_JUMP: FaultRule("stamps are wrong by size", "[s]", of_joint=False, stays=True),
 }
+_LEAST_WATCHDOG = 2.0  # cycles, so that a torque frame may be late
 _NOT_NEGATIVE = (
     FaultKind.DELAYED_FEEDBACK,
     FaultKind.HIDDEN_DELAY,
@@ -135,13 +136,24 @@ class SimulatedFault(Section):
         return self
 
 
-def disagreements(driver: SimulatedDriver, joints: Sequence[str]) -> Iterator[tuple[tuple[str | int, ...], str]]:
+def disagreements(
+    driver: SimulatedDriver, joints: Sequence[str], rate: float
+) -> Iterator[tuple[tuple[str | int, ...], str]]:
     """What does not fit an arm of these joints: the place in the arm's file, and what is wrong.
 
     Args:
         driver: the section `driver`.
         joints: names of the arm's joints; none where the file does not name them.
+        rate: cycles per second.
     """
+    # What the message tells to set is rounded to six digits.
+    if driver.watchdog * rate < _LEAST_WATCHDOG * (1.0 - 1e-5):
+        yield (
+            ("driver", "watchdog"),
+            f"driver.watchdog: {driver.watchdog:g} s at {rate:g} Hz has no room for a late torque frame;"
+            f" at least {_LEAST_WATCHDOG:g} cycles are needed: set driver.watchdog to {_LEAST_WATCHDOG / rate:g} s or"
+            " more, or raise control.rate",
+        )
     if not joints:
         return
     if isinstance(driver.braking, tuple) and len(driver.braking) != len(joints):

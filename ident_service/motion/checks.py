@@ -37,7 +37,7 @@ class Check:
     Attributes:
         code: of the fault it would be.
         hit: where it is wrong, shape (joints,) or (names,).
-        what: the sentence's middle; `{}` stands for numbers, `{u}` for their unit.
+        what: the sentence's middle; `{}` stands for numbers, `{u}` for the position's unit, `{f}` for the torque's.
         numbers: one array, shaped like `hit`, for each `{}`.
         names: of what `hit` is about, the joints when None.
     """
@@ -145,7 +145,7 @@ def _what_can_be_bridged(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
     yield Check("lost_feedback", ~seen.usable, "no feedback in this cycle")
     if seen.sent is not None:
         differs = np.abs(seen.sample.torque - seen.sent) > NOT_APPLIED * limits.torque
-        what = "the drive gives {} of the {} N m (N) it was told"
+        what = "the drive gives {} of the {} {f} it was told"
         yield Check("torque_not_applied", differs, what, (seen.sample.torque, seen.sent))
 
 
@@ -175,7 +175,8 @@ def in_words(check: Check, names: Sequence[str], units: Sequence[str]) -> str:
     names = check.names or names
     texts = [", ".join(f"{number[k]:.4g}" for k in hit) for number in check.numbers]
     unit = "" if check.names else units[hit[0]]
-    return f"{', '.join(dict.fromkeys(names[k] for k in hit))}: {check.what.format(*texts, u=unit)}"
+    force = {"rad": "N m", "m": "N"}.get(unit, "")
+    return f"{', '.join(dict.fromkeys(names[k] for k in hit))}: {check.what.format(*texts, u=unit, f=force)}"
 
 
 def _beyond(position: Vector, limits: MotionLimits) -> tuple[Vector, Vector]:

@@ -165,7 +165,7 @@ class Guard:
             self._sent = wanted
             return wanted, None
         finite = np.isfinite(wanted)
-        what = f"a torque of {{}} N m (N) was asked for, more than {ABSURD:g} times the limit of {{}}"
+        what = f"a torque of {{}} {{f}} was asked for, more than {ABSURD:g} times the limit of {{}}"
         for check in (
             Check("torque_not_finite", ~finite, "the torque asked for is not a number"),
             Check("torque_absurd", finite & (size > ABSURD * limit), what, (wanted, limit)),
@@ -175,11 +175,11 @@ class Guard:
         leaves = np.clip(wanted, -limit, limit)
         over, fault = size > limit, None
         if over.any():
-            what = "a torque of {} N m (N) was asked for, the limit is {}"
+            what = "a torque of {} {f} was asked for, the limit is {}"
             fault = self._found(Check("torque_saturated", over, what, (wanted, limit)))
         if before is not None and (fast := np.abs(leaves - before) > self.rate).any():
             change = (leaves - before) / self._period
-            what = "the torque was to change by {} N m/s (N/s), {} allowed"
+            what = "the torque was to change by {} {f}/s, {} allowed"
             found = self._found(Check("torque_rate", fast, what, (change, self.rate / self._period)))
             leaves = np.clip(leaves, before - self.rate, before + self.rate)
             fault = found if fault is None or found.reaction > fault.reaction else fault

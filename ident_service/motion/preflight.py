@@ -50,6 +50,7 @@ from ident_service.motion.preflight_plan import (
     way_home_check,
     ways_check,
 )
+from ident_service.motion.preflight_remedy import remedy_of
 from ident_service.motion.preflight_session import Session
 from ident_service.motion.preflight_ticket import VALID, Ticket, new_ticket, subject_of
 from ident_service.motion.preflight_watchdog import Confirm, consent, watchdog_check
@@ -229,11 +230,15 @@ class _Preflight:
         return work
 
     def _faulted(self, session: Session, error: ArmFault) -> None:
-        """Find out what ended the loop: a joint that went the wrong way, or something else."""
+        """Find out what ended the loop: what the fault says failed, a joint that went the wrong way, or else."""
+        at = "direction" if "gravity" in self.checks else "gravity"
+        if (remedy := remedy_of(error)) is not None:
+            self._passed(failed(at, str(error), remedy))
+            return
         trace = session.trace()
         astray = int(np.argmax(np.abs(trace.position[-1] - trace.reference[-1])))
         name = self.model.chain.names[astray]
-        if "gravity" not in self.checks:
+        if at == "gravity":
             if wrong := wrong_signs(trace, session):
                 self._passed(sign_failure(wrong, self.model, str(error)))
             else:

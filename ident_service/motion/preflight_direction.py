@@ -37,6 +37,9 @@ FOLLOWS = (0.8, 1.25)  # measured against commanded displacement
 FOLLOWS_LOOSELY = (0.5, 2.0)
 MOST_ANSWER = 1.0 / INERTIA[0]  # how much more a joint may answer to torque than the model says
 LEAST_ANSWER = 1.0 / (2.0 * INERTIA[1])  # and how much less, where the model knows the drive's inertia
+_NEAREST = "answer to torque, the nearest within its doubt"
+# Behind an inertia that is missing in the model even a healthy joint answers with next to nothing.
+_NEAREST_LOOSELY = "answer to torque (too low a scale cannot be judged until the prior has the drive inertia)"
 _DOUBT = 3.0  # standard deviations
 _EXPLAINS = 0.5  # of what is unexplained must remain at most when a wrong sign is put right
 _LEAST_CYCLES = 8
@@ -252,7 +255,8 @@ def direction_check(answers: Sequence[Answer], model: ArmModel) -> Check:
                   least=np.where(known > 0.0, FOLLOWS[0], FOLLOWS_LOOSELY[0]),
                   most=np.where(known > 0.0, FOLLOWS[1], FOLLOWS_LOOSELY[1])),
         *measures("answer to torque, measured against the model", response, ones, names),
-        *measures("answer to torque, the nearest within its doubt", judged_at, ones, names, least=least, most=most),
+        *(replace(one, what=_NEAREST if drive > 0.0 else _NEAREST_LOOSELY) for one, drive in zip(
+            measures(_NEAREST, judged_at, ones, names, least=least, most=most), known, strict=True)),
     ]  # fmt: skip
     # Where it cannot be told from friction how a joint answers torque, following is all there is to judge.
     found = [one for one in found if one.value is not None or one.what.startswith("displacement")]

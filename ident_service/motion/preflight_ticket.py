@@ -199,9 +199,9 @@ def read_ticket(path: Path) -> Ticket:
     except OSError as error:
         raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise UsageError(f"{path}: not UTF-8 text, so not a ticket") from None
+        raise UsageError(f"{path}: not UTF-8 text, so not a ticket; `ident check` makes a new one") from None
     except UsageError as error:
-        raise UsageError(f"{path}: {error}") from None
+        raise UsageError(f"{path}: {error}; `ident check` makes a new one") from None
 
 
 def ticket_from_json(text: str) -> Ticket:

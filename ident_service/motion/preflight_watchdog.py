@@ -59,7 +59,8 @@ def consent(model: ArmModel, sample: Sample, confirm: Confirm) -> Consent:
     )
     if typed.strip() == name:
         return Consent(True, None)
-    why = f"nobody typed the arm's name, {name}, so the drives' watchdog was not tried"
+    wrong = f"{typed.strip()!r} is not" if typed.strip() else "nobody typed"
+    why = f"{wrong} the arm's name, {name}, so the drives' watchdog was not tried"
     remedy = "Support the arm, step out of its reach, check again and type its name when asked."
     return Consent(False, Check(CODE, Verdict.NEEDS_PERSON, (), why, remedy))
 

@@ -95,7 +95,7 @@ def test_the_description_that_the_others_spoil_is_good(tmp_path: Path) -> None:
             "driver: {kind: simulated,", "driver: {", "driver: {", "'kind' is missing", id="driver of no kind"
         ),
         pytest.param("control: {rate: 1000}", "control: fast", "control", "valid", id="text for a section"),
-        pytest.param("gravity: [0, 0, -9.81]", "gravity: 9.81", "gravity", "valid tuple", id="number for a vector"),
+        pytest.param("gravity: [0, 0, -9.81]", "gravity: 9.81", "gravity", "must be a list", id="number for a vector"),
         pytest.param("-9.81]", "down]", "down]", "valid number", id="word in a vector"),
         pytest.param("-9.81]", "-9.81, 0]", "gravity", "at most 3", id="vector too long"),
         pytest.param("rate: 1000", "rate: '1000'", "rate", "valid number", id="text for a number"),

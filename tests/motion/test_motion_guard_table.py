@@ -281,6 +281,23 @@ def test_a_sentence_names_all_joints_with_numbers_and_limits() -> None:
     assert fault.message.startswith("elbow: moves at -4 m/s, more than 1.2 times the limit of 3 m/s: ")
 
 
+@pytest.mark.parametrize(("joint", "unit_of_torque"), [(0, "N m"), (1, "N")])
+def test_torques_are_told_in_the_unit_of_the_joint(joint: int, unit_of_torque: str) -> None:
+    def told(fault: Fault | None) -> str:
+        assert fault is not None
+        return fault.message
+
+    asked = unit(joint) * LIMITS.torque
+    guard = Bench(revolute=(True, False)).guard
+    assert f"{2.0 * LIMITS.torque[joint]:.4g} {unit_of_torque} was asked for" in told(guard.torque(2.0 * asked)[1])
+    assert f"{4.0 * LIMITS.torque[joint]:.4g} {unit_of_torque} was asked for" in told(guard.torque(4.0 * asked)[1])
+    bench = Bench(revolute=(True, False))
+    bench.guard.torque(0.5 * asked)
+    words = told(bench.see(HOME, torque=np.zeros(2))[1])
+    assert f"gives 0 of the {0.5 * LIMITS.torque[joint]:.4g} {unit_of_torque} it was told" in words
+    assert f" {unit_of_torque}/s, " in told(bench.guard.torque(0.5 * asked - 1.5 * bench.guard.rate * unit(joint))[1])
+
+
 def test_the_rate_of_torque_is_libfrankas_or_a_share() -> None:
     np.testing.assert_allclose(Bench().guard.rate / PERIOD, [1000.0, 1000.0])
     assert (TORQUE_RATE, TORQUE_RATE_SHARE) == (1000.0, 100.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -11,8 +12,13 @@ from flight_bench import FOREVER, TRUTH, Flight, FlightArm, check_of, joint_chan
 
 from drivers.arm import Sample
 from drivers.clock import VirtualClock
-from ident_service.errors import DriverError
+from ident_service.config.load import load_arm
+from ident_service.errors import ArmFault, DriverError
+from ident_service.model.arm_model import arm_model
+from ident_service.motion.faults import FAULTS
+from ident_service.motion.preflight import preflight
 from ident_service.motion.preflight_check import CODES, Verdict
+from ident_service.motion.preflight_remedy import REMEDIES, remedy_of
 from sim_backend.arm import from_config
 from sim_backend.faults import Fault, FaultKind
 
@@ -275,14 +281,66 @@ def test_a_blocked_joint_does_not_follow() -> None:
     assert "brake" in check.remedy or "blocks" in check.remedy
 
 
+@pytest.mark.parametrize(
+    ("kind", "joint", "reason", "remedy"),
+    [
+        (FaultKind.EMERGENCY_STOP, None, "emergency_stop: shoulder, elbow: the drive reports", "then release it"),
+        (
+            FaultKind.DRIVE_FAULT,
+            1,
+            "drive_fault: elbow: the drive reports",
+            "fault code .* `ident recover`",
+        ),
+        (FaultKind.NODE_SILENT, 1, "feedback_gone: elbow: ", "power, cables and bus"),
+        (FaultKind.LOST_FEEDBACK, 0, "feedback_gone: shoulder: ", "power, cables and bus"),
+        (FaultKind.NAN_POSITION, 1, "feedback_not_finite: elbow: ", "the encoder of the joint named"),
+    ],
+)
+@pytest.mark.parametrize(("cycle", "code"), [(450, "gravity"), (1000, "direction")])
+def test_a_fault_that_says_what_failed_is_passed_on_with_its_own_remedy(
+    kind: FaultKind, joint: int | None, reason: str, remedy: str, cycle: int, code: str
+) -> None:
+    check = only_failure(Flight(faults=(Fault(cycle, kind, joint, FOREVER),)).ticket(), code)
+    assert check.reason.startswith(reason)
+    assert re.search(remedy, check.remedy)
+    assert "sign" not in check.remedy
+
+
 def test_an_encoder_that_freezes_while_the_joint_moves_is_noticed() -> None:
-    flight = Flight(faults=(Fault(1000, FaultKind.FROZEN_ENCODER, 0, FOREVER),))
-    assert only_failure(flight.ticket(), "direction").reason.find("shoulder") >= 0
+    check = only_failure(Flight(faults=(Fault(1000, FaultKind.FROZEN_ENCODER, 0, FOREVER),)).ticket(), "direction")
+    assert check.reason.startswith("frozen_encoder: shoulder: ")
+    assert check.remedy.startswith("Check the encoder of the joint named")
 
 
-def test_a_drive_that_gives_up_in_the_middle_is_named() -> None:
-    flight = Flight(faults=(Fault(450, FaultKind.DRIVE_FAULT, 1, FOREVER),))
-    assert "elbow" in only_failure(flight.ticket(), "gravity").reason
+def test_a_drive_that_limits_its_torque_is_named_and_not_the_joint_that_it_drags_along() -> None:
+    # As the drives tell it: the arm of the other tests says that the torque asked for has acted.
+    model = arm_model(load_arm("planar2"))
+    arm = from_config(model.config, faults=(Fault(3000, FaultKind.TORQUE_SATURATION, 0, FOREVER, 0.02),))
+    check = only_failure(preflight(arm, model, None, confirm=lambda question: "planar2", look_seconds=0.3), "direction")
+    assert check.reason.startswith("repeated_warnings: torque_not_applied in more than 20 of the last 100 cycles")
+    assert "(shoulder: the drive gives 0.8 of the " in check.reason
+    assert " N m it was told)" in check.reason
+    assert "limits that the drive keeps by itself" in check.remedy
+
+
+@pytest.mark.parametrize(
+    ("code", "message", "remedy"),
+    [
+        ("drive_watchdog", "elbow: the drive's watchdog has struck", "control.rate"),
+        ("drive_emergency", "elbow: the drive says 8400h", "own fault code"),
+        ("bus_off", "bus 0 is off", "power, cables and bus"),
+        ("repeated_warnings", "lost_feedback in more than 20 of the last 100 cycles (elbow)", "power, cables and bus"),
+        ("repeated_warnings", "torque_rate in more than 20 of the last 100 cycles (elbow)", None),
+        ("following_error", "elbow: 0.09 rad from where it should be", None),
+        ("over_velocity", "elbow: moves at 3 rad/s", None),
+    ],
+)
+def test_a_remedy_follows_the_code_where_the_fault_says_what_failed(
+    code: str, message: str, remedy: str | None
+) -> None:
+    assert set(REMEDIES) <= set(FAULTS)
+    found = remedy_of(ArmFault(code, message))
+    assert (found is None) if remedy is None else (found is not None and remedy in found)
 
 
 def test_a_bus_that_goes_is_a_failed_check() -> None:

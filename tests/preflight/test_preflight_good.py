@@ -7,16 +7,18 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
-from flight_bench import LIMIT, TRUTH, Flight, check_of, verdicts
+from flight_bench import LIMIT, PRIOR, TRUTH, Flight, check_of, verdicts
 
 from drivers.arm import Sample
 from drivers.clock import VirtualClock
 from ident_service.config.load import load_arm
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import arm_model
+from ident_service.model.rigid_body import InverseDynamics
 from ident_service.motion.factory import make_arm
 from ident_service.motion.preflight import preflight
 from ident_service.motion.preflight_check import CODES, Verdict
+from ident_service.motion.preflight_direction import LEAST_ANSWER
 from ident_service.motion.preflight_session import trace_of
 from ident_service.motion.reference import Setpoint
 
@@ -42,6 +44,29 @@ def test_it_measures_what_is_true() -> None:
     assert abs((held["shoulder"] or 0.0) - 12.3) < 0.7
 
 
+def test_a_scale_that_cannot_be_judged_is_not_reported_as_if_it_were() -> None:
+    """An elbow of whose drive inertia the model knows nothing passes with a third of the answer, and says why."""
+    prior = {name: value for name, value in PRIOR.items() if name != "Ia2"}
+    driver = {
+        "kind": "simulated",
+        "truth": TRUTH | {"Ia2": 0.05},
+        "encoder_resolution": 2e-5,
+        "torque_resolution": 0.01,
+    }
+    flight = Flight(changes={"prior": prior, "driver": driver})
+    check = check_of(flight.ticket(), "direction")
+    assert check.verdict is Verdict.PASSED
+    judged = {one.joint: one for one in check.measures if one.what.startswith("answer") and one.most is not None}
+    assert "scale cannot be judged until the prior has the drive inertia" in judged["elbow"].what
+    # The elbow alone accelerates, by a; the model expects a (1 + Ia (M^-1)_22) of the torques that takes.
+    model = flight.model
+    assert model.prior is not None
+    mass = InverseDynamics(model.chain, model.layout, model.prior).mass_matrix(np.array([0.1, -0.1]))
+    assert judged["elbow"].value == pytest.approx(1.0 / (1.0 + 0.05 * np.linalg.inv(mass)[1, 1]), rel=0.05)
+    assert "cannot" not in judged["shoulder"].what
+    assert (judged["shoulder"].least, judged["elbow"].least) == (LEAST_ANSWER, 0.0)
+
+
 def test_the_arm_moves_no_farther_than_told_and_within_its_band_of_torque() -> None:
     flight = Flight()
     seen: list[np.ndarray] = []
@@ -61,12 +86,18 @@ def test_a_person_is_asked_by_the_arms_name_before_anything_is_energised() -> No
     assert "sinks" in question
 
 
-def test_without_the_name_the_watchdog_is_not_tried_and_the_arm_is_handed_back_to_its_support() -> None:
-    flight = Flight(typed="yes")
+@pytest.mark.parametrize(
+    ("typed", "why"), [("yes", "'yes' is not the arm's name, bench,"), (" ", "nobody typed the arm's name, bench,")]
+)
+def test_without_the_name_the_watchdog_is_not_tried_and_the_arm_is_handed_back_to_its_support(
+    typed: str, why: str
+) -> None:
+    flight = Flight(typed=typed)
     ticket = flight.ticket()
     assert ticket.verdict is Verdict.NEEDS_PERSON
     check = check_of(ticket, "watchdog")
     assert check.verdict is Verdict.NEEDS_PERSON
+    assert check.reason.startswith(why)
     assert "type its name" in check.remedy
     assert verdicts(ticket)["direction"] is Verdict.PASSED
 

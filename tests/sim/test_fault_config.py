@@ -111,11 +111,11 @@ def test_an_unknown_joint_is_reported_by_name():
             "faults": ({"kind": "nan_position", "at": 0.0}, {"kind": "nan_position", "at": 0.0, "joint": "six"}),
         }
     )
-    assert list(disagreements(driver, ("one", "two"))) == [
+    assert list(disagreements(driver, ("one", "two"), 500.0)) == [
         (("driver", "braking"), "driver.braking: 1 values for 2 joints"),
         (("driver", "faults", 1, "joint"), "driver.faults.1.joint: 'six' is none of one, two"),
     ]
-    assert list(disagreements(driver, ())) == []
+    assert list(disagreements(driver, (), 500.0)) == []
 
 
 def test_an_unknown_joint_is_refused(tmp_path):
@@ -141,3 +141,30 @@ def test_a_load_is_a_point_mass_in_the_frame_of_the_last_link(tmp_path):
         np.testing.assert_allclose(
             loaded_arm.plant.inverse_dynamics(q, dq, ddq), heavy.inverse_dynamics(q, dq, ddq), rtol=1e-12
         )
+
+
+def test_a_list_of_faults_is_asked_for(tmp_path):
+    path = tmp_path / "two.yaml"
+    path.write_text(TEXT.replace("  faults:\n", "  faults: {kind: nan_position, at: 1}\n"))
+    with pytest.raises(ConfigError) as caught:
+        load_arm(path)
+    assert [problem.message for problem in caught.value.problems] == ["driver.faults: must be a list"]
+
+
+def test_a_watchdog_without_room_for_a_late_frame_is_refused_in_its_place(tmp_path):
+    path = tmp_path / "two.yaml"
+    text = TEXT.replace("  faults:\n", "").replace("rate: 500", "rate: 70")
+    path.write_text(text + "  watchdog: 0.0285\n")
+    with pytest.raises(ConfigError) as caught:
+        load_arm(path)
+    ((line, message),) = [(problem.line, problem.message) for problem in caught.value.problems]
+    assert line == text.count("\n") + 1
+    assert message == (
+        "driver.watchdog: 0.0285 s at 70 Hz has no room for a late torque frame; at least 2 cycles are needed: "
+        "set driver.watchdog to 0.0285714 s or more, or raise control.rate"
+    )
+    path.write_text(text)  # the default of 10 ms
+    with pytest.raises(ConfigError, match=r"driver.watchdog: 0.01 s at 70 Hz"):
+        load_arm(path)
+    path.write_text(text + "  watchdog: 0.0285714\n")
+    load_arm(path)
