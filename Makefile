@@ -10,7 +10,8 @@ demo: $(READY)
 	$(BIN)/ident simulate
 
 test: lint types coverage
-	$(BIN)/pytest -n 2 -m "not campaign"
+	$(BIN)/pytest -n 2 -m "not campaign and not realtime"
+	$(BIN)/pytest -m "realtime and not campaign"
 
 unit: $(READY)
 	$(BIN)/pytest -n 2 -m "not campaign and not slow"

@@ -42,7 +42,7 @@ DEADLINE, BRAKING = 0.2, [4.0, 2.0]
 STOPPED = "(quick stop active|switch on disabled|fault reaction active|fault)"
 NAMES = ("shoulder", "elbow")
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.slow, pytest.mark.realtime, pytest.mark.timeout(600)]
 
 
 class Bench:
