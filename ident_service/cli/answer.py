@@ -12,6 +12,7 @@ import json
 import os
 import signal
 import sys
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, TextIO
@@ -32,7 +33,7 @@ def print_answer(arguments: argparse.Namespace, code: int, text: str, document: 
         write(sys.stdout, text)
 
 
-def print_error(kind: str, message: str, code: int, more: dict[str, Any] | None = None) -> None:
+def print_error(kind: str, message: str, code: int, more: Mapping[str, object] | None = None) -> None:
     """Print the one JSON object of a command that failed; `kind` is the name of an error of `errors.py`."""
     _print_json({"error": {"kind": kind, "message": message}, **(more or {}), "exit_code": code})
 
