@@ -74,7 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         notes = list(getattr(error, "__notes__", ()))
         print_to_person("\n".join([f"ident: {error}", *notes]) + "\n")
         if arguments.json:
-            print_error(type(error).__name__, str(error), code, {"notes": notes, **error.facts} if notes else {})
+            print_error(type(error).__name__, str(error), code, {**({"notes": notes} if notes else {}), **error.facts})
         return code
     print_answer(arguments, code, text, document)
     return code
