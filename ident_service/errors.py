@@ -19,13 +19,20 @@ Each leaf also is the builtin it resembles, so that callers who do not know this
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 
 class IdentError(Exception):
-    """Base of all errors raised on purpose; the command line turns it into one message and an exit code."""
+    """Base of all errors raised on purpose; the command line turns it into one message and an exit code.
+
+    Attributes:
+        facts: further entries of the JSON object that the command prints; what a run left behind, for example.
+    """
+
+    facts: Mapping[str, object] = MappingProxyType({})
 
 
 class UsageError(IdentError, ValueError):

@@ -14,7 +14,17 @@ from pathlib import Path
 
 from ident_service import __version__
 from ident_service.cli import arm, bus, commission, configs, emulate, motions, parameters, recovery
-from ident_service.cli.answer import DONE, FAILED, FAULTED, USAGE, VERDICT_NO, Answer, print_answer, print_error
+from ident_service.cli.answer import (
+    DONE,
+    FAILED,
+    FAULTED,
+    USAGE,
+    VERDICT_NO,
+    Answer,
+    print_answer,
+    print_error,
+    print_to_person,
+)
 from ident_service.cli.words import Parser, Verbs, WrongWords, asks_for_json
 from ident_service.errors import ArmFault, ConfigError, IdentError, MotionRefused, UsageError
 
@@ -55,15 +65,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         code, text, document = verb(arguments)
     except KeyboardInterrupt:
         # Asked twice, or by somebody who does not want to wait for what could be saved.
-        sys.stderr.write("ident: interrupted\n")
+        print_to_person("ident: interrupted\n")
         if arguments.json:
             print_error("Interrupted", "interrupted", FAILED)
         return FAILED
     except IdentError as error:
         code = next(number for kind, number in _EXIT_CODES if isinstance(error, kind))
-        sys.stderr.write(f"ident: {error}\n")
+        notes = list(getattr(error, "__notes__", ()))
+        print_to_person("\n".join([f"ident: {error}", *notes]) + "\n")
         if arguments.json:
-            print_error(type(error).__name__, str(error), code)
+            print_error(type(error).__name__, str(error), code, {**({"notes": notes} if notes else {}), **error.facts})
         return code
     print_answer(arguments, code, text, document)
     return code

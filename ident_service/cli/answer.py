@@ -7,12 +7,15 @@ Boundary: nothing here knows a single verb.
 from __future__ import annotations
 
 import argparse
+import errno
 import json
 import os
 import signal
 import sys
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from ident_service.errors import UsageError
 
@@ -27,22 +30,48 @@ def print_answer(arguments: argparse.Namespace, code: int, text: str, document: 
     if arguments.json:
         _print_json({**document, "exit_code": code})
     else:
-        sys.stdout.write(text)
+        write(sys.stdout, text)
 
 
-def print_error(kind: str, message: str, code: int) -> None:
+def print_error(kind: str, message: str, code: int, more: Mapping[str, object] | None = None) -> None:
     """Print the one JSON object of a command that failed; `kind` is the name of an error of `errors.py`."""
-    _print_json({"error": {"kind": kind, "message": message}, "exit_code": code})
+    _print_json({"error": {"kind": kind, "message": message}, **(more or {}), "exit_code": code})
+
+
+def print_to_person(text: str) -> None:
+    """Print on stderr, as far as anybody reads it."""
+    write(sys.stderr, text)
 
 
 def _print_json(document: dict[str, Any]) -> None:
-    sys.stdout.write(json.dumps(document, allow_nan=False) + "\n")
+    write(sys.stdout, json.dumps(document, allow_nan=False) + "\n")
 
 
 def tell(arguments: argparse.Namespace, line: str) -> None:
-    """Say what is going on while a verb works."""
+    """Say what is going on while a verb works; words that cannot be said end nothing, least of all a motion."""
     # With --json, stdout belongs to the one object.
-    print(line, file=sys.stderr if arguments.json else sys.stdout, flush=True)
+    with suppress(OSError):
+        write(sys.stderr if arguments.json else sys.stdout, line + "\n")
+
+
+def write(stream: TextIO | None, text: str) -> None:
+    """Write and flush; a reader that has gone, or a terminal, changes neither what is done nor the exit code.
+
+    Raises:
+        OSError: anything else that keeps text from its place, a full disk for example.
+    """
+    if stream is None:  # closed before we began
+        return
+    try:
+        stream.write(text)
+        stream.flush()
+    except OSError as error:
+        if error.errno not in (errno.EPIPE, errno.EIO):
+            raise
+        # What is left in the buffer would fail again when the interpreter ends, and change the exit code.
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
 
 
 def state_folder(arguments: argparse.Namespace) -> Path:
@@ -62,7 +91,11 @@ def state_folder(arguments: argparse.Namespace) -> Path:
 
 
 class StopOnSignal:
-    """Ctrl-C or a polite kill asks for a controlled stop; a second one ends the process as usual."""
+    """Ctrl-C, a polite kill or a terminal that closes asks for a controlled stop.
+
+    A second Ctrl-C or kill is an interrupt as usual. A second hangup is not: shells send it besides the kernel. Where
+    hangups are ignored (`nohup`), they stay so.
+    """
 
     def __init__(self) -> None:
         self._asked = False
@@ -72,7 +105,10 @@ class StopOnSignal:
         return self._asked
 
     def __enter__(self) -> None:
-        self._before = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)}
+        numbers = [signal.SIGINT, signal.SIGTERM]
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+            numbers.append(signal.SIGHUP)
+        self._before = {number: signal.signal(number, self._ask) for number in numbers}
 
     def __exit__(self, *_: object) -> None:
         for number, before in self._before.items():
@@ -80,4 +116,5 @@ class StopOnSignal:
 
     def _ask(self, number: int, _: object) -> None:
         self._asked = True
-        signal.signal(number, self._before[signal.Signals(number)])
+        if number != signal.SIGHUP:
+            signal.signal(number, self._before[signal.Signals(number)])

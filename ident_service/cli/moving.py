@@ -18,9 +18,11 @@ from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.answer import DONE, Answer, state_folder, tell
 from ident_service.cli.words import Parser
-from ident_service.errors import MotionRefused, UsageError
+from ident_service.errors import IdentError, MotionRefused, UsageError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from ident_service.config.schema import ArmConfig
     from ident_service.excitation.excitation import Excitation
     from ident_service.motion.plans import Destination
@@ -141,22 +143,51 @@ def moved(
     if not path.exists():
         raise MotionRefused(f"{config.name}: not checked yet; `ident check` comes before every motion")
     folder = arguments.out or new_run_folder(state, config.name)
-    tell(arguments, f"{config.name}: {sentence}, into {folder}")
-    ran = run_motion(
-        config,
-        motion,
-        folder,
-        state,
-        read_ticket(path),
-        speed=speed,
-        lease=LEASE_SECONDS if lease is None else lease,
-        log_frames=arguments.can_log,
-        tell=lambda word: tell(arguments, word),
-        stop_requested=stop_requested,
-    )
-    files = "".join(f"  {path.name}\n" for path in sorted(folder.iterdir()))
-    text = _report_text(ran.report) + f"files: {folder}\n" + files
-    return DONE, text, {"folder": str(folder), "report": ran.report}
+    begun = False
+
+    def begin() -> None:
+        nonlocal begun
+        begun = True
+        tell(arguments, f"{config.name}: {sentence}, into {folder}")
+
+    try:
+        ran = run_motion(
+            config,
+            motion,
+            folder,
+            state,
+            read_ticket(path),
+            speed=speed,
+            lease=LEASE_SECONDS if lease is None else lease,
+            log_frames=arguments.can_log,
+            begin=begin,
+            tell=lambda word: tell(arguments, word),
+            stop_requested=stop_requested,
+        )
+    except IdentError as error:
+        if begun and folder.exists():
+            _add_facts(error, folder, state, config.name)
+        raise
+    files = _files(folder)
+    text = _report_text(ran.report) + f"files: {folder}\n" + "".join(f"  {name}\n" for name in files)
+    return DONE, text, {"folder": str(folder), "files": files, "report": ran.report}
+
+
+def _add_facts(error: IdentError, folder: Path, state: Path, arm: str) -> None:
+    """What a run that ended in an error has left: faults, the first first, and files."""
+    from ident_service.service.arm_state import fault_file
+
+    faults = [{"code": code, "cause": cause} for code, cause in fault_file(state, arm).latched().items()]
+    files = _files(folder)
+    recorded = next((str(folder / name) for name in ("run.mcap", "run.mcap.partial") if name in files), None)
+    if recorded is not None:
+        error.add_note(f"recorded until then: {recorded}")
+    error.add_note("\n".join([f"files: {folder}", *(f"  {name}" for name in files)]))
+    error.facts = {"folder": str(folder), "faults": faults, "recording": recorded, "files": files}
+
+
+def _files(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
 
 
 def add_can_log(sub: Parser) -> None:
@@ -184,9 +215,11 @@ def _report_text(report: dict[str, Any]) -> str:
     frames = f"can.log: {report['frames_logged']}\n" if "frames_logged" in report else ""
     warnings = ", ".join(f"{code} {count} times" for code, count in report["warnings"].items()) or "none"
     lateness, compute = report["lateness"], report["compute"]
+    ended = f"{report['state']} after {report['cycles']} cycles; warnings: {warnings}\n{report['real_time']}"
+    if lateness is None or compute is None:
+        return f"{ended}: nothing was timed\n{frames}"
     return (
-        f"{report['state']} after {report['cycles']} cycles; warnings: {warnings}\n"
-        f"{report['real_time']}\n"
+        f"{ended}\n"
         f"woke late by below {lateness['median_below_us']:g} us (median), {lateness['p999_below_us']:g} us (99.9 %), "
         f"at worst {lateness['worst_us']:.0f} us\n"
         f"computed for below {compute['median_below_us']:g} us (median), {compute['p999_below_us']:g} us (99.9 %), "

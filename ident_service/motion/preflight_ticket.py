@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime, timedelta
 from math import isfinite
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import Any
 
 from drivers.arm import ArmDescription
 from ident_service import __version__
-from ident_service.errors import UsageError
+from ident_service.errors import MotionRefused, UsageError
 from ident_service.excitation.excitation import Excitation
 from ident_service.model.arm_model import ArmModel
 from ident_service.motion.preflight_check import ABOUT_THE_MOTION, CODES, Check, Measure, Verdict
@@ -118,6 +118,18 @@ class Ticket:
         for was, now_is in ((mine.driver, theirs.driver), (mine.software, theirs.software)):
             found += [f"it was made with {was or 'no driver'}, not with {now_is or 'none'}"] if was != now_is else []
         return found
+
+    def require_valid_for(self, subject: Subject, now: datetime) -> None:
+        """Raise MotionRefused, which says why, unless this ticket is `valid_for` the motion."""
+        if why := self.valid_for(subject, now):
+            raise MotionRefused(
+                f"the preflight ticket does not allow this: {'; '.join(why)}; `ident check` makes a new one"
+            )
+
+    def with_arm(self, subject: Subject) -> Subject:
+        """The subject on the arm of this ticket: all that can be compared before the arm is open."""
+        mine = self.subject
+        return replace(subject, identities=mine.identities, bus_sha256=mine.bus_sha256, driver=mine.driver)
 
     def to_json(self) -> str:
         """One JSON object, the inverse of `ticket_from_json`."""

@@ -110,12 +110,17 @@ def _ended(request: dict[str, Any]) -> tuple[int, dict[str, Any]]:
             say({"pid": os.getpid()})
             return 0, {"report": _latching(request, controls)}
     except ArmFault as fault:
-        return 4, {"error": {"kind": "ArmFault", "code": fault.code, "message": str(fault)}}
+        return 4, {"error": {"kind": "ArmFault", "code": fault.code, "message": _words(fault)}}
     except IdentError as error:
-        return 1, {"error": {"kind": type(error).__name__, "message": str(error)}}
+        return 1, {"error": {"kind": type(error).__name__, "message": _words(error)}}
     except Exception as error:  # noqa: BLE001 - a mistake of ours, too, has a message besides its traceback
         traceback.print_exc()
         return 1, {"error": {"kind": "ArmError", "message": f"the motion process failed: {error!r}"}}
+
+
+def _words(error: IdentError) -> str:
+    """The error and its notes in one line."""
+    return "; ".join((str(error), *getattr(error, "__notes__", ())))
 
 
 def _latching(request: dict[str, Any], controls: ControlFile) -> dict[str, Any]:
@@ -123,11 +128,22 @@ def _latching(request: dict[str, Any], controls: ControlFile) -> dict[str, Any]:
     faults, latch = FaultFile(Path(request["arm_folder"])), Latch()
     faults.began(Path(request["folder"]))
     try:
-        return _moved(request, controls, latch)
-    finally:
-        for fault in latch.faults:
-            faults.latch(fault.code, fault.cause)
-        faults.ended()
+        report = _moved(request, controls, latch)
+    except BaseException as error:
+        try:
+            _remember(faults, latch)
+        except UsageError as second:  # the mark stays, so that the arm is not taken for a sound one
+            error.add_note(f"it could not be latched: {second}")
+        raise
+    _remember(faults, latch)
+    return report
+
+
+def _remember(faults: FaultFile, latch: Latch) -> None:
+    """What went wrong is on the disk, and only then the arm is without a mark."""
+    for fault in latch.faults:
+        faults.latch(fault.code, fault.cause)
+    faults.ended()
 
 
 def _moved(request: dict[str, Any], controls: ControlFile, latch: Latch) -> dict[str, Any]:
@@ -146,11 +162,7 @@ def _moved(request: dict[str, Any], controls: ControlFile, latch: Latch) -> dict
     sentence = "virtual time" if arm.clock.lock_step else ask().sentence()
     with arm:
         ticket = ticket_from_json(request["ticket"])
-        now = datetime.now(UTC)
-        if why := ticket.valid_for(subject_of(model, motion, arm.describe()), now):
-            raise MotionRefused(
-                f"the preflight ticket does not allow this: {'; '.join(why)}; `ident check` makes a new one"
-            )
+        ticket.require_valid_for(subject_of(model, motion, arm.describe()), datetime.now(UTC))
         if not sink.event(arm.clock.now_ns(), 20, sentence):
             raise MotionRefused(f"nothing would be recorded: {sink.error or 'the recorder cannot keep up'}")
         if lifeline.cut:
@@ -165,8 +177,9 @@ def _moved(request: dict[str, Any], controls: ControlFile, latch: Latch) -> dict
         "peak_torque": np.asarray(report.peak_torque).tolist(),
         "warnings": report.warnings,
         "real_time": sentence,
-        "lateness": sink.lateness.document(),
-        "compute": sink.compute.document(),
+        # In virtual time cycles wait for each other, and nothing is late.
+        "lateness": None if arm.clock.lock_step else sink.lateness.document(),
+        "compute": None if arm.clock.lock_step else sink.compute.document(),
         **({"frames_logged": arm.logged()} if request["log_frames"] else {}),
     }
 

@@ -16,7 +16,27 @@ _STEP: Final = 1 << 20
 def require_file(path: Path) -> None:
     """Raise UsageError unless `path` is a file."""
     if not path.is_file():
-        raise UsageError(f"{path}: {'is a folder, not a recording' if path.is_dir() else 'no such file'}")
+        why = "is a folder, not a recording" if path.is_dir() else "no such file"
+        partial = path.with_name(f"{path.name}.partial")
+        hint = f" (there is {partial.name}, left by an interrupted recording)" if partial.is_file() else ""
+        raise UsageError(f"{path}: {why}{hint}")
+
+
+def require_writable(folder: Path) -> None:
+    """Make a folder and see that a file can be kept in it, before something begins that must be written down there.
+
+    Raises:
+        UsageError: it cannot be made, or nothing can be written into it.
+    """
+    probe = folder / f".{secrets.token_hex(4)}.probe"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            probe.write_bytes(b"\n")
+        finally:
+            probe.unlink(missing_ok=True)
+    except OSError as error:
+        raise UsageError(f"{folder}: cannot be written: {error.strerror}") from None
 
 
 def sha256(path: Path, size: int) -> str:

@@ -189,17 +189,19 @@ class Drain:
 
 def serve(channel: socket.socket, ring: int, work: int, room: int) -> None:
     """Record what the request on the channel asks for; errors go to the parent."""
-    with channel.makefile("rwb") as lines:
+    with channel.makefile("rb") as lines:
 
         def tell(answer: Mapping[str, object]) -> None:
             # A parent that died is no reason to stop recording.
             with suppress(OSError):
-                lines.write(json.dumps(answer).encode() + b"\n")
-                lines.flush()
+                channel.sendall(json.dumps(answer).encode() + b"\n")
 
-        asked: dict[str, Any] = json.loads(lines.readline() or b"{}")
-        if not asked:
-            return
+        line = b""
+        with suppress(OSError):
+            line = lines.readline()
+        if not line.endswith(b"\n"):
+            return  # whoever wanted to ask was killed, perhaps in the middle of a word
+        asked: dict[str, Any] = json.loads(line)
         attachments = {name: base64.b64decode(data) for name, data in asked["attachments"].items()}
         with RingReader(ring, recorder=True) as reader:
             writer = RecordingWriter(

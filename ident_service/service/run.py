@@ -1,47 +1,37 @@
 """A run on an arm: recorder and motion each in a process of their own, watched from here, everything kept in a folder.
 
-This process holds the pipe and the lease of the motion process: what ends it closes the pipe, and what makes it hang
-lets the lease lapse; either stops the arm. The folder is there from the beginning and keeps what was recorded, whether
-the run ended well or not. How it ended is written by the motion process, and from here where that could not.
+The folder is there from the beginning and keeps what was recorded, whether the run ended well or not; only a run that
+was refused before anything moved leaves none. How it ended is written by the motion process, and from here where that
+could not. A file that cannot be written never hides why a run ended: it becomes a note of that error.
 """
 
 from __future__ import annotations
 
 import json
-import os
-import select
-import signal
-import subprocess
-import sys
+import shutil
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import astuple, dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from ident_service.config.schema import ArmConfig
-from ident_service.errors import ArmError, ArmFault, DriverError, IdentError, MotionRefused, UsageError
+from ident_service.errors import MotionRefused, RecordingError, UsageError
 from ident_service.excitation.excitation import Excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.model.urdf import urdf_text
-from ident_service.motion.control_file import ControlFile
 from ident_service.motion.controls import LEASE_SECONDS
-from ident_service.motion.ending import write_ending
+from ident_service.motion.ending import ENDED, write_ending
 from ident_service.motion.factory import make_arm
-from ident_service.motion.fault_file import CONTROLS, UNFINISHED, FaultFile
 from ident_service.motion.plans import HOMING_SPEED, Destination
-from ident_service.motion.preflight_ticket import Ticket
+from ident_service.motion.preflight_ticket import Ticket, subject_of
+from ident_service.record.files import require_writable
 from ident_service.record.recorder_process import RecorderProcess
-from ident_service.results.files import write_atomically
+from ident_service.results.files import require_place, write_atomically
 from ident_service.results.run_folder import write_manifest
 from ident_service.service.arm_state import arm_folder, fault_file
 from ident_service.service.preflight import write_ticket
-
-_RENEW_SHARE = 0.25  # of the lease
-_LAST_WORDS = 30.0  # s for a process that was told to stop
-_KINDS: dict[str, type[IdentError]] = {
-    kind.__name__: kind for kind in (MotionRefused, DriverError, UsageError, ArmError)
-}
+from ident_service.service.watching import watched
 
 
 @dataclass(frozen=True)
@@ -67,6 +57,7 @@ def run_motion(
     speed: float = 1.0,
     lease: float = LEASE_SECONDS,
     log_frames: bool = False,
+    begin: Callable[[], None] = lambda: None,
     tell: Callable[[str], None] = lambda _: None,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> Ran:
@@ -81,13 +72,14 @@ def run_motion(
         speed: share of the motion's own speed; ways to a destination have theirs.
         lease: how long the arm moves on when this process is gone [s].
         log_frames: whether every frame of the fieldbus is kept in `can.log`, too, in candump's format.
+        begin: called when nothing that is known without the arm stands against the run, and its folder exists.
         tell: called with each state that is entered.
         stop_requested: asked several times a second.
 
     Raises:
-        UsageError: the folder exists.
+        UsageError: the run folder exists or cannot be made, or the state folder cannot be written; nothing has moved.
         MotionRefused: nothing has moved; a fault that nobody has acknowledged is a reason too.
-        ArmFault: a fault stopped the motion; it stays latched until `FaultFile.acknowledge`.
+        ArmFault: a fault stopped the motion, the first of those that stay latched until `FaultFile.acknowledge`.
         DriverError: the arm cannot be had.
         RecordingError: the recording failed, which has stopped the arm.
     """
@@ -96,16 +88,20 @@ def run_motion(
     if folder.exists():
         raise UsageError(f"{folder}: exists already; give a folder that does not")
     model = arm_model(config)
+    subject = subject_of(model, motion if isinstance(motion, Excitation) else None, None)
+    ticket.require_valid_for(ticket.with_arm(subject), datetime.now(UTC))
+    require_place(folder)
+    require_writable(arm_folder(state, config.name))
     clock = make_arm(config).clock
-    folder.mkdir(parents=True)
+    try:
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise UsageError(f"{folder}: cannot be made: {error.strerror}") from None
     excitation = motion.to_json() if isinstance(motion, Excitation) else None
     name = motion.name if isinstance(motion, Excitation) else motion.value
     speed = speed if isinstance(motion, Excitation) else HOMING_SPEED
-    write_ticket(folder / "ticket.json", ticket)
-    write_atomically(folder / "arm.json", config.model_dump_json(indent=1) + "\n")
     attachments = {"arm.json": config.model_dump_json(indent=1).encode()}
     if excitation is not None:
-        write_atomically(folder / "excitation.json", excitation + "\n")
         attachments["excitation.json"] = excitation.encode()
     metadata = {"arm": config.name, "arm_sha256": config.sha256, "motion": name, "speed": repr(speed)}
     recording = folder / "run.mcap"
@@ -132,110 +128,37 @@ def run_motion(
         "speed": speed,
         "log_frames": log_frames,
     }
+    started = False
     try:
+        write_ticket(folder / "ticket.json", ticket)
+        for file, content in attachments.items():
+            write_atomically(folder / file, content.decode() + "\n")
+        begin()
         with recorder:
-            ending = _watched(request, astuple(recorder.ends), lease, tell, stop_requested)
+            started = True
+            ending = watched(request, astuple(recorder.ends), lease, tell, stop_requested)
             ending.raise_for(faults)
     except BaseException as error:
-        write_ending(folder, {"error": str(error) or type(error).__name__})
+        if started and not (isinstance(error, MotionRefused) and not faults.latched()):
+            _keep(folder, error)
+        else:
+            shutil.rmtree(folder, ignore_errors=True)
         raise
-    finally:
-        write_manifest(folder)
+    write_manifest(folder)
     return Ran(folder, ending.report)
 
 
-@dataclass
-class _Ending:
-    """What the motion process said at last."""
+def _keep(folder: Path, error: BaseException) -> None:
+    """Write down how a run ended, unless the motion process has, and what is in its folder."""
 
-    report: dict[str, Any]
-    error: dict[str, str]
-    code: int | None = None
+    def ending() -> None:
+        # One that the motion process called good, but whose recording could not be finished, was not.
+        if isinstance(error, RecordingError) or not (folder / ENDED).exists():
+            cause = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or type(error).__name__
+            write_ending(folder, {"error": cause})
 
-    def raise_for(self, faults: FaultFile) -> None:
-        """Turn what went wrong into the error that it was."""
-        if self.report:
-            return
-        kind, message = self.error.get("kind"), self.error.get("message", "")
-        if kind == ArmFault.__name__:
-            code = self.error["code"]
-            raise ArmFault(code, message.removeprefix(f"{code}: "))
-        if kind is not None:
-            raise _KINDS.get(kind, ArmError)(message)
-        died = f"the motion process died without a word ({self._how()})"
-        if UNFINISHED not in faults.latched():
-            raise ArmError(f"{died} before it took the arm; nothing has moved")
-        raise ArmFault(
-            UNFINISHED, f"{died}; drives that hear nothing stop by themselves: look at the arm before `ident ack`"
-        )
-
-    def _how(self) -> str:
-        if self.code is not None and self.code < 0:
-            return signal.Signals(-self.code).name
-        return f"exit code {self.code}"
-
-
-def _watched(
-    request: dict[str, Any],
-    ends: tuple[int, ...],
-    lease: float,
-    tell: Callable[[str], None],
-    stop_requested: Callable[[], bool],
-) -> _Ending:
-    """Start the motion process, keep its lease, hear what it says until it ends."""
-    paths = os.pathsep.join(path or str(Path.cwd()) for path in sys.path)
-    environment = {**os.environ, "PYTHONPATH": paths, "OPENBLAS_NUM_THREADS": "1"}
-    command = [sys.executable, "-P", "-m", "ident_service.motion.process"]
-    ending = _Ending({}, {})
-    # Another session, so that what a terminal or a service manager sends to our group does not reach it.
-    with subprocess.Popen(  # noqa: S603 - our own interpreter and module
-        command,
-        bufsize=0,  # a line that waits in a buffer is one that select does not see
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        pass_fds=ends,
-        env=environment,
-        start_new_session=True,
-    ) as process:
-        if process.stdin is None or process.stdout is None:
-            raise AssertionError("pipes were asked for")
-        with suppress(BrokenPipeError):
-            process.stdin.write(json.dumps({**request, "ends": ends}).encode() + b"\n")
-            process.stdin.flush()
-        controls: ControlFile | None = None
-        asked = False
+    for write in (ending, lambda: write_manifest(folder)):
         try:
-            while True:
-                if controls is not None:
-                    controls.renew()
-                    if stop_requested() and not asked:
-                        asked = True
-                        controls.ask_stop()
-                ready, _, _ = select.select([process.stdout], [], [], _RENEW_SHARE * lease)
-                if not ready:
-                    continue
-                line = process.stdout.readline()
-                if not line.endswith(b"\n"):  # the end, or what was killed in the middle of a word
-                    break
-                said = json.loads(line)
-                if "pid" in said:
-                    with suppress(UsageError):  # it died at once, which is heard next
-                        controls = ControlFile.reach(Path(request["arm_folder"]) / CONTROLS)
-                if "state" in said:
-                    tell(said["state"])
-                ending.report = said.get("report", ending.report)
-                ending.error = said.get("error", ending.error)
-        except BaseException:
-            process.stdin.close()  # nobody asks for this motion any more
-            if controls is not None:
-                controls.ask_stop()
-            try:
-                process.wait(_LAST_WORDS)
-            except subprocess.TimeoutExpired:
-                process.kill()  # it hangs, and the drives have heard nothing for as long
-            raise
-        finally:
-            if controls is not None:
-                controls.close()
-        ending.code = process.wait()
-    return ending
+            write()
+        except (UsageError, OSError) as second:
+            error.add_note(str(second))

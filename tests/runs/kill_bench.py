@@ -204,7 +204,9 @@ class Lane:
         samples, last_ns = self._readable(kill, run, capsys)
         if kill.word is not None:
             assert moved
-        if kill.victim != "parent":
+        if not run.exists():
+            assert not moved
+        elif kill.victim != "parent":
             assert "error" in json.loads((run / "ended.json").read_text())
             _check_manifest(run)
         return Outcome(moved, status, samples, (killed_ns - last_ns) * 1e-9 if self._real and samples else 0.0)

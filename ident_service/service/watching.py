@@ -1,0 +1,223 @@
+"""The motion process from its parent's side: started, its lease kept, heard until it ends; and what it said at last.
+
+What ends this process closes the pipe, and what makes it hang lets the lease lapse; either stops the arm. An interrupt
+while somebody has the arm ends nothing at once: it asks for a controlled stop, and the end of that is waited for.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ident_service.errors import ArmError, ArmFault, DriverError, IdentError, MotionRefused, UsageError
+from ident_service.motion.control_file import ControlFile
+from ident_service.motion.fault_file import CONTROLS, UNFINISHED, FaultFile
+
+_RENEW_SHARE = 0.25  # of the lease
+_LAST_WORDS = 30.0  # s for a process that was told to stop
+_KINDS: dict[str, type[IdentError]] = {
+    kind.__name__: kind for kind in (MotionRefused, DriverError, UsageError, ArmError)
+}
+
+
+@dataclass
+class Ending:
+    """What the motion process said at last.
+
+    Attributes:
+        report: of a run that was done or stopped, else empty.
+        error: kind, message, and code of a fault; else empty.
+        code: exit code, None while it runs.
+    """
+
+    report: dict[str, Any]
+    error: dict[str, str]
+    code: int | None = None
+
+    @property
+    def heard(self) -> bool:
+        """Whether it had a last word."""
+        return bool(self.report or self.error)
+
+    def raise_for(self, faults: FaultFile) -> None:
+        """Turn what went wrong into the error that it was; faults that followed the first one are its notes.
+
+        Raises:
+            ArmFault: the fault that was latched first, which is the cause of the others.
+            MotionRefused, DriverError, UsageError, ArmError: as the motion process said.
+        """
+        if self.report:
+            return
+        kind, message = self.error.get("kind"), self.error.get("message", "")
+        latched = faults.latched()
+        if kind is None:
+            raise self._died(latched)
+        error: IdentError
+        if kind == ArmFault.__name__:
+            code = self.error["code"]
+            # A fault that could not be latched, because that disk is full too, is still the fault.
+            first, cause = next(iter(latched.items()), (code, message.removeprefix(f"{code}: ")))
+            error = ArmFault(first, cause)
+            latched.pop(first, None)
+        else:
+            error = _KINDS.get(kind, ArmError)(message)
+        for code, cause in latched.items():
+            error.add_note(f"latched, too: {code}: {cause}")
+        raise error
+
+    def _died(self, latched: dict[str, str]) -> ArmError:
+        died = f"the motion process died without a word ({self._how()})"
+        if UNFINISHED not in latched:
+            return ArmError(f"{died} before it took the arm; nothing has moved")
+        return ArmFault(
+            UNFINISHED, f"{died}; drives that hear nothing stop by themselves: look at the arm before `ident ack`"
+        )
+
+    def _how(self) -> str:
+        if self.code is not None and self.code < 0:
+            return signal.Signals(-self.code).name
+        return f"exit code {self.code}"
+
+
+def watched(
+    request: dict[str, Any],
+    ends: tuple[int, ...],
+    lease: float,
+    tell: Callable[[str], None],
+    stop_requested: Callable[[], bool],
+) -> Ending:
+    """Start the motion process, keep its lease, hear what it says until it ends.
+
+    Args:
+        request: what it is to do (`motion/process.py`).
+        ends: file descriptors of the ring, for a sink.
+        lease: how long the arm moves on when this process is gone [s].
+        tell: called with each state that is entered.
+        stop_requested: asked several times per lease.
+
+    Raises:
+        KeyboardInterrupt: it came before the arm was taken, or the motion process did not end after it.
+    """
+    paths = os.pathsep.join(path or str(Path.cwd()) for path in sys.path)
+    environment = {**os.environ, "PYTHONPATH": paths, "OPENBLAS_NUM_THREADS": "1"}
+    command = [sys.executable, "-P", "-m", "ident_service.motion.process"]
+    # Another session, so that what a terminal or a service manager sends to our group does not reach it.
+    with subprocess.Popen(  # noqa: S603 - our own interpreter and module
+        command,
+        bufsize=0,  # a line that waits in a buffer is one that select does not see
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        pass_fds=ends,
+        env=environment,
+        start_new_session=True,
+    ) as process:
+        if process.stdin is None or process.stdout is None:
+            raise AssertionError("pipes were asked for")
+        with suppress(BrokenPipeError):
+            process.stdin.write(json.dumps({**request, "ends": ends}).encode() + b"\n")
+            process.stdin.flush()
+        watch = _Watch(process, Path(request["arm_folder"]) / CONTROLS, lease, tell, stop_requested)
+        try:
+            try:
+                watch.hear()
+            except KeyboardInterrupt:
+                if not watch.hear_the_end():
+                    raise
+        except BaseException:
+            process.stdin.close()  # nobody asks for this motion any more
+            watch.ask_stop()
+            try:
+                process.wait(_LAST_WORDS)
+            except subprocess.TimeoutExpired:
+                process.kill()  # it hangs, and the drives have heard nothing for as long
+            raise
+        finally:
+            watch.close()
+        watch.ending.code = process.wait()
+    return watch.ending
+
+
+class _Watch:
+    """Hears one motion process."""
+
+    def __init__(
+        self,
+        process: subprocess.Popen[bytes],
+        path: Path,
+        lease: float,
+        tell: Callable[[str], None],
+        stop_requested: Callable[[], bool],
+    ) -> None:
+        self.ending = Ending({}, {})
+        self._process, self._path, self._lease = process, path, lease
+        self._tell, self._stop_requested = tell, stop_requested
+        self._controls: ControlFile | None = None
+        self._asked = False
+
+    def hear(self, until: float = float("inf")) -> bool:
+        """Hear it, and renew its lease, until it ends or the time has come [s]; whether it ended."""
+        stdout = self._process.stdout
+        assert stdout is not None  # noqa: S101 - asked for by `watched`
+        while time.monotonic() < until:
+            if self._controls is not None:
+                self._controls.renew()
+                if not self._asked and self._stop_requested():
+                    self.ask_stop()
+            ready, _, _ = select.select([stdout], [], [], _RENEW_SHARE * self._lease)
+            if not ready:
+                continue
+            line = stdout.readline()
+            if not line.endswith(b"\n"):  # the end, or what was killed in the middle of a word
+                return True
+            with suppress(ValueError):  # the rest of a line whose beginning went with an interrupt
+                self._take(json.loads(line))
+        return False
+
+    def hear_the_end(self) -> bool:
+        """After an interrupt: wait, but not for ever, for the end of the stop; whether it was heard."""
+        if self._controls is None:
+            return False  # nobody has the arm yet
+        with _deaf():
+            self.ask_stop()
+            self._tell(f"interrupted: the arm is being stopped under control; waiting {_LAST_WORDS:g} s at most")
+            return self.hear(time.monotonic() + _LAST_WORDS) and self.ending.heard
+
+    def ask_stop(self) -> None:
+        """Ask for a controlled stop, where somebody has the arm."""
+        if self._controls is not None:
+            self._asked = True
+            self._controls.ask_stop()
+
+    def close(self) -> None:
+        """Let the controls go."""
+        if self._controls is not None:
+            self._controls.close()
+
+    def _take(self, said: dict[str, Any]) -> None:
+        if "pid" in said:
+            with suppress(UsageError):  # it died at once, which is heard next
+                self._controls = ControlFile.reach(self._path)
+        self.ending.report = said.get("report", self.ending.report)
+        self.ending.error = said.get("error", self.ending.error)
+        if "state" in said:
+            self._tell(said["state"])
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """Without Ctrl-C, which has been understood; it was heard, so this is the main thread."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,85 @@
+"""Words that nobody reads any more, and signals that ask for a stop."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from argparse import Namespace
+from collections.abc import Iterator
+
+import pytest
+
+from ident_service.cli.answer import StopOnSignal, print_answer, tell
+
+TALK = """
+import sys
+from argparse import Namespace
+from ident_service.cli.answer import print_answer, tell
+words = Namespace(json=False)
+for _ in range(3):
+    tell(words, "exciting")
+print_answer(words, 3, "done", {})
+sys.exit(3)
+"""
+
+
+def test_a_reader_that_has_gone_changes_nothing() -> None:
+    end, other = os.pipe()
+    os.close(end)
+    done = subprocess.run([sys.executable, "-c", TALK], stdout=other, stderr=subprocess.PIPE, check=False)
+    os.close(other)
+    assert (done.returncode, done.stderr) == (3, b"")
+
+
+def test_a_closed_stdout_changes_nothing() -> None:
+    done = subprocess.run(
+        ["/bin/sh", "-c", f"exec '{sys.executable}' -c '{TALK}' >&-"], stderr=subprocess.PIPE, check=False
+    )
+    assert (done.returncode, done.stderr) == (3, b"")
+
+
+def test_a_full_disk_loses_no_answer_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:
+    with open("/dev/full", "w") as full:  # noqa: PTH123 - a device
+        monkeypatch.setattr(sys, "stdout", full)
+        tell(Namespace(json=False), "exciting")
+        with pytest.raises(OSError, match="No space left"):
+            print_answer(Namespace(json=False), 0, "figures", {})
+        os.dup2(os.open(os.devnull, os.O_WRONLY), full.fileno())
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_first_signal_asks_for_a_stop(number: signal.Signals) -> None:
+    before = signal.getsignal(number)
+    stopping = StopOnSignal()
+    with stopping:
+        assert not stopping.requested()
+        signal.raise_signal(number)
+        assert stopping.requested()
+    assert signal.getsignal(number) is before
+
+
+def test_a_second_ctrl_c_interrupts_and_a_second_hangup_does_not() -> None:
+    with StopOnSignal():
+        for _ in range(3):
+            signal.raise_signal(signal.SIGHUP)
+        signal.raise_signal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+
+@pytest.mark.usefixtures("nohup")
+def test_hangups_that_are_ignored_stay_so() -> None:
+    stopping = StopOnSignal()
+    with stopping:
+        signal.raise_signal(signal.SIGHUP)
+        assert not stopping.requested()
+    assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+
+
+@pytest.fixture
+def nohup() -> Iterator[None]:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    yield
+    signal.signal(signal.SIGHUP, before)
