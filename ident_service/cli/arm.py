@@ -97,6 +97,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
     from ident_service.motion.preflight_check import Verdict
     from ident_service.motion.realtime import asked
     from ident_service.motion.stoppable import StoppableArm
+    from ident_service.record.files import require_writable
     from ident_service.service.arm_state import control_path, fault_file, ticket_path
     from ident_service.service.preflight import ticket_document, ticket_text, write_ticket
 
@@ -113,6 +114,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
     state = state_folder(arguments)
     path, faults = ticket_path(state, config.name), fault_file(state, config.name)
     faults.require_none(faults.latched())
+    require_writable(path.parent)
     arm, model = make_arm(config), arm_model(config)
     # Whoever looks for the one who moves the arm finds this process, and its stop ends the preflight.
     with ControlFile.take(control_path(state, config.name), None) as controls:
