@@ -12,6 +12,7 @@ told beforehand `setup.py`.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -32,7 +33,7 @@ from drivers.canopen.profile import Write, bus_profiles
 from drivers.canopen.sdo import Objects
 from drivers.canopen.session_log import SessionLog, logged_links, require_format
 from drivers.canopen.setup import Setup, configure, identify
-from drivers.canopen.words import DISABLE_VOLTAGE, QUICK_STOP, NmtCommand, axis_status, joint_status
+from drivers.canopen.words import DISABLE_VOLTAGE, QUICK_STOP, DriveState, NmtCommand, axis_status, joint_status
 from drivers.clock import Clock, RealClock, VirtualClock
 from drivers.status import AxisEvent, AxisEventCode, AxisStatus
 from ident_service.config.canopen import CanopenDriver
@@ -41,6 +42,8 @@ from ident_service.errors import DriverError
 
 LIMIT_SLACK = 0.05  # rad or m beyond the joints' limits that the drives keep by themselves
 _HEARTBEAT_CHECK = 10  # cycles between two looks at everybody's heartbeat
+_QUICK_STOP = 1.0  # s that drives may take for a quick stop before the arm is left to them
+_ENDING = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP, DriveState.FAULT_REACTION)
 _FAREWELL = 5  # cycles after the last control words, in which drives say that they are off
 
 
@@ -84,7 +87,7 @@ class CanopenArm(Arm):
         self._reset_state()
 
     def _reset_state(self) -> None:
-        self._enabled = self._streaming = False
+        self._enabled = self._streaming = self._braking = False
         self._stops = 0  # told so far
         self._counts = [0] * len(self._limits)
         self._acting = _frozen(np.zeros(len(self._limits)))
@@ -162,7 +165,7 @@ class CanopenArm(Arm):
         """
         buses = self._open()
         self._no_torque()
-        self._streaming = True
+        self._streaming, self._braking = True, False
         try:
             reports = self._driver.status.inhibit, self._driver.status.period
             steps = Enabling(buses.drives, self._names, self._driver.bring_up, self.clock.now_ns(), reports)
@@ -210,6 +213,7 @@ class CanopenArm(Arm):
         """Tell every drive to let go, or to stop by itself; never raises. What was sent before acts until it does."""
         word = QUICK_STOP if kind is StopKind.QUICK_STOP else DISABLE_VOLTAGE
         self._enabled = False
+        self._braking = kind is StopKind.QUICK_STOP
         self._stops += 1
         self._no_torque()
         if self._buses is not None:
@@ -219,8 +223,12 @@ class CanopenArm(Arm):
                     self._buses.control(number, word)
 
     def close(self) -> None:
-        """Torque off, drives as they were powered up, buses free; any number of times."""
-        self.stop(StopKind.TORQUE_OFF)
+        """Torque off, drives as they were powered up, buses free; any number of times.
+
+        A quick stop is not cut short by it: drives that are told to let go in the midst of one would let the arm fall.
+        """
+        if not self._braking:
+            self.stop(StopKind.TORQUE_OFF)
         if self._buses is not None:
             self._leave(self._buses)
             self._buses.close()
@@ -234,8 +242,12 @@ class CanopenArm(Arm):
     def _leave(self, buses: Buses) -> None:
         """Let drives that are off forget that a host will be missed; the others shall miss it. Never raises."""
         with suppress(Exception):
-            for _ in range(_FAREWELL):
+            last = self.clock.now_ns() + round(_QUICK_STOP * 1e9)
+            for cycle in itertools.count(1):
                 buses.cycle(self._counts if self._streaming else None)
+                brakes = self._braking and any(drive.state in _ENDING for drive in buses.drives)
+                if cycle >= _FAREWELL and not (brakes and self.clock.now_ns() < last):
+                    break
         there: dict[int, Objects] = {}  # by bus
         for number, drive in enumerate(self._driver.drives):
             with suppress(Exception):
