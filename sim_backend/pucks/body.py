@@ -102,7 +102,7 @@ class Body:
                 self.watch(end)
 
     def support(self, now_ns: int) -> None:
-        """Somebody holds the arm where it stands, until all motors are powered again."""
+        """Somebody holds the arm where it stands, until all motors are powered and given torque again."""
         if not self.supported:
             self.advance(now_ns)
             self.plant.rest()

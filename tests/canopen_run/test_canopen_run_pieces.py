@@ -24,6 +24,8 @@ from sim_backend.pucks.process import Emulated, emulate
 
 IDENTITY = bytes([0x40, 0x00, 0x10, 0, 0, 0, 0, 0])
 
+PUSH = np.array([0.1, 0.1])  # N m, next to nothing, but torque
+
 
 def behind(folder: Path) -> tuple[LockStepArm, CanopenArm]:
     config = load_arm(write(folder, canopen(described("held", 250.0, 225.0, 30.0), {"interface": "lock_step"}, 1)))
@@ -50,6 +52,8 @@ def test_an_arm_whose_host_leaves_in_order_is_held_where_it_stands(tmp_path: Pat
     body = drives.emulator.body
     with arm:
         arm.enable()
+        arm.exchange(PUSH)
+        arm.exchange(PUSH)
         assert not body.supported
         for _ in range(20):
             arm.exchange(np.zeros(2))
@@ -58,8 +62,11 @@ def test_an_arm_whose_host_leaves_in_order_is_held_where_it_stands(tmp_path: Pat
     stands = body.plant.position
     drives.settle(drives.clock.now_ns() + 2_000_000_000)
     np.testing.assert_array_equal(body.plant.position, stands)
-    with arm:  # and is let go when it is powered again
+    with arm:  # and is let go when it is given torque again
         arm.enable()
+        assert body.supported
+        arm.exchange(PUSH)
+        arm.exchange(PUSH)
         assert not body.supported
 
 
@@ -68,7 +75,7 @@ def test_an_arm_whose_host_falls_silent_sinks(tmp_path: Path) -> None:
     body = drives.emulator.body
     arm.open()
     arm.enable()
-    arm.exchange(np.zeros(2))
+    arm.exchange(PUSH)
     before = body.plant.position
     drives.settle(drives.clock.now_ns() + 2_000_000_000)
     assert all(state.startswith("pre operational") for state in drives.emulator.states)

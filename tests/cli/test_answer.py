@@ -25,6 +25,14 @@ sys.exit(3)
 """
 
 
+@pytest.fixture(autouse=True)
+def hangups_are_heard() -> Iterator[None]:
+    """Whoever runs the tests may have told them to ignore hangups, as `nohup` does."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 def test_a_reader_that_has_gone_changes_nothing() -> None:
     end, other = os.pipe()
     os.close(end)
