@@ -19,7 +19,7 @@ from ident_service.record.recorder_process import RecorderProcess
 from ident_service.record.ring import RingReader, RingWriter, create_ring
 
 _JOINTS = 7
-_SECONDS = float(os.environ.get("IDENT_BENCH_RING_SECONDS", "20"))
+_SECONDS = float(os.environ.get("IDENT_BENCH_RING_SECONDS", "60"))
 _PERIOD_NS = 1_000_000
 
 

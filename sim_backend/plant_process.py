@@ -280,11 +280,21 @@ def start_document(
     }
 
 
+def _leave_the_core() -> None:
+    """Let the loop have its core: a plant that inherits it stands still whenever the loop computes, as no arm does."""
+    inherited, others = os.sched_getaffinity(0), set(range(os.cpu_count() or 1))
+    others -= inherited
+    if len(inherited) == 1 and others:
+        with suppress(OSError):
+            os.sched_setaffinity(0, others)
+
+
 def main() -> int:
     """Read one line of JSON from standard input, serve, and end when told to or abandoned.
 
     Says `ready`, `in use` (of the address) or an error, in one line on standard output.
     """
+    _leave_the_core()
     line = b""
     while not line.endswith(b"\n"):
         if not (more := os.read(0, 65536)):
