@@ -246,6 +246,8 @@ class CanopenArm(Arm):
             for cycle in itertools.count(1):
                 buses.cycle(self._counts if self._streaming else None)
                 brakes = self._braking and any(drive.state in _ENDING for drive in buses.drives)
+                if brakes and cycle % _FAREWELL == 0:
+                    self.stop(StopKind.QUICK_STOP)  # again: the first may have been lost
                 if cycle >= _FAREWELL and not (brakes and self.clock.now_ns() < last):
                     break
         there: dict[int, Objects] = {}  # by bus

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.emulated_arms import weightless_config
+from helpers.emulated_arms import tapped, weightless_config
 
 from drivers.arm import StopKind
 from drivers.canopen.arm import CanopenArm
@@ -34,6 +34,23 @@ def test_a_quick_stop_is_not_cut_short_by_closing() -> None:
     moving, after = speeds(StopKind.QUICK_STOP)
     assert (np.abs(moving) > 0.1).all()
     assert (np.abs(after) < 0.7 * np.abs(moving)).all()
+
+
+def test_a_quick_stop_that_was_lost_is_told_again() -> None:
+    config = weightless_config()
+    behind = LockStepArm(config)
+    truths: list[Truth] = []
+    behind.emulator.observer = truths.append
+    taps = tapped(behind, config)
+    with CanopenArm(config, lambda _: taps) as arm:
+        arm.enable()
+        for _ in range(CYCLES):
+            arm.exchange(PUSH)
+        moving, send = truths[-1].velocity, taps[0].send
+        taps[0].send = lambda frame: None  # type: ignore[method-assign]
+        arm.stop(StopKind.QUICK_STOP)
+        taps[0].send = send  # type: ignore[method-assign]
+    assert (np.abs(truths[-1].velocity) < 0.7 * np.abs(moving)).all()
 
 
 def test_without_torque_the_arm_coasts() -> None:
