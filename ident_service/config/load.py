@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from ident_service.config import canopen, design, recording, simulation, workspace
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.drivers import SimulatedDriver
-from ident_service.config.quantities import Section
+from ident_service.config.quantities import MAX_FILE_BYTES, Section
 from ident_service.config.recording import RecordingFormat
 from ident_service.config.schema import ArmConfig, DHTable, FourierMotion
 from ident_service.config.shipped import shipped_arms as shipped_arms
@@ -53,6 +53,24 @@ def load_arm(arm: str | Path) -> ArmConfig:
     if problems:
         raise ConfigError(problems)
     return config
+
+
+def arm_from_json(path: Path) -> ArmConfig:
+    """Read a description that a folder of results or a recording keeps: whole, without the files it was made from.
+
+    Raises:
+        UsageError: no such file.
+        ConfigError: not a description that this version knows, with the first mistakes.
+    """
+    if not path.is_file():
+        raise UsageError(f"no such file: {path}")
+    if path.stat().st_size > 4 * MAX_FILE_BYTES:
+        raise ConfigError([Problem(path, 1, 1, f"larger than {4 * MAX_FILE_BYTES} bytes")])
+    try:
+        return ArmConfig.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        places = [(".".join(map(str, mistake["loc"])), mistake["msg"]) for mistake in error.errors(include_url=False)]
+        raise ConfigError([Problem(path, 1, 1, f"{where}: {said}") for where, said in places[:10]]) from None
 
 
 def load_recording_format(path: str | Path) -> RecordingFormat:

@@ -144,7 +144,6 @@ def simulate(
         estimate = identify(model, recordings[:1], recordings[1:], set_name=set_name)
         scored = score(estimate, truth, observed, equations(recordings[1], model, estimate.base))
         write_results(staging, estimate)
-        write_atomically(staging / "arm.json", config.model_dump_json(indent=1) + "\n")
         write_atomically(staging / "score.json", json.dumps(score_document(scored), indent=1) + "\n")
         write_manifest(staging)
     return Commissioning(folder, estimate, (reports[0], reports[1]), scored)

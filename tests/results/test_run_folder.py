@@ -12,26 +12,26 @@ import pinocchio as pin
 import pytest
 from helpers.random_arms import bodies_of, reference_model
 
-from ident_service.errors import ModelError
+from ident_service.errors import ConfigError, ModelError, ParameterError, UsageError
 from ident_service.estimation.identify import Estimate
 from ident_service.results import exports
 from ident_service.results.exports import write_urdf
 from ident_service.results.parameter_file import read_parameters
-from ident_service.results.run_folder import write_manifest, write_results
+from ident_service.results.run_folder import read_results, write_manifest, write_results
 from ident_service.results.summary import parameter_table, summary
 
 
 def test_a_feasible_estimate_s_files(tmp_path: Path, feasible_estimate: Estimate) -> None:
     names = write_results(tmp_path, feasible_estimate)
     assert sorted(names) == sorted(path.name for path in tmp_path.iterdir())
-    assert sorted(names) == ["identified.urdf", "parameters.json", "report.txt"]
+    assert sorted(names) == ["arm.json", "identified.urdf", "parameters.json", "report.txt"]
     read = read_parameters(tmp_path / "parameters.json", feasible_estimate.model.layout.names)
     np.testing.assert_array_equal(read.values, feasible_estimate.beta)
 
 
 def test_an_estimate_no_body_has_comes_without_a_urdf(tmp_path: Path, free_estimate: Estimate) -> None:
-    assert sorted(write_results(tmp_path, free_estimate)) == ["parameters.json", "report.txt"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["parameters.json", "report.txt"]
+    assert sorted(write_results(tmp_path, free_estimate)) == ["arm.json", "parameters.json", "report.txt"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["arm.json", "parameters.json", "report.txt"]
     assert "INFEASIBLE" in (tmp_path / "report.txt").read_text()
 
 
@@ -90,7 +90,7 @@ def test_the_manifest_names_every_file_with_its_hash(tmp_path: Path, feasible_es
     manifest = json.loads((tmp_path / "manifest.json").read_text())
     wanted = {
         name: hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
-        for name in ("identified.urdf", "parameters.json", "report.txt")
+        for name in ("arm.json", "identified.urdf", "parameters.json", "report.txt")
     }
     assert manifest["files"] == wanted
     assert (manifest["format"], manifest["version"]) == ("ident-run", 1)
@@ -127,3 +127,72 @@ def test_the_report_lists_every_parameter_and_the_doubtful_ones_twice(feasible_e
     assert len(table) == size + 1
     assert table[4].startswith(expression)
     assert "inf" in table[4]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, feasible_estimate: Estimate) -> Path:
+    """A folder of results as `ident identify` leaves it."""
+    made = tmp_path / "results"
+    made.mkdir()
+    write_results(made, feasible_estimate)
+    write_manifest(made)
+    return made
+
+
+def test_a_folder_is_read_as_it_was_written(folder: Path, feasible_estimate: Estimate) -> None:
+    read = read_results(folder)
+    assert read.config == feasible_estimate.model.config
+    np.testing.assert_array_equal(read.parameters.values, feasible_estimate.beta)
+    assert set(read.sha256) == {"arm.json", "identified.urdf", "parameters.json", "report.txt"}
+
+
+def test_a_folder_that_was_torn_or_changed_is_refused(folder: Path) -> None:
+    text = (folder / "identified.urdf").read_text()
+    (folder / "identified.urdf").write_text(text[:-5])
+    with pytest.raises(ParameterError, match=r"identified\.urdf: not what the manifest names; it was changed, or is"):
+        read_results(folder)
+    (folder / "identified.urdf").unlink()
+    with pytest.raises(ParameterError, match=r"identified\.urdf: named by the manifest, but not there"):
+        read_results(folder)
+
+
+@pytest.mark.parametrize(
+    ("manifest", "reason"),
+    [
+        ("{", "not a manifest"),
+        ("[]", "not a manifest"),
+        ('{"format": "ident-run", "files": []}', "not a manifest"),
+        ('{"format": "other", "files": {}}', "not the manifest of a run"),
+        ('{"format": "ident-run", "files": {"../parameters.json": ""}}', "not the manifest of a run"),
+        ('{"format": "ident-run", "files": {"parameters.json": 3}}', "not the manifest of a run"),
+        ("[" * 100_000, "not a manifest"),
+    ],
+)
+def test_a_foreign_manifest_is_refused(folder: Path, manifest: str, reason: str) -> None:
+    (folder / "manifest.json").write_text(manifest)
+    with pytest.raises(ParameterError, match=reason):
+        read_results(folder)
+
+
+def test_a_folder_without_results_is_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no such folder"):
+        read_results(tmp_path / "nowhere")
+    (folder / "parameters.json").unlink()
+    write_manifest(folder)
+    with pytest.raises(UsageError, match=r"parameters\.json is not among its files; it comes from `ident identify`"):
+        read_results(folder)
+    (folder / "manifest.json").unlink()
+    with pytest.raises(UsageError, match=r"no manifest\.json in it"):
+        read_results(folder)
+
+
+def test_parameters_of_another_arm_are_refused(folder: Path, feasible_estimate: Estimate) -> None:
+    other = feasible_estimate.model.config.model_copy(update={"name": "another"})
+    (folder / "arm.json").write_text(other.model_dump_json())
+    write_manifest(folder)
+    with pytest.raises(ParameterError, match=r"identified for another arm than arm\.json describes"):
+        read_results(folder)
+    (folder / "arm.json").write_text('{"format": "ident-arm"}')
+    write_manifest(folder)
+    with pytest.raises(ConfigError, match=r"arm\.json:1:1: version: Field required"):
+        read_results(folder)
