@@ -187,7 +187,8 @@ class Findings:
         if rule.reaction is Reaction.WARN:
             self.warnings[code] = self.warnings.get(code, 0) + 1
             recent = self._recent.setdefault(code, deque(maxlen=rule.often + 1))
-            recent.append(self.cycle)
+            if not recent or recent[-1] != self.cycle:  # seven drives that are late once are late in one cycle
+                recent.append(self.cycle)
             if len(recent) > rule.often and recent[0] > self.cycle - WINDOW:
                 what = f"{code} in more than {rule.often} of the last {WINDOW} cycles ({what})"
                 code, rule = rule.becomes, FAULTS[rule.becomes]

@@ -8,22 +8,26 @@ what. Whatever happens, the arm is without torque and closed afterwards.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from datetime import timedelta
 
 import numpy as np
 
 from drivers.arm import Arm, ArmDescription, Sample, StopKind
 from drivers.clock import Clock, RealClock
-from ident_service.config.limits import MotionLimits, motion_limits
+from ident_service.config.limits import MotionLimits, Vector, motion_limits
 from ident_service.errors import ArmError, ArmFault, ModelError, MotionRefused
 from ident_service.excitation.excitation import Excitation
 from ident_service.excitation.following import ExpectedFriction, expected_friction
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.rigid_body import InverseDynamics
+from ident_service.model.threads import one_blas_thread
+from ident_service.motion.attended import attended
 from ident_service.motion.control import ComputedTorque
 from ident_service.motion.outside import admitting, reachable
 from ident_service.motion.preflight_check import ABOUT_THE_MOTION, CODES, Check, Verdict, failed, skipped
 from ident_service.motion.preflight_direction import (
+    Stroke,
     answer,
     direction_check,
     follow_stroke,
@@ -32,9 +36,10 @@ from ident_service.motion.preflight_direction import (
     went_against,
     wrong_signs,
 )
-from ident_service.motion.preflight_gravity import HOLD, SETTLE, gravity_check, holdable
+from ident_service.motion.preflight_gravity import HOLD, SETTLE, differences, gravity_check, held_torque, holdable
 from ident_service.motion.preflight_gravity import REMEDY as GRAVITY_REMEDY
 from ident_service.motion.preflight_look import (
+    Looked,
     at_rest_check,
     identities_check,
     look,
@@ -51,9 +56,9 @@ from ident_service.motion.preflight_plan import (
     ways_check,
 )
 from ident_service.motion.preflight_remedy import remedy_of
-from ident_service.motion.preflight_session import Session
+from ident_service.motion.preflight_session import Rows, Session, trace_of
 from ident_service.motion.preflight_ticket import VALID, Ticket, new_ticket, subject_of
-from ident_service.motion.preflight_watchdog import Confirm, consent, watchdog_check
+from ident_service.motion.preflight_watchdog import Confirm, Consent, consent, watchdog_check
 from ident_service.motion.reference import hold, rest
 
 LOOK = 1.0  # s
@@ -63,6 +68,7 @@ _LOOK_AGAIN = 20  # cycles
 Tell = Callable[[Check], None]
 
 
+@one_blas_thread()  # a second one would run beside whoever has the other core, and be waited for
 def preflight(
     arm: Arm,
     model: ArmModel,
@@ -97,6 +103,18 @@ def preflight(
     flight.run()
     subject = subject_of(model, excitation, flight.described)
     return new_ticket(subject, flight.all_checks(), clock.now_ns() + clock.utc_offset_ns, valid)
+
+
+@dataclass(frozen=True)
+class _Gravity:
+    torque: Vector
+    limits: MotionLimits
+    friction: ExpectedFriction
+
+    def carried_by(self, held: Vector) -> bool:
+        """Whether the torque that holds the arm is near enough to the model's; without words, between two cycles."""
+        difference, most = differences(held, self.torque, self.limits, self.friction)
+        return bool((difference <= most).all())
 
 
 class _Ended(Exception):
@@ -157,12 +175,36 @@ class _Preflight:
         first = self.arm.exchange(None)
         cycles = max(_LEAST_CYCLES, round(self.look_seconds / period))
         looked = look(self.arm, cycles, period, self._load(first, limits, period))
-        if not self._passed(identities_check(self.described, self.model, limits, self.identities, looked)):
+        # Drives would take us for dead, above all while a person thinks.
+        with attended(self.arm):
+            agreed = self._agreed(looked, limits)
+        if agreed is None:
             return
-        # A motion begins inside the limits; a way home may begin as far outside as the arm may be led back from.
-        bounds = limits if self.excitation is not None else reachable(limits)
-        if not self._passed(at_rest_check(looked, self.model, bounds)):
+        # A person may have taken minutes to answer, and may have moved the arm meanwhile.
+        again = look(self.arm, _LOOK_AGAIN, period)
+        if (still := at_rest_check(again, self.model, self._bounds(limits))).verdict is not Verdict.PASSED:
+            self._passed(still)
             return
+        home = again.samples[-1].position
+        with attended(self.arm):
+            limits = limits if self.excitation is not None else admitting(home, limits)
+            friction = expected_friction(self.model, limits, self.model.config.design.friction_guess)
+            session = Session(self.arm, self.model, limits, period, home, friction)
+            planned = self._planned(session)
+        self._touched(session, planned, _Gravity(session.gravity, limits, friction), try_watchdog=agreed.given)
+
+    def _bounds(self, limits: MotionLimits) -> MotionLimits:
+        """A motion begins inside the limits; a way home may begin as far outside as the arm may be led back from."""
+        return limits if self.excitation is not None else reachable(limits)
+
+    def _agreed(self, looked: Looked, limits: MotionLimits) -> Consent | None:
+        """Judge what was seen of the arm; whether its watchdog may be tried, None where the arm may not be touched."""
+        if self.described is None or not self._passed(
+            identities_check(self.described, self.model, limits, self.identities, looked)
+        ):
+            return None
+        if not self._passed(at_rest_check(looked, self.model, self._bounds(limits))):
+            return None
         home = looked.samples[-1].position.copy()
         if self.excitation is None:
             self._passed(way_home_check(self.model, limits, home))
@@ -171,48 +213,66 @@ class _Preflight:
             self._passed(ways_check(self.model, limits, self.excitation, home))
         self._passed(rate_check(looked, self.arm.clock.lock_step))
         friction = expected_friction(self.model, limits, self.model.config.design.friction_guess)
-        session = Session(self.arm, self.model, limits, period, home, friction)
+        session = Session(self.arm, self.model, limits, 1.0 / self.described.rate, home, friction)
         self._passed(noise_check(looked, self.described, self.model, limits, session.mass))
         if any(c.verdict is Verdict.FAILED and c.code not in ABOUT_THE_MOTION for c in self.checks.values()):
-            return
+            return None
         if (impossible := holdable(session.gravity, self.model, limits)) is not None:
             self._passed(impossible)
-            return
+            return None
         agreed = consent(self.model, looked.samples[-1], self.confirm)
         if agreed.check is not None:
             self._passed(agreed.check)
-        # A person may have taken minutes to answer, and may have moved the arm meanwhile.
-        again = look(self.arm, _LOOK_AGAIN, period)
-        if (still := at_rest_check(again, self.model, bounds)).verdict is not Verdict.PASSED:
-            self._passed(still)
-            return
-        session = Session(self.arm, self.model, limits, period, again.samples[-1].position, friction)
-        if self._touched(session, limits, friction) and agreed.given:
-            self._passed(watchdog_check(self.arm, self.model, period))
-        else:
-            session.release()
+        return agreed
 
-    def _touched(self, session: Session, limits: MotionLimits, friction: ExpectedFriction) -> bool:
-        """Hold the arm and move it a little; True when it is held afterwards and all its joints are known."""
+    def _planned(self, session: Session) -> list[Stroke]:
+        """A small motion of every joint; none, and a failed check, where one has no room."""
         try:
             # Of a joint that stands outside its limits none leads farther out.
             room = admitting(session.home, motion_limits(self.model.config), 0.0)
-            planned = strokes(session, self.model, room)
+            return strokes(session, self.model, room)
         except (ModelError, MotionRefused) as error:
-            planned = []
             self._passed(failed("direction", str(error), "Move the arm by hand to where every joint has room."))
-        session.energise()
+            return []
+
+    def _touched(self, session: Session, planned: Sequence[Stroke], gravity: _Gravity, *, try_watchdog: bool) -> None:
+        """Hold the arm, move it a little, and fall silent; what came of it is judged when the arm has been let go."""
+        held: Rows = ()
+        moved: list[Rows] = []
+        silent: Check | None = None
         try:
-            trace = session.follow(hold(session.home), SETTLE + HOLD)
-            if not self._passed(gravity_check(trace, session.gravity, self.model, limits, friction)) or not planned:
-                return False
-            answers = [answer(follow_stroke(session, one), one, session) for one in planned]
-            session.follow(hold(session.home), SETTLE)
-            return self._passed(direction_check(answers, self.model))
-        except ArmFault as error:
+            session.energise()
+            held = session.follow(hold(session.home), SETTLE + HOLD)
+            if planned and gravity.carried_by(held_torque(held, session.period)):
+                moved += (follow_stroke(session, one) for one in planned)
+                session.follow(hold(session.home), SETTLE)
+                if try_watchdog:
+                    silent = watchdog_check(self.arm, self.model, session.period)
+            if silent is None:
+                session.release()
+        except ArmError as error:
             self.arm.stop(StopKind.TORQUE_OFF)
+            self._judged(session, gravity, held, planned, moved)
+            if not isinstance(error, ArmFault):
+                raise
             self._faulted(session, error)
             raise _Ended from error
+        self._judged(session, gravity, held, planned, moved)
+        if silent is not None:
+            self._passed(silent)
+
+    def _judged(
+        self, session: Session, gravity: _Gravity, held: Rows, planned: Sequence[Stroke], moved: Sequence[Rows]
+    ) -> None:
+        if held:
+            torque = held_torque(held, session.period)
+            self._passed(gravity_check(torque, gravity.torque, self.model, gravity.limits, gravity.friction))
+        if planned and len(moved) == len(planned):
+            answers = [
+                answer(trace_of(rows, session.period), stroke, session)
+                for rows, stroke in zip(moved, planned, strict=True)
+            ]
+            self._passed(direction_check(answers, self.model))
 
     def _load(self, first: Sample, limits: MotionLimits, period: float) -> Callable[[Sample], None]:
         """The control law of a run, computed and thrown away."""

@@ -22,7 +22,7 @@ from ident_service.errors import MotionRefused
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
 from ident_service.motion.preflight_check import Check, Measure, failed, judged, measures
-from ident_service.motion.preflight_session import BAND, Session, Trace
+from ident_service.motion.preflight_session import BAND, Rows, Session, Trace
 from ident_service.motion.preflight_stability import INERTIA
 from ident_service.motion.reference import Reference, Setpoint, rest
 from ident_service.motion.surroundings import way_clearance
@@ -116,8 +116,8 @@ def strokes(session: Session, model: ArmModel, limits: MotionLimits) -> list[Str
     return found
 
 
-def follow_stroke(session: Session, stroke: Stroke) -> Trace:
-    """Move one joint there and back, to learn its friction, and once more; the trace is of the last time.
+def follow_stroke(session: Session, stroke: Stroke) -> Rows:
+    """Move one joint there and back, to learn its friction, and once more; what is returned is of the last time.
 
     Raises:
         ArmFault, DriverError: from the loop.

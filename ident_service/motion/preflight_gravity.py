@@ -9,7 +9,7 @@ from ident_service.excitation.following import ExpectedFriction
 from ident_service.model.arm_model import ArmModel
 from ident_service.motion.preflight_check import Check, failed, joint_units, judged, measures
 from ident_service.motion.preflight_plan import HOLDABLE
-from ident_service.motion.preflight_session import Trace
+from ident_service.motion.preflight_session import Rows
 
 SETTLE, HOLD = 0.3, 1.0  # s before the mean is taken, and over which
 GRAVITY_ERROR = 0.1  # of the torque limit, beside Coulomb friction, which may carry as much of the weight
@@ -44,25 +44,41 @@ def holdable(gravity: Vector, model: ArmModel, limits: MotionLimits) -> Check | 
     )
 
 
+def held_torque(rows: Rows, period: float) -> Vector:
+    """Mean torque that held the arm, after it had settled [N m or N], shape (joints,).
+
+    Args:
+        rows: of holding still for `SETTLE + HOLD` seconds.
+        period: [s].
+    """
+    return np.asarray(np.mean([sample.torque for sample, _ in rows[round(SETTLE / period) :]], axis=0))
+
+
+def differences(
+    held: Vector, gravity: Vector, limits: MotionLimits, friction: ExpectedFriction
+) -> tuple[Vector, Vector]:
+    """How far two torques are apart, and how far they may be [N m or N], shape (joints,) each."""
+    return np.abs(held - gravity), GRAVITY_ERROR * limits.torque + friction.coulomb
+
+
 def gravity_check(
-    trace: Trace, gravity: Vector, model: ArmModel, limits: MotionLimits, friction: ExpectedFriction
+    held: Vector, gravity: Vector, model: ArmModel, limits: MotionLimits, friction: ExpectedFriction
 ) -> Check:
     """Compare what held the arm with what the model says would.
 
     Args:
-        trace: of holding still for `SETTLE + HOLD` seconds.
-        gravity: the model's torque there [N m or N], shape (joints,).
+        held: `held_torque` [N m or N], shape (joints,).
+        gravity: the model's torque there, likewise.
         model: of the arm.
         limits: of the arm.
         friction: Coulomb friction may hold the arm instead of torque, either way.
     """
     names = model.chain.names
     force = joint_units(model.chain.revolute, "N m", "N")
-    held = trace.torque[round(SETTLE / trace.period) :].mean(axis=0)
-    most = GRAVITY_ERROR * limits.torque + friction.coulomb
+    difference, most = differences(held, gravity, limits, friction)
     found = [
         *measures("torque that holds", held, force, names),
         *measures("gravity torque of the model", gravity, force, names),
-        *measures("difference", np.abs(held - gravity), force, names, most=most),
+        *measures("difference", difference, force, names, most=most),
     ]
     return judged("gravity", found, REMEDY)

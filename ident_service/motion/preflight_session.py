@@ -5,6 +5,9 @@ its guard stops it `FARTHEST` from where it should be, at a crawl, and its torqu
 gravity torque: a wrong sign or a wrong scale then drives the arm no farther than a few hundredths of a radian, from
 where it can be let go. So every end here, good or bad, is torque off; a drive's own quick stop would trust the very
 sign that has not been proven yet.
+
+While the torque is on nothing is worked out between two cycles, for drives give up within a few cycles without torque
+frames: what was recorded is judged when the arm has been let go.
 """
 
 from __future__ import annotations
@@ -31,6 +34,8 @@ _CREEP = 0.02  # rad/s or m/s, below which friction is not compensated, so that 
 RELEASE = 0.5  # s over which torque is led to zero
 SUNK = 0.02  # rad or m: what sinks farther while torque fades has no support, and is let go at once
 
+Rows = Sequence[tuple[Sample, Setpoint]]
+
 
 @dataclass(frozen=True)
 class Trace:
@@ -54,7 +59,7 @@ class Trace:
     period: float
 
 
-def trace_of(rows: Sequence[tuple[Sample, Setpoint]], period: float) -> Trace:
+def trace_of(rows: Rows, period: float) -> Trace:
     """Cycles with their references, the earliest first, as a trace.
 
     Args:
@@ -84,6 +89,7 @@ class Session:
         home: where the arm stood [rad or m], shape (joints,).
         gravity: the model's torque there [N m or N], shape (joints,).
         mass: the model's mass matrix there, shape (joints, joints).
+        period: [s].
     """
 
     def __init__(
@@ -106,7 +112,7 @@ class Session:
         self.gravity = dynamics.torque(home, still, still)
         self.mass = dynamics.mass_matrix(home)
         self._arm = arm
-        self._period = period
+        self.period = period
         self._band = np.minimum(BAND * limits.torque + friction.coulomb, limits.torque)
         narrow = replace(
             limits,
@@ -129,7 +135,7 @@ class Session:
         self._arm.enable()
         self._torque = self._limited(self.gravity)
 
-    def follow(self, reference: Reference, seconds: float, learning: float = 0.0) -> Trace:
+    def follow(self, reference: Reference, seconds: float, learning: float = 0.0) -> Rows:
         """Follow a reference for some time.
 
         Args:
@@ -140,7 +146,7 @@ class Session:
                 WAM's first joint takes 13 mrad of error.
 
         Returns:
-            What happened.
+            What happened, for `trace_of`.
 
         Raises:
             ArmFault: the guard or a drive found something that is more than a warning; `trace` tells the story.
@@ -161,15 +167,15 @@ class Session:
             wanted = self._control.torque(sample.position, usable, setpoint)
             self._torque = self._limited(wanted + self._against_friction(setpoint, learning))
             if elapsed >= seconds:
-                return self.trace()
+                return self._rows
 
     def trace(self) -> Trace:
         """The cycles of the last `follow`, also of one that a fault ended."""
-        return trace_of(self._rows, self._period)
+        return trace_of(self._rows, self.period)
 
     def release(self) -> None:
         """Hand the arm back to its support: torque fades, then the drives are switched off."""
-        cycles = max(1, round(RELEASE / self._period))
+        cycles = max(1, round(RELEASE / self.period))
         held = self._torque
         for left in range(cycles - 1, -1, -1):
             sample = self._arm.exchange(self._torque)
@@ -183,7 +189,7 @@ class Session:
         rate = setpoint.velocity
         direction = np.where(np.abs(rate) > _CREEP, np.sign(rate), 0.0)
         lag = (setpoint.position - self._control.position) * direction
-        self._friction = np.clip(self._friction + learning * self._period * self._stiffness * lag, 0.0, self._band)
+        self._friction = np.clip(self._friction + learning * self.period * self._stiffness * lag, 0.0, self._band)
         return np.asarray(self._friction * np.clip(rate / _CREEP, -1.0, 1.0))
 
     def _limited(self, wanted: Vector, *, band: bool = True) -> Vector:

@@ -18,6 +18,7 @@ from ident_service.excitation.excitation import Excitation
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.contact import Contact
 from ident_service.model.rigid_body import InverseDynamics
+from ident_service.motion.attended import attended
 from ident_service.motion.control import ComputedTorque
 from ident_service.motion.controls import Controls, StopWhen
 from ident_service.motion.course import Course
@@ -167,22 +168,31 @@ class _Run:
         """Everything checked and put together, and the torque that holds the arm where it stands."""
         model, chain, arm = self.model, self.model.chain, self.arm
         limits = motion_limits(model.config)
-        if model.prior is None:
-            raise MotionRefused(f"{model.config.name}: computed torque needs prior parameters")
         described = arm.describe()
         if described.joint_names != chain.names:
             raise MotionRefused(
                 f"the arm on the bus has the joints {', '.join(described.joint_names)}, "
                 f"the description {', '.join(chain.names)}"
             )
-        self.plan.require_possible(model, limits)
+        with attended(arm):  # what is worked out takes longer than drives wait for their host
+            self.plan.require_possible(model, limits)
         period = 1.0 / described.rate
         sample = self._look(limits, period)
+        with attended(arm):
+            loop, torque = self._planned(sample, limits, period, described.position_resolution)
+        self._loop = loop
+        self._stamp_ns = sample.stamp_ns
+        return loop, torque
+
+    def _planned(self, sample: Sample, limits: MotionLimits, period: float, resolution: Vector) -> tuple[Loop, Vector]:
+        model, chain = self.model, self.model.chain
+        if model.prior is None:
+            raise MotionRefused(f"{model.config.name}: computed torque needs prior parameters")
         home = sample.position.copy()
         admitted = self.plan.admits(model, home, limits)
         legs, limits = self.plan.legs(model, home, limits), admitted
         dynamics = InverseDynamics(chain, model.layout, model.prior)
-        owed = owed_ways(dynamics, model, limits, period, described.position_resolution)
+        owed = owed_ways(dynamics, model, limits, period, resolution)
         contact = Contact(model)
         guard = Guard(chain.names, limits, period, home, revolute=chain.revolute, contact=contact, owed=owed)
         control = ComputedTorque(dynamics, limits, period, model.config.control.velocity_cutoff, home)
@@ -191,7 +201,7 @@ class _Run:
             raise MotionRefused(f"the arm cannot be held where it stands: {cannot_hold.message}")
         self.states = States(self.latch, self._entered)
         loop = Loop(
-            arm,
+            self.arm,
             guard,
             control,
             Course(
@@ -212,8 +222,6 @@ class _Run:
             self.hold_seconds,
             Peaks(np.zeros_like(home), np.zeros_like(home)),
         )
-        self._loop = loop
-        self._stamp_ns = sample.stamp_ns
         return loop, torque
 
     def _look(self, limits: MotionLimits, period: float) -> Sample:

@@ -59,3 +59,12 @@ def test_warnings_that_do_not_end_stop_the_arm() -> None:
 def test_what_cannot_be_believed_comes_before_what_is_told() -> None:
     _, fault = Bench().see(np.array([np.nan, HOME[1]]), events=(DIED,))
     assert is_fault(fault, "feedback_not_finite", 0)
+
+
+def test_warnings_of_one_cycle_count_as_one_cycle() -> None:
+    bench, often = Bench(), FAULTS["strange_frame"].often
+    late = tuple(AxisEvent(AxisEventCode.STRANGE_FRAME, k % 2, f"node {k}: came late") for k in range(7))
+    found = [bench.see(HOME, events=late)[1] for _ in range(often + 1)]
+    assert all(is_fault(one, "strange_frame", 0) for one in found[:-1])
+    assert is_fault(found[-1], "repeated_warnings")
+    assert bench.guard.warnings["strange_frame"] == 7 * (often + 1)
