@@ -30,10 +30,14 @@ from canopen_run_bench import (
     write,
 )
 
+from drivers.status import AxisEventCode
 from ident_service.cli import main
+from ident_service.config.canopen import CanopenDriver
 from ident_service.config.load import load_arm
 from ident_service.model.arm_model import arm_model
 from ident_service.model.base import base_parameters
+from ident_service.motion.attended import attended
+from ident_service.motion.factory import make_arm
 from ident_service.record.open import open_recording
 from ident_service.service.arm_state import fault_file
 
@@ -166,3 +170,18 @@ def test_the_guard_stops_a_run_whose_drives_vanish(bench: Bench) -> None:
         with again:
             assert again.code() == 3
             assert "acknowledge" in again.text
+
+
+def test_a_person_may_think_longer_than_drives_wait_for_their_host(bench: Bench) -> None:
+    config = load_arm(bench.arm)
+    assert isinstance(config.driver, CanopenDriver)
+    with emulated(bench.arm), make_arm(config) as arm:
+        with attended(arm):
+            time.sleep(3.0 * config.driver.heartbeats.timeout)
+        sample = arm.exchange(None)
+        told = {event.code for event in sample.events}
+        assert not told & {AxisEventCode.DRIVE_LEFT, AxisEventCode.EMERGENCY_MESSAGE}
+        assert arm.exchange(None).valid.all() or arm.exchange(None).valid.all()
+        time.sleep(3.0 * config.driver.heartbeats.timeout)  # alone, they say that they miss us
+        told = {event.code for _ in range(20) for event in arm.exchange(None).events}
+        assert AxisEventCode.EMERGENCY_MESSAGE in told

@@ -1,0 +1,78 @@
+"""Cycles go on while somebody thinks or computes with an arm open; nothing of it reaches an arm in virtual time."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Callable
+
+import pytest
+
+from drivers.clock import Clock, RealClock, VirtualClock
+from ident_service.errors import DriverError
+from ident_service.motion.attended import attended
+
+
+class Looked:
+    """The part of an arm that is used: cycles without torque, one of which may fail."""
+
+    def __init__(self, clock: Clock, fails_at: int | None = None) -> None:
+        self.clock, self.fails_at = clock, fails_at
+        self.cycles, self.torques = 0, list[object]()
+        self.enough = threading.Event()
+
+    def exchange(self, torque: object) -> None:
+        self.torques.append(torque)
+        self.cycles += 1
+        if self.cycles == self.fails_at:
+            raise DriverError("the bus is gone")
+        if self.cycles >= 10:
+            self.enough.set()
+        self.clock.sleep_until_ns(self.clock.now_ns() + 1_000_000)
+
+
+def during(arm: Looked, work: Callable[[], None]) -> None:
+    with attended(arm):  # type: ignore[arg-type]
+        work()
+
+
+def test_cycles_without_torque_go_on_until_the_work_is_done() -> None:
+    arm, before = Looked(RealClock()), sys.getswitchinterval()
+    during(arm, lambda: require(arm.enough.wait(60.0)))
+    ended = arm.cycles
+    assert ended >= 10
+    assert set(arm.torques) == {None}
+    assert threading.active_count() == 1 or "attended" not in {one.name for one in threading.enumerate()}
+    assert arm.cycles == ended
+    assert sys.getswitchinterval() == before
+
+
+def test_in_virtual_time_nobody_waits() -> None:
+    arm = Looked(VirtualClock())
+    during(arm, lambda: None)
+    assert arm.cycles == 0
+
+
+def test_a_cycle_that_fails_is_told_when_the_work_is_done() -> None:
+    arm, done = Looked(RealClock(), fails_at=1), list[str]()
+    with pytest.raises(DriverError, match="the bus is gone"):
+        during(arm, lambda: done.append("work"))
+    assert done == ["work"]
+    assert arm.cycles == 1
+
+
+def test_work_that_fails_ends_the_cycles_and_is_told_first() -> None:
+    arm = Looked(RealClock(), fails_at=1)
+    with pytest.raises(KeyboardInterrupt):
+        during(arm, interrupted)
+    ended = arm.cycles
+    assert "attended" not in {one.name for one in threading.enumerate()}
+    assert arm.cycles == ended
+
+
+def interrupted() -> None:
+    raise KeyboardInterrupt
+
+
+def require(true: bool) -> None:
+    assert true
