@@ -16,7 +16,7 @@ from ident_service.errors import ArmFault, MotionRefused
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.factory import make_arm
-from ident_service.motion.preflight import preflight
+from ident_service.motion.preflight.preflight import preflight
 from ident_service.record.open import open_recording
 from ident_service.service.run import run_motion
 

@@ -16,8 +16,8 @@ from collections.abc import Callable, Sequence
 
 from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector
 from drivers.clock import Clock, RealClock, VirtualClock
-from ident_service.config.drivers import SimulatedDriver
 from ident_service.config.schema import ArmConfig
+from ident_service.config.simulation import SimulatedDriver
 from ident_service.errors import DriverError
 from sim_backend.build import build_machine
 from sim_backend.door import checked_torque, description

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from drivers.arm import Vector
-from ident_service.config.drivers import SimulatedDriver
 from ident_service.config.quantities import PerJoint
 from ident_service.config.schema import ArmConfig
+from ident_service.config.simulation import SimulatedDriver
 from ident_service.errors import DriverError
 from ident_service.model.arm_model import arm_model
 from sim_backend.faults import Fault, configured_faults

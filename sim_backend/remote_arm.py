@@ -21,8 +21,8 @@ import numpy as np
 
 from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector
 from drivers.clock import Clock
-from ident_service.config.drivers import SimulatedDriver
 from ident_service.config.schema import ArmConfig
+from ident_service.config.simulation import SimulatedDriver
 from ident_service.errors import DriverError
 from sim_backend import wire
 from sim_backend.build import build_machine

@@ -93,8 +93,8 @@ def _check(arguments: argparse.Namespace) -> Answer:
     from ident_service.model.arm_model import arm_model
     from ident_service.motion.control_file import ControlFile
     from ident_service.motion.factory import make_arm
-    from ident_service.motion.preflight import preflight
-    from ident_service.motion.preflight_check import Verdict
+    from ident_service.motion.preflight.check import Verdict
+    from ident_service.motion.preflight.preflight import preflight
     from ident_service.motion.realtime import asked
     from ident_service.motion.stoppable import StoppableArm
     from ident_service.record.files import require_writable

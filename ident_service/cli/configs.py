@@ -1,6 +1,6 @@
 """Verbs about arm descriptions: `config check`.
 
-Boundary: words to calls, results to words; the work is `config/load.py`, `motion/preflight_stability.py` and
+Boundary: words to calls, results to words; the work is `config/load.py`, `motion/preflight/stability.py` and
 `service/bus.py`.
 """
 
@@ -14,7 +14,7 @@ from ident_service.cli.answer import DONE, VERDICT_NO, Answer
 from ident_service.cli.words import Verbs
 
 if TYPE_CHECKING:
-    from ident_service.motion.preflight_stability import StabilityReport
+    from ident_service.motion.preflight.stability import StabilityReport
 
 
 def add(verbs: Verbs) -> None:
@@ -31,7 +31,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
     from ident_service.errors import MotionRefused
     from ident_service.model.arm_model import arm_model
-    from ident_service.motion.preflight_stability import delay_of, stability
+    from ident_service.motion.preflight.stability import delay_of, stability
     from ident_service.service.bus import bus_lines, require_budget
 
     model = arm_model(load_arm(arguments.file))

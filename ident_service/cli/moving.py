@@ -133,7 +133,7 @@ def moved(
         As `service.run.run_motion`; MotionRefused without a ticket.
     """
     from ident_service.motion.controls import LEASE_SECONDS
-    from ident_service.motion.preflight_ticket import read_ticket
+    from ident_service.motion.preflight.ticket import read_ticket
     from ident_service.service.arm_state import ticket_path
     from ident_service.service.commission import new_run_folder
     from ident_service.service.run import run_motion

@@ -2,38 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
-from pydantic import ConfigDict, Discriminator, Field, Tag
+from pydantic import ConfigDict, Discriminator, Tag
 
 from ident_service.config.canopen import CanopenDriver
-from ident_service.config.quantities import Count, ParameterTable, PerJoint, Positive, Section, Seed
-from ident_service.config.simulation import SimulatedFault
-
-
-class SimulatedDriver(Section):
-    """The simulated arm: true parameters and imperfections, all per joint or one number for all.
-
-    `process` says where its plant lives; `bus` names a separate one that other processes may ask for, `status` the file
-    it reports to, `deadline` [s] how long an answer of it may take. `watchdog` [s] without a torque frame makes
-    the drives idle; idle drives brake with `braking` [N m s/rad].
-    """
-
-    kind: Literal["simulated"]
-    time: Literal["virtual", "real"] = "virtual"
-    process: Literal["own", "separate"] = "own"
-    bus: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")] | None = None
-    status: str | None = None
-    deadline: Positive | None = None
-    seed: Seed = 0
-    truth: ParameterTable | None = None
-    encoder_resolution: PerJoint = 0.0
-    torque_resolution: PerJoint = 0.0
-    torque_noise: PerJoint = 0.0
-    delay_cycles: Annotated[Count, Field(le=100)] = 1
-    watchdog: Positive = 0.01
-    braking: PerJoint | None = None
-    faults: tuple[SimulatedFault, ...] = ()
+from ident_service.config.quantities import Section
+from ident_service.config.simulation import SimulatedDriver
 
 
 class PluginDriver(Section):

@@ -10,11 +10,11 @@ from pydantic import ValidationError
 
 from ident_service.config import canopen, design, recording, simulation, workspace
 from ident_service.config.canopen import CanopenDriver
-from ident_service.config.drivers import SimulatedDriver
 from ident_service.config.quantities import MAX_FILE_BYTES, Section
 from ident_service.config.recording import RecordingFormat
 from ident_service.config.schema import ArmConfig, DHTable, FourierMotion
 from ident_service.config.shipped import shipped_arms as shipped_arms
+from ident_service.config.simulation import SimulatedDriver
 from ident_service.config.source import KeyPath, Tree, read_tree
 from ident_service.errors import ConfigError, Problem, UsageError
 

@@ -1,4 +1,4 @@
-"""Faults to inject into a simulated arm, as a configuration names them: kind, joint, time, duration, size.
+"""The simulated arm as a configuration describes it, and the faults to inject: kind, joint, time, duration, size.
 
 Boundary: data only. What each kind does to readings and to the plant is `sim_backend`.
 """
@@ -8,14 +8,21 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from ident_service.config.quantities import NonNegative, Number, Positive, Section, Vector3
-
-if TYPE_CHECKING:
-    from ident_service.config.drivers import SimulatedDriver
+from ident_service.config.quantities import (
+    Count,
+    NonNegative,
+    Number,
+    ParameterTable,
+    PerJoint,
+    Positive,
+    Section,
+    Seed,
+    Vector3,
+)
 
 
 class FaultKind(Enum):
@@ -134,6 +141,31 @@ class SimulatedFault(Section):
         if self.offset is not None and self.kind is not FaultKind.LOAD_ATTACHED:
             raise ValueError(f"{name} has no offset")
         return self
+
+
+class SimulatedDriver(Section):
+    """The simulated arm: true parameters and imperfections, all per joint or one number for all.
+
+    `process` says where its plant lives; `bus` names a separate one that other processes may ask for, `status` the file
+    it reports to, `deadline` [s] how long an answer of it may take. `watchdog` [s] without a torque frame makes
+    the drives idle; idle drives brake with `braking` [N m s/rad].
+    """
+
+    kind: Literal["simulated"]
+    time: Literal["virtual", "real"] = "virtual"
+    process: Literal["own", "separate"] = "own"
+    bus: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")] | None = None
+    status: str | None = None
+    deadline: Positive | None = None
+    seed: Seed = 0
+    truth: ParameterTable | None = None
+    encoder_resolution: PerJoint = 0.0
+    torque_resolution: PerJoint = 0.0
+    torque_noise: PerJoint = 0.0
+    delay_cycles: Annotated[Count, Field(le=100)] = 1
+    watchdog: Positive = 0.01
+    braking: PerJoint | None = None
+    faults: tuple[SimulatedFault, ...] = ()
 
 
 def disagreements(

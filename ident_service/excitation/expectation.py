@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ident_service.config.drivers import SimulatedDriver
 from ident_service.config.limits import MotionLimits
+from ident_service.config.simulation import SimulatedDriver
 from ident_service.excitation.path import FourierPath, PosturePath
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters

@@ -21,8 +21,9 @@ from ident_service.errors import ModelError
 from ident_service.model.adjoint import Differentiable
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array, Chain
+from ident_service.model.scene import scene
 from ident_service.model.segments import between_segments, to_boxes, to_half_spaces
-from ident_service.model.solids import Body, Box, Capsule, Cylinder, HalfSpace, scene
+from ident_service.model.solids import Body, Box, Capsule, Cylinder, HalfSpace
 from ident_service.model.tape import Symbol, Tape, Value
 
 _Vector = list[Value]

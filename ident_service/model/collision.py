@@ -17,7 +17,8 @@ from ident_service.errors import ModelError, MotionRefused
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.reach import reach
-from ident_service.model.solids import Body, Box, Capsule, Cylinder, Scene, scene
+from ident_service.model.scene import Scene, scene
+from ident_service.model.solids import Body, Box, Capsule, Cylinder
 
 _TOLERANCE = 1e-9  # m, of coal's iterations for boxes and cylinders
 _POSTURES, _SEED = 200, 20140101

@@ -16,7 +16,7 @@ import pinocchio as pin
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array
 from ident_service.model.collision import geometry, kinematics
-from ident_service.model.solids import scene
+from ident_service.model.scene import scene
 
 AT_ONCE = 40
 

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident_service.model.chain import WORLD, Array
-from ident_service.model.solids import Body, Box, Capsule, HalfSpace, Scene
+from ident_service.model.scene import Scene
+from ident_service.model.solids import Body, Box, Capsule, HalfSpace
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ from ident_service.motion.histogram import Histogram
 from ident_service.motion.latch import Latch
 from ident_service.motion.lifeline import Lifeline
 from ident_service.motion.plans import Destination, Excite, GoTo, Plan
-from ident_service.motion.preflight_ticket import subject_of, ticket_from_json
+from ident_service.motion.preflight.ticket import subject_of, ticket_from_json
 from ident_service.motion.realtime import ask
 from ident_service.motion.run import follow
 from ident_service.motion.states import State

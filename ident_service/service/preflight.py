@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from drivers.status import AxisStatus
-from ident_service.motion.preflight_check import Check, Measure, Verdict
-from ident_service.motion.preflight_ticket import Ticket, ticket_values
+from ident_service.motion.preflight.check import Check, Measure, Verdict
+from ident_service.motion.preflight.ticket import Ticket, ticket_values
 from ident_service.motion.watch import Watched
 from ident_service.results.files import write_atomically
 

@@ -24,7 +24,7 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters, base_parameters
 from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel
-from ident_service.model.solids import scene
+from ident_service.model.scene import scene
 from ident_service.motion.reference import Setpoint, rest
 from ident_service.motion.stop import stop_extent
 from ident_service.motion.surroundings import Nearest, stop_clearance

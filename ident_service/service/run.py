@@ -24,7 +24,7 @@ from ident_service.motion.controls import LEASE_SECONDS
 from ident_service.motion.ending import ENDED, write_ending
 from ident_service.motion.factory import make_arm
 from ident_service.motion.plans import HOMING_SPEED, Destination
-from ident_service.motion.preflight_ticket import Ticket, subject_of
+from ident_service.motion.preflight.ticket import Ticket, subject_of
 from ident_service.record.files import require_writable
 from ident_service.record.recorder_process import RecorderProcess
 from ident_service.results.files import require_place, write_atomically

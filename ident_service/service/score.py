@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ident_service.config.drivers import SimulatedDriver
 from ident_service.config.schema import ArmConfig
+from ident_service.config.simulation import SimulatedDriver
 from ident_service.estimation.equations import Equations
 from ident_service.estimation.identify import Estimate
 from ident_service.estimation.least_squares import torque_error

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ident_service.config.canopen import CanopenDrive, CanopenDriver
-from ident_service.config.drivers import SimulatedDriver
 from ident_service.config.schema import ArmConfig
+from ident_service.config.simulation import SimulatedDriver
 from ident_service.errors import DriverError
 from ident_service.model.arm_model import arm_model
 from sim_backend.build import build_machine

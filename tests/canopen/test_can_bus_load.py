@@ -17,8 +17,8 @@ from ident_service.config.limits import motion_limits
 from ident_service.config.load import load_arm
 from ident_service.errors import ConfigError
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.preflight_check import Verdict
-from ident_service.motion.preflight_plan import configuration_check, stability_check
+from ident_service.motion.preflight.check import Verdict
+from ident_service.motion.preflight.plan import configuration_check, stability_check
 
 ARMS = ("wam7_canopen", "wam7_canopen_500hz")
 

@@ -15,8 +15,8 @@ from cli.conftest import run_main
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from ident_service.config.drivers import SimulatedDriver
 from ident_service.config.load import load_arm
+from ident_service.config.simulation import SimulatedDriver
 from ident_service.estimation.identify import identify
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import ArmModel, arm_model

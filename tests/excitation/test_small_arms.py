@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ident_service.config.drivers import SimulatedDriver
 from ident_service.config.load import load_arm
+from ident_service.config.simulation import SimulatedDriver
 from ident_service.estimation.identify import identify
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import ArmModel, arm_model

@@ -16,10 +16,10 @@ from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.model.rigid_body import InverseDynamics
 from ident_service.motion.factory import make_arm
-from ident_service.motion.preflight import preflight
-from ident_service.motion.preflight_check import CODES, Verdict
-from ident_service.motion.preflight_direction import LEAST_ANSWER
-from ident_service.motion.preflight_session import trace_of
+from ident_service.motion.preflight.check import CODES, Verdict
+from ident_service.motion.preflight.direction import LEAST_ANSWER
+from ident_service.motion.preflight.preflight import preflight
+from ident_service.motion.preflight.session import trace_of
 from ident_service.motion.reference import Setpoint
 
 

@@ -17,8 +17,8 @@ from drivers.arm import ArmDescription
 from ident_service.errors import UsageError
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.preflight_check import CODES, Check, Verdict, failed, judged, measure, skipped
-from ident_service.motion.preflight_ticket import (
+from ident_service.motion.preflight.check import CODES, Check, Verdict, failed, judged, measure, skipped
+from ident_service.motion.preflight.ticket import (
     Subject,
     Ticket,
     new_ticket,

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pucks_bench import GEARS, MS, pucks_config
 
-from ident_service.config.drivers import SimulatedDriver
 from ident_service.config.load import load_arm
 from ident_service.config.recording import Transmission
+from ident_service.config.simulation import SimulatedDriver
 from ident_service.errors import DriverError
 from sim_backend.build import build_machine
 from sim_backend.pucks.body import Body

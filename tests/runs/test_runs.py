@@ -22,7 +22,7 @@ from ident_service.cli import main
 from ident_service.config.load import load_arm
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.preflight_ticket import read_ticket
+from ident_service.motion.preflight.ticket import read_ticket
 from ident_service.record.mcap_file import McapRecording
 from ident_service.record.open import open_recording
 from ident_service.service.arm_state import fault_file, ticket_path

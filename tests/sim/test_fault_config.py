@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ident_service.config.drivers import SimulatedDriver
 from ident_service.config.load import load_arm
-from ident_service.config.simulation import FAULT_RULES, FaultKind, disagreements
+from ident_service.config.simulation import FAULT_RULES, FaultKind, SimulatedDriver, disagreements
 from ident_service.errors import ConfigError, DriverError
 from sim_backend.arm import from_config
 from sim_backend.faults import Fault

@@ -6,7 +6,7 @@ it answers torque: measured acceleration against the one that the model expects 
 the answer to torque shows it, as it shows a wrong gear ratio, squared. A joint whose sign is wrong runs away from its
 reference, until the guard ends that at twice the amplitude; what it did on the way says whether the sign was why.
 
-Boundary: the motions and the judgement; the loop is `preflight_session.py`.
+Boundary: the motions and the judgement; the loop is `session.py`.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from ident_service.config.limits import MotionLimits, Vector
 from ident_service.errors import MotionRefused
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
-from ident_service.motion.preflight_check import Check, Measure, failed, judged, measures
-from ident_service.motion.preflight_session import BAND, Rows, Session, Trace
-from ident_service.motion.preflight_stability import INERTIA
+from ident_service.motion.preflight.check import Check, Measure, failed, judged, measures
+from ident_service.motion.preflight.session import BAND, Rows, Session, Trace
+from ident_service.motion.preflight.stability import INERTIA
 from ident_service.motion.reference import Reference, Setpoint, rest
 from ident_service.motion.surroundings import way_clearance
 from ident_service.motion.way import RuckigReference, way

@@ -25,8 +25,8 @@ from ident_service.model.threads import one_blas_thread
 from ident_service.motion.attended import attended
 from ident_service.motion.control import ComputedTorque
 from ident_service.motion.outside import admitting, reachable
-from ident_service.motion.preflight_check import ABOUT_THE_MOTION, CODES, Check, Verdict, failed, skipped
-from ident_service.motion.preflight_direction import (
+from ident_service.motion.preflight.check import ABOUT_THE_MOTION, CODES, Check, Verdict, failed, skipped
+from ident_service.motion.preflight.direction import (
     Stroke,
     answer,
     direction_check,
@@ -36,9 +36,9 @@ from ident_service.motion.preflight_direction import (
     went_against,
     wrong_signs,
 )
-from ident_service.motion.preflight_gravity import HOLD, SETTLE, differences, gravity_check, held_torque, holdable
-from ident_service.motion.preflight_gravity import REMEDY as GRAVITY_REMEDY
-from ident_service.motion.preflight_look import (
+from ident_service.motion.preflight.gravity import HOLD, SETTLE, differences, gravity_check, held_torque, holdable
+from ident_service.motion.preflight.gravity import REMEDY as GRAVITY_REMEDY
+from ident_service.motion.preflight.look import (
     Looked,
     at_rest_check,
     identities_check,
@@ -47,7 +47,7 @@ from ident_service.motion.preflight_look import (
     rate_check,
     unreachable,
 )
-from ident_service.motion.preflight_plan import (
+from ident_service.motion.preflight.plan import (
     configuration_check,
     motion_fits_check,
     motion_proven_check,
@@ -55,10 +55,10 @@ from ident_service.motion.preflight_plan import (
     way_home_check,
     ways_check,
 )
-from ident_service.motion.preflight_remedy import remedy_of
-from ident_service.motion.preflight_session import Rows, Session, trace_of
-from ident_service.motion.preflight_ticket import VALID, Ticket, new_ticket, subject_of
-from ident_service.motion.preflight_watchdog import Confirm, Consent, consent, watchdog_check
+from ident_service.motion.preflight.remedy import remedy_of
+from ident_service.motion.preflight.session import Rows, Session, trace_of
+from ident_service.motion.preflight.ticket import VALID, Ticket, new_ticket, subject_of
+from ident_service.motion.preflight.watchdog import Confirm, Consent, consent, watchdog_check
 from ident_service.motion.reference import hold, rest
 
 LOOK = 1.0  # s

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from drivers.arm import Arm, Sample, StopKind
 from drivers.status import AxisStatus
 from ident_service.model.arm_model import ArmModel
-from ident_service.motion.preflight_check import Check, Verdict, failed, judged, measure, skipped
+from ident_service.motion.preflight.check import Check, Verdict, failed, judged, measure, skipped
 
 CODE = "watchdog"
 # What a drive may take where the driver's section does not say: the longest that others use (moteus 0.1 s).

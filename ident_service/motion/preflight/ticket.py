@@ -20,7 +20,7 @@ from ident_service import __version__
 from ident_service.errors import MotionRefused, UsageError
 from ident_service.excitation.excitation import Excitation
 from ident_service.model.arm_model import ArmModel
-from ident_service.motion.preflight_check import ABOUT_THE_MOTION, CODES, Check, Measure, Verdict
+from ident_service.motion.preflight.check import ABOUT_THE_MOTION, CODES, Check, Measure, Verdict
 
 FORMAT, VERSION = "ident-ticket", 1
 VALID = timedelta(minutes=15)

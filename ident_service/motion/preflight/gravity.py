@@ -7,9 +7,9 @@ import numpy as np
 from ident_service.config.limits import MotionLimits, Vector
 from ident_service.excitation.following import ExpectedFriction
 from ident_service.model.arm_model import ArmModel
-from ident_service.motion.preflight_check import Check, failed, joint_units, judged, measures
-from ident_service.motion.preflight_plan import HOLDABLE
-from ident_service.motion.preflight_session import Rows
+from ident_service.motion.preflight.check import Check, failed, joint_units, judged, measures
+from ident_service.motion.preflight.plan import HOLDABLE
+from ident_service.motion.preflight.session import Rows
 
 SETTLE, HOLD = 0.3, 1.0  # s before the mean is taken, and over which
 GRAVITY_ERROR = 0.1  # of the torque limit, beside Coulomb friction, which may carry as much of the weight

@@ -17,8 +17,8 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
 from ident_service.model.rigid_body import InverseDynamics
 from ident_service.motion.plans import Destination, GoTo
-from ident_service.motion.preflight_check import Check, Measure, Verdict, failed, judged, measure, measures
-from ident_service.motion.preflight_stability import INERTIA, LEAST_GAIN_MARGIN, delay_of, stability
+from ident_service.motion.preflight.check import Check, Measure, Verdict, failed, judged, measure, measures
+from ident_service.motion.preflight.stability import INERTIA, LEAST_GAIN_MARGIN, delay_of, stability
 from ident_service.motion.reference import PathReference, rest
 from ident_service.motion.stop import require_stops_within_limits
 from ident_service.motion.surroundings import stop_clearance, way_clearance
