@@ -17,7 +17,7 @@ import pytest
 from drivers.arm import Arm, StopKind
 from drivers.status import TRIPPED, AxisStatus
 from ident_service.config.schema import ArmConfig
-from ident_service.errors import DriverError
+from ident_service.errors import DriverError, PositionUnknown
 
 PERIOD_NS = 2_000_000
 LIMIT = np.array([10.0, 5.0])
@@ -85,7 +85,22 @@ def canopen_config(**driver: Any) -> ArmConfig:
     return ArmConfig.model_validate(content)
 
 
-def canopen(faults: Sequence[dict[str, Any]] = ()) -> Bench:
+def relative_config() -> ArmConfig:
+    """The drives' encoders count from where they were when power came; home is on whole counts, for exact positions."""
+    content = canopen_config(zero="at_home").model_dump(mode="json")
+    for joint, counts in zip(content["joints"].values(), (5216, 1044), strict=True):
+        joint["home"] = 2.0 * np.pi / 65536 * counts  # 0.5 and 0.1
+    return ArmConfig.model_validate(content)
+
+
+def relative(faults: Sequence[dict[str, Any]] = ()) -> Bench:
+    """An arm that a person has zeroed."""
+    bench = canopen(faults, relative_config())
+    bench.arm.zero()
+    return bench
+
+
+def canopen(faults: Sequence[dict[str, Any]] = (), config: ArmConfig | None = None) -> Bench:
     """Two emulated drives; opening takes cycles too, so that faults are counted from the end of enabling here."""
     from drivers.canopen.arm import CanopenArm
     from ident_service.config.simulation import SimulatedFault
@@ -93,7 +108,7 @@ def canopen(faults: Sequence[dict[str, Any]] = ()) -> Bench:
     from sim_backend.pucks.faults import configured
     from sim_backend.pucks.lock_step import LockStepArm
 
-    config = canopen_config()
+    config = config or canopen_config()
     behind = LockStepArm(config)
     truths: list[Truth] = []
     behind.emulator.observer = truths.append
@@ -103,7 +118,12 @@ def canopen(faults: Sequence[dict[str, Any]] = ()) -> Bench:
     return Bench(arm, lambda: truths[-1].velocity, lambda: truths[-1].position, lambda: behind.inject(*strike))
 
 
-BACKENDS: dict[str, Callable[..., Bench]] = {"canopen": canopen, "separate": separate, "simulated": simulated}
+BACKENDS: dict[str, Callable[..., Bench]] = {
+    "canopen": canopen,
+    "relative": relative,
+    "separate": separate,
+    "simulated": simulated,
+}
 
 
 @pytest.fixture(params=sorted(BACKENDS))
@@ -404,3 +424,31 @@ def test_leaving_closes_whatever_happened(bench):
     bench.arm.open()
     with pytest.raises(DriverError):
         bench.arm.exchange(NONE)
+
+
+def test_what_zeroing_says_does_not_depend_on_the_arm_being_open(bench, request):
+    needs_it = request.node.callspec.params["bench"] == "relative"
+    if needs_it:
+        assert len(bench.arm.zero()) == 2
+    else:
+        with pytest.raises(DriverError, match=r"zero|absolute"):
+            bench.arm.zero()
+    with bench.arm as arm:
+        before = arm.exchange(None).position
+        with pytest.raises(DriverError):
+            arm.zero()
+        with pytest.raises(DriverError):
+            arm.look().zero()
+        after = arm.exchange(None)
+        np.testing.assert_array_equal(after.position, before)
+        np.testing.assert_array_equal(after.torque, 0.0)
+
+
+def test_a_position_is_told_only_by_an_arm_that_knows_it():
+    bench = canopen(config=relative_config())
+    for act in (bench.arm.open, bench.arm.look().open):
+        with pytest.raises(PositionUnknown):
+            act()
+    bench.arm.zero()
+    with bench.arm as arm:
+        np.testing.assert_allclose(arm.exchange(None).position, [0.5, 0.1], atol=2e-4)

@@ -49,9 +49,7 @@ def written(folder: Path, homes: tuple[float | None, ...] = (0.3, -0.2), **drive
         "extends": str(planar),
         "name": "pucks2",
         "control": {"rate": 500, "velocity_cutoff": 30},
-        "joints": {
-            joint: GAINS | {"home": home} for joint, home in zip(("shoulder", "elbow"), homes, strict=True)
-        },
+        "joints": {joint: GAINS | {"home": home} for joint, home in zip(("shoulder", "elbow"), homes, strict=True)},
         "transmission": GEARS,
         "driver": section | driver,
     }
@@ -118,9 +116,7 @@ def test_a_zeroed_arm_passes_its_preflight_and_is_moved(config: ArmConfig, behin
         np.testing.assert_allclose(arm.exchange(None).position, behind.emulator.body.plant.position, atol=1e-4)
 
 
-def test_a_ticket_dies_with_the_zero_that_it_was_made_for(
-    config: ArmConfig, behind: LockStepArm, state: Path
-) -> None:
+def test_a_ticket_dies_with_the_zero_that_it_was_made_for(config: ArmConfig, behind: LockStepArm, state: Path) -> None:
     assert not take_home(config, state, sure).ticket_removed
     ticket = checked(config)
     path = ticket_path(state, config.name)
