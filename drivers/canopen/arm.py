@@ -137,7 +137,7 @@ class CanopenArm(Arm):
                 self._locks = [BusLock(bus) for bus in self._driver.buses]
             links = self._open_bus(self._config)
             if self._log_path is not None:
-                self._log, links = logged_links(links, self._log_path)
+                self._log, links = logged_links(links, self._log_path, [profile.fd for profile in self._profiles])
                 self._log_path = None
             buses = Buses(self._profiles, links, self._period_ns)
             self.clock = buses.clock

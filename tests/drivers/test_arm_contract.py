@@ -118,8 +118,15 @@ def canopen(faults: Sequence[dict[str, Any]] = (), config: ArmConfig | None = No
     return Bench(arm, lambda: truths[-1].velocity, lambda: truths[-1].position, lambda: behind.inject(*strike))
 
 
+def fd(faults: Sequence[dict[str, Any]] = ()) -> Bench:
+    """Drives on a bus of CAN FD."""
+    bus = {"interface": "lock_step", "channel": "bench", "bitrate": 1_000_000, "data_bitrate": 4_000_000}
+    return canopen(faults, canopen_config(buses=[bus]))
+
+
 BACKENDS: dict[str, Callable[..., Bench]] = {
     "canopen": canopen,
+    "fd": fd,
     "relative": relative,
     "separate": separate,
     "simulated": simulated,
