@@ -43,6 +43,7 @@ class Buses:
         codecs: one a bus.
         drives: the state of every drive, in the arm's order.
         clock: of the links.
+        complete: whether every drive answered in the last cycle.
         lost: positions that did not come in their cycle, so far.
     """
 
@@ -56,6 +57,7 @@ class Buses:
         """
         self.codecs = [BusCodec(profile) for profile in profiles]
         self.clock: Clock = links[0].clock
+        self.complete = False
         self.lost = 0
         self._links = list(links)
         self._pairs = list(zip(self.codecs, self._links, strict=True))
@@ -214,7 +216,9 @@ class Buses:
                     break
                 codec.receive(answer)
             codec.end_cycle()
-        self.lost += sum(not drive.answered for drive in self.drives)
+        self.complete = all(codec.complete for codec in self.codecs)
+        if not self.complete:
+            self.lost += sum(not drive.answered for drive in self.drives)
         self.keep_alive()
         return stamp_ns
 
