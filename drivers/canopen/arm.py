@@ -274,7 +274,7 @@ class CanopenArm(Arm):
                 objects = buses.objects(number)
                 # Between two conversations, so that the others do not miss their torque frames.
                 buses.cycle(self._counts if self._streaming else None)
-                for _ in released(objects, self._zeros, number):
+                for _ in released(objects, self._zeros, number, buses.restarted(number)):
                     buses.cycle(self._counts if self._streaming else None)
                 there[drive.bus] = objects
         with suppress(Exception):
@@ -310,16 +310,15 @@ class CanopenArm(Arm):
             configure(objects, Setup(drive, buses.profile(number), self._driver.reactions, limits[number]))
             if self._zeros is not None:
                 counts = self._coordinates.zero[number]
-                self._zeros.keep(objects, number, counts)
+                if not self._zeros.keep_on(objects, number, counts, buses.restarted(number)):
+                    raise PositionUnknown(self._zeros.lost([drive.node]))
                 identity += f", home at {counts} counts"  # a preflight ticket is for this zero
             yield identity
 
     def _require_no_restart(self, buses: Buses) -> None:
-        """A drive that restarted while it was configured vouches for counts that it lost: that must not stand."""
-        if self._zeros is not None and (restarted := [k for k, drive in enumerate(buses.drives) if drive.boots]):
-            for number in restarted:
-                self._zeros.forget(buses.objects(number))
-            raise PositionUnknown(self._zeros.lost([buses.drives[number].node for number in restarted]))
+        """Drives that restarted after they were configured have lost their zero."""
+        if self._zeros is not None and (restarted := [drive.node for drive in buses.drives if drive.boots]):
+            raise PositionUnknown(self._zeros.lost(restarted))
 
     def _through(self, buses: Buses, steps: Enabling | Resetting) -> None:
         """Cycle with zero torque until the drives have gone where they are led; a stop meanwhile wins."""

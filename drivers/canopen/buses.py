@@ -11,7 +11,7 @@ Boundary: frames and time. What torques mean and what states drives should be in
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 from drivers.canopen.bits import worst
@@ -99,6 +99,11 @@ class Buses:
     def profile(self, number: int) -> BusProfile:
         """Of the bus that a drive is on."""
         return self._at[number][0].profile
+
+    def restarted(self, number: int) -> Callable[[], bool]:
+        """What tells whether a drive has sent a boot-up message since the buses were opened."""
+        drive = self.drives[number]
+        return lambda: drive.boots > 0
 
     def listen(self) -> None:
         """Wait whether another host drives this arm, which anything of ours would disturb in the midst of it.

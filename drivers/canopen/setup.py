@@ -6,7 +6,7 @@ it does: SYNC's period and window, the interpolation period, PDOs that are only 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 from drivers.canopen import dictionary as od
@@ -133,7 +133,7 @@ def configure(objects: Objects, setup: Setup) -> None:
         raise DriverError(f"node {objects.node}: is in mode {mode} (6061h) although {od.CST} was set")
 
 
-def released(objects: Objects, zeros: Zeros | None, number: int) -> Iterator[None]:
+def released(objects: Objects, zeros: Zeros | None, number: int, restarted: Callable[[], bool]) -> Iterator[None]:
     """Let a drive that is off forget that a host will be missed; one that is not shall miss it, and stop.
 
     It comes in steps of a few frames each, for cycles between them. What a drive vouches for (`zero.py`) it vouches for
@@ -143,6 +143,7 @@ def released(objects: Objects, zeros: Zeros | None, number: int) -> Iterator[Non
         objects: of the drive.
         zeros: of the arm, None where drives know their position.
         number: of the drive.
+        restarted: whether it has sent a boot-up message in the session.
 
     Raises:
         DriverError: it does not answer, or refuses.
@@ -158,7 +159,7 @@ def released(objects: Objects, zeros: Zeros | None, number: int) -> Iterator[Non
     objects.write(Write(od.HEARTBEAT_CONSUMER, 0))  # or 8130h would follow every session
     if zeros is not None and counts is not None:
         yield
-        zeros.keep(objects, number, counts)
+        zeros.keep_on(objects, number, counts, restarted)
 
 
 def _rated_torque(objects: Objects, drive: CanopenDrive) -> None:

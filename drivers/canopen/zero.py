@@ -15,7 +15,7 @@ Boundary: objects of single drives. When a person may say where the arm stands i
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -79,6 +79,28 @@ class Zeros:
         """Have a drive vouch for these counts at home, and read it back; raises as `Objects.set`."""
         objects.set(Write(od.ZERO_COUNTS, counts & 0xFFFF_FFFF))
         objects.set(Write(od.ZERO_MARK, self.mark(number, counts)))
+
+    def keep_on(self, objects: Objects, number: int, counts: int, restarted: Callable[[], bool]) -> bool:
+        """Have a drive vouch again for what it vouched for before it was configured, unless it has restarted since.
+
+        Args:
+            objects: of the drive.
+            number: its.
+            counts: at home.
+            restarted: whether it has sent a boot-up message; asked before, and when its answers have been heard.
+
+        Returns:
+            Whether it vouches for them; otherwise it vouches for nothing.
+
+        Raises:
+            DriverError: as `Objects.set`.
+        """
+        if not restarted():
+            self.keep(objects, number, counts)
+            if not restarted():
+                return True
+        self.forget(objects)
+        return False
 
     def forget(self, objects: Objects) -> None:
         """Have a drive vouch for nothing, and read it back; raises as `Objects.set`."""
