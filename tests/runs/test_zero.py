@@ -19,9 +19,9 @@ from ident_service.errors import ConfigError, DriverError, MotionRefused, Positi
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.control_file import ControlFile
 from ident_service.motion.factory import make_arm
-from ident_service.motion.preflight import preflight
-from ident_service.motion.preflight_check import Verdict
-from ident_service.motion.preflight_ticket import Ticket, subject_of
+from ident_service.motion.preflight.check import Verdict
+from ident_service.motion.preflight.preflight import preflight
+from ident_service.motion.preflight.ticket import Ticket, subject_of
 from ident_service.service.arm_state import control_path, fault_file, ticket_path
 from ident_service.service.recover import recover
 from ident_service.service.zeroing import home_posture, take_home
