@@ -1,7 +1,7 @@
 """The links as bodies: how far inside each condition they lie, and the ellipsoids that move as they do.
 
-A solid ellipsoid of uniform density with half axes a_1, a_2, a_3 and mass m has the second moments m a_i^2 / 5 about
-its centre. So the ellipsoid with a link's mass, centre and inertia has a_i = sqrt(5 s_i / m), with s_i the eigenvalues
+A solid ellipsoid of uniform density with half axes a_1, a_2, a_3 and mass m has second moments m a_i^2 / 5 about its
+centre. So the ellipsoid with a link's mass, centre and inertia has a_i = sqrt(5 s_i / m), with s_i the eigenvalues
 of Sigma = tr(I)/2 1 - I, I the inertia about the centre of mass; it exists where all of them are positive, which is what
 `pseudo_inertia` asks for.
 """
@@ -32,14 +32,12 @@ def conditions_of(estimate: Estimate) -> tuple[Condition, ...]:
 
 
 def bounds_of(tight: tuple[str, ...], conditions: FeasibleSet, base: BaseParameters) -> tuple[tuple[str, ...], ...]:
-    """Per base parameter, the conditions of `tight` that its own link parameter, the first of its sum, takes part in."""
+    """Per base parameter, the conditions of `tight` that the first link parameter of its sum takes part in."""
     touched = {
         block.name: set(np.flatnonzero(np.any(block.F != 0.0, axis=0)).tolist())
         for block in (*conditions.blocks, *conditions.equalities)
     }
-    return tuple(
-        tuple(name for name in tight if int(column) in touched.get(name, set())) for column in base.base
-    )
+    return tuple(tuple(name for name in tight if int(column) in touched.get(name, set())) for column in base.base)
 
 
 def posed(model: ArmModel, delta: Array | None, positions: Array) -> Posed | None:

@@ -134,7 +134,7 @@ def _recording_document(one: Traced) -> dict[str, Any]:
         "role": one.role,
         "width": one.width,
         # Stretches are numbered from the recording's first sample; a jump is a gap.
-        "runs": _runs(np.round(one.time / one.width - 0.5).astype(np.int64)),
+        "runs": runs_of(np.round(one.time / one.width - 0.5).astype(np.int64)),
         "joints": [
             {
                 "torque": packed(joint.torque),
@@ -159,7 +159,7 @@ def _recording_document(one: Traced) -> dict[str, Any]:
     }
 
 
-def _runs(numbers: np.ndarray[Any, np.dtype[np.int64]]) -> list[list[int]]:
+def runs_of(numbers: np.ndarray[Any, np.dtype[np.int64]]) -> list[list[int]]:
     """First number and length of every run of consecutive numbers."""
     begins = np.flatnonzero(np.diff(numbers, prepend=numbers[0] - 2) != 1)
     return [[int(numbers[b]), int(n)] for b, n in zip(begins, np.diff(begins, append=len(numbers)), strict=True)]

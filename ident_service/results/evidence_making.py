@@ -174,6 +174,4 @@ class _Seen:
         frequency, density = self._welch.density()
         lag, correlation = self._welch.correlation()
         white = self._welch.white
-        return tuple(
-            Spectrum(frequency, density[k], lag, correlation[k], white) for k in range(len(density))
-        )
+        return tuple(Spectrum(frequency, density[k], lag, correlation[k], white) for k in range(len(density)))

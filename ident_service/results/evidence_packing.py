@@ -1,8 +1,8 @@
 """Long arrays as short text that numpy and JavaScript read alike: little-endian 16-bit integers in base64.
 
-A packed array is `{"shape": [...], "low": a, "step": b, "data": "..."}` with value = a + b * (integer + 32768), so that
-it is off by at most half a step, which is the range of the array divided by 131070. Masks are `{"bits": n, "data": "..."}`,
-the first bit of a byte being its lowest.
+A packed array is `{"shape": [...], "low": a, "step": b, "data": "..."}` with value = a + b * (integer + 32768), so
+that it is off by at most half a step, which is the range of the array divided by 131070. Masks are
+`{"bits": n, "data": "..."}`, the first bit of a byte being its lowest.
 """
 
 from __future__ import annotations

@@ -118,7 +118,7 @@ class Welch:
         return self._segments > 0
 
     def density(self) -> tuple[Array, Array]:
-        """Frequencies [Hz], shape (lines,), and densities, shape (series, lines), closer together at low frequencies."""
+        """Frequencies [Hz], shape (lines,), and densities, shape (series, lines), denser at low frequencies."""
         frequency = np.arange(1, self._density.shape[1]) * self.rate / self.length
         density = self._density[:, 1:] / max(self._segments, 1)
         edges = np.unique(np.geomspace(1, len(frequency) + 1, _LINES + 1).astype(int)) - 1

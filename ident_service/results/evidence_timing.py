@@ -1,4 +1,4 @@
-"""How evenly samples were taken: from the loop's own account of every cycle where a recording has it, else from stamps."""
+"""How evenly samples were taken: from the loop's account of its cycles where a recording has one, else from stamps."""
 
 from __future__ import annotations
 
