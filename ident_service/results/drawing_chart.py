@@ -51,7 +51,7 @@ def draw_frame(canvas: Canvas, axes: Axes, *, x: str, y: str, x_log: bool = Fals
         canvas.line("grid grid-x", at, axes.top, at, bottom)
         if x:
             canvas.text("soft tick-x", at, bottom + _LINE, words, size=FONT, anchor="middle")
-    for value, words in _ticks(axes.low_y, axes.high_y, y_log, max(2, int(axes.height / 32))):
+    for value, words in _ticks(axes.low_y, axes.high_y, y_log, max(4, int(axes.height / 32))):
         at = float(axes.y(value))
         canvas.line("grid", axes.left, at, right, at)
         canvas.text("soft", axes.left - 5, at + 4, words, size=FONT, anchor="end")

@@ -27,6 +27,8 @@ class Estimated:
         margin: of the feasibility test, whose sign is the verdict; None where it was not tested.
         identification: relative torque error on what was fitted to (eq. 84) [percent]; None where it was not computed.
         validation: likewise on every recording that was never fitted to.
+        moving: as `identification`, without rows of joints near standstill, whose friction nobody knows.
+        moving_validation: likewise on every recording that was never fitted to.
     """
 
     name: str
@@ -34,6 +36,8 @@ class Estimated:
     margin: float | None
     identification: float | None
     validation: tuple[float, ...]
+    moving: float | None = None
+    moving_validation: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)

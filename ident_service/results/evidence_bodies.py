@@ -1,7 +1,7 @@
 """The links as bodies: how far inside each condition they lie, and the ellipsoids that move as they do.
 
-A solid ellipsoid of uniform density with half axes a_1, a_2, a_3 and mass m has second moments m a_i^2 / 5 about its
-centre. So the ellipsoid with a link's mass, centre and inertia has a_i = sqrt(5 s_i / m), with s_i the eigenvalues
+A solid ellipsoid of uniform density with half axes a_1, a_2, a_3 and mass m has second moments m a_i^2 / 5 about
+its centre. So the ellipsoid with a link's mass, centre and inertia has a_i = sqrt(5 s_i / m), with s_i the eigenvalues
 of Sigma = tr(I)/2 1 - I, I the inertia about the centre of mass; it exists where all of them are positive, which is what
 `pseudo_inertia` asks for.
 """

@@ -99,6 +99,8 @@ def evidence_document(evidence: Evidence) -> dict[str, Any]:
                 "margin": one.margin,
                 "identification": one.identification,
                 "validation": list(one.validation),
+                "moving": one.moving,
+                "moving_validation": list(one.moving_validation),
             }
             for one in evidence.estimates
         ],
@@ -220,6 +222,8 @@ def _evidence(content: Mapping[str, Any]) -> Evidence:
                 one["margin"],
                 one["identification"],
                 tuple(one["validation"]),
+                one["moving"],
+                tuple(one["moving_validation"]),
             )
             for one in estimates
         ),

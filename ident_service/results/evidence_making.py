@@ -94,9 +94,16 @@ def gather_evidence(
 
 def _estimates(estimate: Estimate) -> tuple[Estimated, ...]:
     def of(candidate: Candidate) -> Estimated:
-        scores = tuple(score.error.relative_percent for score in candidate.validation)
-        fitted = candidate.identification.relative_percent
-        return Estimated(candidate.name, candidate.beta, candidate.margin, fitted, scores)
+        scores = candidate.validation
+        return Estimated(
+            name=candidate.name,
+            values=candidate.beta,
+            margin=candidate.margin,
+            identification=candidate.identification.relative_percent,
+            validation=tuple(score.error.relative_percent for score in scores),
+            moving=candidate.moving.relative_percent,
+            moving_validation=tuple(score.moving.relative_percent for score in scores),
+        )
 
     found = [of(candidate) for candidate in estimate.candidates]
     prior = estimate.model.prior

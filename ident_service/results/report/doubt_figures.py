@@ -58,12 +58,14 @@ def deviation_figure(parameters: ParameterFile) -> Figure | None:
     canvas = Canvas(WIDTH, _TOP + _HEIGHT + _BOTTOM)
     size = len(shares)
     axes = Axes(LEFT, _TOP, WIDTH - LEFT - RIGHT, _HEIGHT, 0.0, size + 1.0, np.log10(low) - 0.1, np.log10(high) + 0.1)
-    draw_key(canvas, WIDTH - RIGHT, 16, [("dot", kind, word) for word, kind in _KINDS.items()])
+    draw_key(
+        canvas, WIDTH - RIGHT, 16, [("dot" if kind == "good" else "area", kind, word) for word, kind in _KINDS.items()]
+    )
     draw_frame(canvas, axes, x="number of the base parameter, as in the table", y="relative deviation", y_log=True)
     for level in (IDENTIFIED_BELOW, WEAK_BELOW):
         y = float(axes.y(np.log10(level)))
         canvas.line("limit", LEFT, y, WIDTH - RIGHT, y)
-        canvas.text("soft halo", LEFT + 4, y - 3, f"{level:.0%}", size=FONT)
+        canvas.text("soft halo", LEFT + 4, y - 3, f"{100 * level:g} %", size=FONT)
     for place in range(size):
         kind = _KINDS.get(verdicts[place] if place < len(verdicts) else "", "good")
         # Shape tells what colour tells: a ring would not be seen at this size, but a square is.
@@ -80,7 +82,7 @@ def deviation_figure(parameters: ParameterFile) -> Figure | None:
         title="Relative standard deviation of every base parameter",
         description=words,
         caption=(
-            f"{words} Good: round dots below the lower line, where the deviation is below {IDENTIFIED_BELOW:.0%} of "
+            f"{words} Good: round dots below the lower line, where it is below {100 * IDENTIFIED_BELOW:g} % of "
             "the parameter or of what is as good as zero. Bad: squares above the upper line; their values mean nothing."
         ),
         canvas=canvas,

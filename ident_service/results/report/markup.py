@@ -38,7 +38,10 @@ def table(caption: str, heads: Sequence[str], rows: Iterable[Sequence[Cell]], *,
 
     It stands in a region that scrolls by itself where it is wider than the page.
     """
-    head = "".join(f'<th scope="col">{plain(one)}</th>' for one in heads)
+    rows = list(rows)
+    numbers = [any(row[k].value is not None for row in rows) for k in range(len(heads))]
+    kinds = [_class("number" if one else "") for one in numbers]
+    head = "".join(f'<th scope="col"{kind}>{plain(one)}</th>' for one, kind in zip(heads, kinds, strict=True))
     body = "".join(f"<tr>{_row(row)}</tr>" for row in rows)
     return (
         f'<div class="scroll" role="region" tabindex="0" aria-label="{plain(caption)}">'

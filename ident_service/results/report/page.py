@@ -128,9 +128,7 @@ def _torque(evidence: Evidence, drawn: Figures) -> Iterable[str]:
 
 def _bodies(evidence: Evidence, drawn: Figures) -> Iterable[str]:
     if not evidence.conditions:
-        yield paragraph(
-            "No body has these parameters, so there are no link parameters, no margins and no ellipsoids to show."
-        )
+        yield paragraph("No body has these parameters, so there are no link parameters, margins or ellipsoids to show.")
         return
     yield paragraph(
         "Motion shows base parameters only: the bodies are one choice of many that move alike. Good: room well above 0. "

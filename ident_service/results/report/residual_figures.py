@@ -12,7 +12,7 @@ from ident_service.results.report.figure import LEFT, RIGHT, WIDTH, Figure
 _TOP, _HEIGHT, _BETWEEN, _BOTTOM = 42.0, 120.0, 66.0, 40.0
 _GOOD = (
     "Good: a flat spectrum, and an autocorrelation that falls to zero at once and stays between the dashed lines. "
-    "Bad: peaks at the frequencies of the motion or of a gear, and an autocorrelation that swings slowly."
+    "Bad: peaks at frequencies of the motion or of a gear, and an autocorrelation that swings slowly."
 )
 
 
@@ -47,7 +47,7 @@ def _figure(evidence: Evidence, joint: int, shown: list[Traced]) -> Figure:
         canvas.line("limit", LEFT, float(below.y(level)), LEFT + wide, float(below.y(level)))
     for kind, spectrum in zip(kinds, spectra, strict=True):
         canvas.polyline(kind, below.x(spectrum.lag), below.y(np.clip(spectrum.correlation, -1.05, 1.05)))
-    words = f"{name}: {_strongest(spectra[0])}, {_memory(spectra[0])}."
+    words = f"{name}, all rows: {_strongest(spectra[0])}, {_memory(spectra[0])}."
     return Figure(
         slug=f"residual-{joint + 1}",
         title=f"{name}: spectrum and autocorrelation of the residual",

@@ -37,7 +37,7 @@ def parameter_table(evidence: Evidence, parameters: ParameterFile) -> str:
     heads = ["no.", "base parameter", "unit", *names, "\u03c3", "verdict", "bound"]
     rows = []
     for k, expression in enumerate(content["expressions"]):
-        cells = [Cell(str(k + 1)), Cell(expression, kind="expression"), Cell(units[k])]
+        cells = [Cell(str(k + 1)), Cell(expression, kind="expression"), Cell(units[k], kind="unit")]
         cells += [_NOTHING if column is None else _number(float(column[k])) for column in columns]
         cells.append(Cell("not seen", kind="bad") if deviations[k] is None else _number(deviations[k], 2))
         bounds = "; ".join(evidence.bounds[k])
@@ -58,10 +58,12 @@ def error_table(evidence: Evidence) -> str:
         if one.margin is not None:
             feasible = Cell("yes") if one.margin > 0.0 else Cell("NO", kind="bad")
         margin = _NOTHING if one.margin is None else _number(one.margin, 3)
-        errors = [_number(error, 4) for error in (one.identification, *one.validation)]
+        whole, moving = (one.identification, *one.validation), (one.moving, *one.moving_validation)
+        errors = [_number(error, 4) for pair in zip(whole, moving, strict=True) for error in pair]
         rows.append([Cell(one.name + mark), feasible, margin, *errors])
-    heads = ["estimate", "feasible", "margin", "fitted [%]", *(f"{name} [%]" for name in unseen)]
-    return table("Relative torque error (eq. 84) of every estimate", heads, rows)
+    heads = ["estimate", "feasible", "margin"]
+    heads += [f"{name} {rows_of} [%]" for name in ("fitted", *unseen) for rows_of in ("all rows", "moving")]
+    return table("Relative torque error (eq. 84) of every estimate, on all rows and away from standstill", heads, rows)
 
 
 def joint_table(evidence: Evidence, parameters: ParameterFile) -> str:
@@ -127,6 +129,8 @@ def file_table(evidence: Evidence, parameters: ParameterFile, sha256: Mapping[st
     return table("Files", ["what", "SHA-256"], rows)
 
 
-def _number(value: float, digits: int = 5) -> Cell:
+def _number(value: float | None, digits: int = 5) -> Cell:
+    if value is None:
+        return _NOTHING
     words = number(value, digits)
     return Cell(words, float(value)) if np.isfinite(value) else _NOTHING

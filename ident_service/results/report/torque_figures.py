@@ -14,8 +14,8 @@ from ident_service.results.report.figure import LEFT, RIGHT, WIDTH, Figure, Zoom
 _TOP, _TORQUE, _RESIDUAL, _BETWEEN, _BOTTOM = 42.0, 150.0, 74.0, 26.0, 40.0
 _COLUMNS = 440
 _GOOD = (
-    "Good: both lines lie on each other and what is left is noise about zero. "
-    "Bad: what is left follows the motion, or jumps where the joint turns round."
+    "Good: both lines lie on each other and their difference is noise about zero, but for spikes where a joint turns "
+    "round. Bad: a difference that follows the motion."
 )
 
 
@@ -35,7 +35,7 @@ def _figure(evidence: Evidence, recording: int, joint: int) -> Figure:
     canvas = Canvas(WIDTH, below + _RESIDUAL + _BOTTOM)
     above = Axes(LEFT, _TOP, WIDTH - LEFT - RIGHT, _TORQUE, *time, *torque)
     under = Axes(LEFT, below, WIDTH - LEFT - RIGHT, _RESIDUAL, *time, *residual)
-    key = [("area", "measured", "measured"), ("area", "predicted", "predicted"), ("area", "residual", "left")]
+    key = [("area", "measured", "measured"), ("area", "predicted", "predicted"), ("area", "residual", "difference")]
     if trace.standstill.any():
         key.insert(0, ("area", "ramp", "not fitted"))
     draw_key(canvas, WIDTH - RIGHT, 16, key)
@@ -54,7 +54,7 @@ def _figure(evidence: Evidence, recording: int, joint: int) -> Figure:
         canvas.clip(None)
     largest = float(np.abs(trace.residual).max())
     size = float(np.abs(trace.torque).max())
-    words = f"{name}: torque up to {number(size)} {unit}, at most {number(largest)} {unit} left."
+    words = f"{name}: torque up to {number(size)} {unit}, difference up to {number(largest)} {unit}."
     return Figure(
         slug=f"torque-{recording + 1}-{traced.role}-{joint + 1}",
         title=f"{name}: measured and predicted torque, {traced.name}",

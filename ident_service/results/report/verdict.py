@@ -52,16 +52,31 @@ def _feasibility(evidence: Evidence, parameters: ParameterFile) -> list[str]:
 
 def _prediction(evidence: Evidence) -> str:
     own = evidence.estimates[evidence.chosen]
-    fitted = "" if own.identification is None else f"{number(own.identification)} % on what it was fitted to"
+    fitted = "" if own.identification is None else _error(own.identification, own.moving)
     unseen = [one.name for one in evidence.recordings if one.role == "validation"]
     if not own.validation:
-        known = f" (its torque error is {fitted})" if fitted else ""
+        known = f" (on what it was fitted to its torque error is {fitted})" if fitted else ""
         return f"It was judged on no recording that it had not seen{known}, so how well it predicts is not known."
-    errors = ", ".join(f"{number(error)} % on {name}" for name, error in zip(unseen, own.validation, strict=True))
-    words = f"On what it never saw its torque error is {errors}, against {fitted}"
-    if own.identification is not None and max(own.validation) > _MUCH_WORSE * own.identification:
+    moving = own.moving_validation or (None,) * len(own.validation)
+    errors = ", ".join(
+        f"{_error(error, alone)} on {name}" for name, error, alone in zip(unseen, own.validation, moving, strict=True)
+    )
+    words = f"On what it never saw its torque error is {errors}, against {fitted} on what it was fitted to"
+    if _worse(evidence):
         return f"{words}: it predicts other motions markedly worse than its own."
     return f"{words}: it predicts other motions about as well as its own."
+
+
+def _error(whole: float, moving: float | None) -> str:
+    return f"{number(whole)} %" + ("" if moving is None else f" ({number(moving)} % away from standstill)")
+
+
+def _worse(evidence: Evidence) -> bool:
+    """Whether it predicts unseen motions markedly worse than its own; judged where friction is known, if that is told."""
+    own = evidence.estimates[evidence.chosen]
+    if own.moving is not None and own.moving_validation:
+        return max(own.moving_validation) > _MUCH_WORSE * own.moving
+    return own.identification is not None and max(own.validation, default=0.0) > _MUCH_WORSE * own.identification
 
 
 def _knowledge(parameters: ParameterFile) -> str:
@@ -70,8 +85,8 @@ def _knowledge(parameters: ParameterFile) -> str:
     if verdicts is None:
         return "How sure its parameters are is not known."
     counts = {word: verdicts.count(word) for word in ("identified", "weak", "unidentified")}
-    words = f"Of {len(verdicts)} base parameters {counts['identified']} are identified to {IDENTIFIED_BELOW:.0%}"
-    words += f", {counts['weak']} are weak (to {WEAK_BELOW:.0%}) and {counts['unidentified']} unidentified"
+    words = f"Of {len(verdicts)} base parameters {counts['identified']} are identified to {100 * IDENTIFIED_BELOW:g} %"
+    words += f", {counts['weak']} are weak (to {100 * WEAK_BELOW:g} %) and {counts['unidentified']} unidentified"
     unknown = [table["expressions"][k] for k, word in enumerate(verdicts) if word == "unidentified"]
     if not unknown:
         return words + "."
@@ -89,7 +104,7 @@ def _next(evidence: Evidence, parameters: ParameterFile) -> str:
     own = evidence.estimates[evidence.chosen]
     if not own.validation:
         steps.append("record a second motion and give it with --validate")
-    elif own.identification is not None and max(own.validation) > _MUCH_WORSE * own.identification:
+    elif _worse(evidence):
         steps.append("look below at which joint's residual follows the motion, and identify from a richer one")
     if "unidentified" in parameters.content["base_parameters"].get("verdicts", []):
         steps.append(
