@@ -2,8 +2,8 @@
 
 A solid ellipsoid of uniform density with half axes a_1, a_2, a_3 and mass m has second moments m a_i^2 / 5 about
 its centre. So the ellipsoid with a link's mass, centre and inertia has a_i = sqrt(5 s_i / m), with s_i the eigenvalues
-of Sigma = tr(I)/2 1 - I, I the inertia about the centre of mass; it exists where all of them are positive, which is what
-`pseudo_inertia` asks for.
+of Sigma = tr(I)/2 1 - I, I the inertia about the centre of mass; it exists where all of them are positive, as
+`pseudo_inertia` asks.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -23,14 +24,23 @@ class Cell:
     kind: str = ""
 
 
+def prose(words: str) -> str:
+    """Text in which no line ends between a number and its unit."""
+    return plain(re.sub(r"(?<=\d) (N m|N|%|ms|s|Hz|kg|MB)(?=[\s.,;:)]|$)", _joined, words))
+
+
+def _joined(unit: re.Match[str]) -> str:
+    return unit[0].replace(" ", "\u00a0")
+
+
 def paragraph(words: str, kind: str = "") -> str:
     """A paragraph."""
-    return f"<p{_class(kind)}>{plain(words)}</p>"
+    return f"<p{_class(kind)}>{prose(words)}</p>"
 
 
 def items(rows: Iterable[str]) -> str:
     """A list."""
-    return "<ul>" + "".join(f"<li>{plain(row)}</li>" for row in rows) + "</ul>"
+    return "<ul>" + "".join(f"<li>{prose(row)}</li>" for row in rows) + "</ul>"
 
 
 def table(caption: str, heads: Sequence[str], rows: Iterable[Sequence[Cell]], *, kind: str = "") -> str:

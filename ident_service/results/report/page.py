@@ -24,7 +24,7 @@ from ident_service.results.evidence_packing import packed, packed_mask
 from ident_service.results.parameter_file import ParameterFile
 from ident_service.results.report.figure import Figure, Zoom
 from ident_service.results.report.figures import Figures, figures
-from ident_service.results.report.markup import items, paragraph, section
+from ident_service.results.report.markup import items, paragraph, prose, section
 from ident_service.results.report.tables import (
     axis_table,
     error_table,
@@ -81,7 +81,11 @@ def _sections(
     evidence: Evidence, parameters: ParameterFile, drawn: Figures, sha256: Mapping[str, str]
 ) -> Iterable[str]:
     yield section("verdict", "Verdict", paragraph(" ".join(verdict(evidence, parameters)), "verdict"))
-    warnings = items(evidence.warnings) if evidence.warnings else paragraph("None: the recordings are sound.")
+    warnings = (
+        items(evidence.warnings)
+        if evidence.warnings
+        else paragraph("None: rate, jitter, gaps, saturation and standstill of the recordings are as they should be.")
+    )
     yield section("warnings", "Warnings", warnings)
     no_cad = (
         ""
@@ -128,7 +132,7 @@ def _torque(evidence: Evidence, drawn: Figures) -> Iterable[str]:
 
 def _bodies(evidence: Evidence, drawn: Figures) -> Iterable[str]:
     if not evidence.conditions:
-        yield paragraph("No body has these parameters, so there are no link parameters, margins or ellipsoids to show.")
+        yield paragraph("No body has these parameters, so there are no link parameters, margins or ellipsoids.")
         return
     yield paragraph(
         "Motion shows base parameters only: the bodies are one choice of many that move alike. Good: room well above 0. "
@@ -165,7 +169,7 @@ def _figure(figure: Figure) -> str:
     about = "" if figure.zoom is None else _zoom(figure.zoom)
     return (
         f'<figure id="{figure.slug}"{about}>{figure.svg(inline=True)}'
-        f"<figcaption>{plain(figure.caption)}</figcaption></figure>"
+        f"<figcaption>{prose(figure.caption)}</figcaption></figure>"
     )
 
 

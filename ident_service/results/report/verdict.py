@@ -72,7 +72,7 @@ def _error(whole: float, moving: float | None) -> str:
 
 
 def _worse(evidence: Evidence) -> bool:
-    """Whether it predicts unseen motions markedly worse than its own; judged where friction is known, if that is told."""
+    """Whether it predicts unseen motions markedly worse than its own; judged where friction is known, if told."""
     own = evidence.estimates[evidence.chosen]
     if own.moving is not None and own.moving_validation:
         return max(own.moving_validation) > _MUCH_WORSE * own.moving
