@@ -132,11 +132,11 @@ def _torque(evidence: Evidence, drawn: Figures) -> Iterable[str]:
 
 def _bodies(evidence: Evidence, drawn: Figures) -> Iterable[str]:
     if not evidence.conditions:
-        yield paragraph("No body has these parameters, so there are no link parameters, margins or ellipsoids.")
+        yield paragraph("No body has these parameters, so there are no link parameters, no margins, no ellipsoids.")
         return
     yield paragraph(
-        "Motion shows base parameters only: the bodies are one choice of many that move alike. Good: room well above 0. "
-        "Bad: almost none, where data and condition pull against each other."
+        "Motion shows base parameters only: the bodies are one choice of many that move alike. Good: much room. "
+        "Bad: almost none: data and condition pull against each other."
     )
     yield margin_table(evidence)
     yield _grid(drawn.bodies, "")
