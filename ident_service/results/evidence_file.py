@@ -13,7 +13,9 @@ import jsonschema
 import numpy as np
 
 from ident_service.errors import ParameterError, UsageError
+from ident_service.results.drawing import LARGEST
 from ident_service.results.evidence import (
+    Array,
     Body,
     Condition,
     Estimated,
@@ -27,9 +29,11 @@ from ident_service.results.evidence import (
 )
 from ident_service.results.evidence_packing import packed, packed_mask, unpacked, unpacked_mask
 from ident_service.results.files import write_atomically
+from ident_service.results.strict_json import strict_json
 
 EVIDENCE = "evidence.json"
 MAX_BYTES = 64 * 2**20
+_LARGEST_LOG = 60.0  # ten to the power of
 
 
 @cache
@@ -62,7 +66,7 @@ def read_evidence(path: Path) -> Evidence:
     if path.stat().st_size > MAX_BYTES:
         raise ParameterError(f"{path}: larger than {MAX_BYTES} bytes")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = strict_json(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise ParameterError(f"{path}: torn, or not JSON: {error}; identify again") from None
     _validate(content, path)
@@ -247,6 +251,19 @@ def _require(holds: bool, words: str) -> None:
         raise ParameterError(f"its parts do not belong together: {words}")
 
 
+def _numbers(values: Any) -> Array:
+    """Numbers that a pixel can be computed from."""
+    array = np.array(values, float)
+    _require(bool((np.abs(array) < LARGEST).all()), f"a number of {float(np.abs(array).max(initial=0.0)):.3g}")
+    return array
+
+
+def _densities(content: Mapping[str, Any], lines: int) -> Array:
+    logs = unpacked(content, (lines,))
+    _require(bool((np.abs(logs) < _LARGEST_LOG).all()), "a density beyond any of an arm")
+    return np.asarray(10.0**logs)
+
+
 def _traced(content: Mapping[str, Any], joints: int) -> Traced:
     _require(len(content["joints"]) == joints, f"{content['name']!r} has {len(content['joints'])} joints, not {joints}")
     _require(len(content["spectra"]) in (0, joints), f"{content['name']!r} has {len(content['spectra'])} spectra")
@@ -266,9 +283,9 @@ def _traced(content: Mapping[str, Any], joints: int) -> Traced:
     )
     spectra = tuple(
         Spectrum(
-            frequency=np.array(one["frequency"], float),
-            density=10.0 ** unpacked(one["log_density"], (len(one["frequency"]),)),
-            lag=np.array(one["lag"], float),
+            frequency=_numbers(one["frequency"]),
+            density=_densities(one["log_density"], len(one["frequency"])),
+            lag=_numbers(one["lag"]),
             correlation=unpacked(one["correlation"], (len(one["lag"]),)),
             white=one["white"],
         )
@@ -280,21 +297,21 @@ def _traced(content: Mapping[str, Any], joints: int) -> Traced:
 
 def _friction(content: Mapping[str, Any]) -> Friction:
     velocity = unpacked(content["velocity"], (None,))
-    curve = [np.array(content[key], float) for key in ("curve_velocity", "curve_torque")]
+    curve = [_numbers(content[key]) for key in ("curve_velocity", "curve_torque")]
     _require(len(curve[0]) == len(curve[1]), "a friction curve of two lengths")
     torque = unpacked(content["torque"], (len(velocity),))
     return Friction(velocity, torque, curve[0], curve[1], tuple(content["terms"]))
 
 
 def _posed(content: Mapping[str, Any], joints: int) -> Posed:
-    points = np.array(content["points"], float)
+    points = _numbers(content["points"])
     _require(len(points) == 1 + 2 * joints and len(content["bodies"]) == joints, "the arm's frames and bodies")
     _require(all(max(branch) < len(points) for branch in content["branches"]), "the arm's branches")
     bodies = tuple(
         Body(
             one["mass"],
-            np.array(one["center"], float),
-            None if one["axes"] is None else np.array(one["axes"], float),
+            _numbers(one["center"]),
+            None if one["axes"] is None else _numbers(one["axes"]),
         )
         for one in content["bodies"]
     )
@@ -308,7 +325,7 @@ def _timing(content: Mapping[str, Any], joints: int) -> Timing:
     return Timing(
         recording=content["recording"],
         source=content["source"],
-        edges=np.array(content["edges"], float),
+        edges=_numbers(content["edges"]),
         counts=np.array(content["counts"], np.int64),
         samples=content["samples"],
         rate=content["rate"],

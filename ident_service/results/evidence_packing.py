@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ident_service.errors import ParameterError
+from ident_service.results.drawing import LARGEST
 from ident_service.results.evidence import Array, Mask
 
 _LEVELS = 65535
@@ -47,6 +48,8 @@ def unpacked(content: Mapping[str, Any], shape: tuple[int | None, ...]) -> Array
         raise ParameterError(f"an array of shape {list(given)} where {[n or 'any' for n in shape]} is needed")
     if int(np.prod(given)) > _MOST or len(data) != 2 * int(np.prod(given)):
         raise ParameterError(f"an array of shape {list(given)} in {len(data)} bytes")
+    if not abs(content["low"]) + _LEVELS * content["step"] < LARGEST:
+        raise ParameterError(f"an array of numbers up to {abs(content['low']) + _LEVELS * content['step']:.3g}")
     levels = np.frombuffer(data, "<i2").astype(float) + 32768.0
     return np.asarray((content["low"] + content["step"] * levels).reshape(given))
 

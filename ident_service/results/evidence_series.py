@@ -128,7 +128,7 @@ class Welch:
 
     def correlation(self) -> tuple[Array, Array]:
         """Lags [s], shape (lags,), and autocorrelations, shape (series, lags); zero where a series is zero."""
-        longest = min(self.length // 2, round(_LONGEST_LAG * self.rate))
+        longest = max(1, min(self.length // 2, round(_LONGEST_LAG * self.rate)))
         step = max(1, longest // _LAGS)
         lags = np.arange(0, longest + 1, step)
         products = self._products[:, lags] / (self.length - lags)

@@ -108,6 +108,16 @@ def test_png_without_its_library_says_how_to_get_it(
     assert not (tmp_path / "figures").exists()
 
 
+def test_png_without_a_font_is_refused(
+    folder: Path, ident: Ident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("resvg_py")
+    monkeypatch.setattr("ident_service.results.figure_files._FONTS", ("No Such Font",))
+    ended = ident("figures", folder, "--format", "png", "--out", tmp_path / "figures")
+    assert ended.code == 2
+    assert "PNG needs one of the fonts No Such Font" in ended.err
+
+
 def test_figures_do_not_go_into_the_results(folder: Path, ident: Ident) -> None:
     ended = ident("figures", folder, "--out", folder)
     assert ended.code == 2

@@ -119,6 +119,10 @@ Change = Callable[[dict[str, Any]], object]
         (lambda c: c["friction"].pop(), "not one friction per drive"),
         (lambda c: c["posed"]["branches"][0].append(99), "the arm's branches"),
         (lambda c: c["recordings"][0].update(sha256="x"), "does not match"),
+        (lambda c: c["recordings"][0]["joints"][0]["torque"].update(step=1e300), "an array of numbers up to"),
+        (lambda c: c["friction"][0]["curve_torque"].__setitem__(0, 1e13), "a number of 1e\\+13"),
+        (lambda c: c["recordings"][0]["spectra"][0]["log_density"].update(low=1e9), "a density beyond any"),
+        (lambda c: c["timing"][0].update(rate=0.0), "rate"),
     ],
 )
 def test_what_does_not_belong_together_is_refused(good: Made, tmp_path: Path, change: Change, reason: str) -> None:
@@ -145,6 +149,9 @@ def test_torn_evidence_is_refused(good: Made, tmp_path: Path, share: float) -> N
         read_evidence(path)
     path.write_text("[" * 100_000)
     with pytest.raises(ParameterError, match="torn, or not JSON"):
+        read_evidence(path)
+    path.write_text(whole.decode().replace('"version":1', '"version":NaN'))
+    with pytest.raises(ParameterError, match="NaN is not a number that JSON knows"):
         read_evidence(path)
     path.write_text("[]")
     with pytest.raises(ParameterError, match="not evidence"):

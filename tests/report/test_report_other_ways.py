@@ -7,13 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from estimation.synthetic import SampledRecording
+from estimation.synthetic import SampledRecording, stamps, waves, with_options
+from helpers.random_arms import model_around, random_chain, random_delta
 from report.conftest import Made, made, recording
 from report.pages import sections
 
 from ident_service.config.schema import Identification, Smoothing
+from ident_service.estimation.identify import identify
+from ident_service.model.regressor import joint_regressor
 from ident_service.results.evidence_making import gather_evidence
 from ident_service.results.evidence_timing import timing
+from ident_service.results.report_files import write_report
+from ident_service.results.run_folder import write_results
 
 
 @pytest.mark.parametrize(
@@ -63,11 +68,6 @@ def test_friction_of_coupled_drives_is_shown_per_drive(tmp_path: Path) -> None:
     coupling = np.array([[1.0, 0.0], [0.5, 1.0]])
     good = made(tmp_path / "results", noise=0.0)
     model = replace(good.model, chain=replace(good.model.chain, coupling=coupling))
-    from estimation.synthetic import stamps, waves
-
-    from ident_service.estimation.identify import identify
-    from ident_service.model.regressor import joint_regressor
-
     time = np.arange(5000) / 250.0
     q, dq, ddq = (waves(1, 2).derivative(time, order) for order in range(3))
     torque = np.einsum("jps,p->sj", joint_regressor(model.chain, model.layout, q, dq, ddq), good.delta)
@@ -83,3 +83,22 @@ def test_friction_of_coupled_drives_is_shown_per_drive(tmp_path: Path) -> None:
         v = friction.velocity[moving]
         true = fv[drive] * v + fc[drive] * np.sign(v) + fo[drive]
         np.testing.assert_allclose(friction.torque[moving], true, atol=0.05)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_any_arm_has_a_report(tmp_path: Path, seed: int) -> None:
+    # From one joint to four, in branches, some that slide.
+    chain = random_chain(np.random.default_rng(seed), seed + 1)
+    arm = with_options(model_around(chain), Identification(smoothing=Smoothing(cutoff=40.0)))
+    fitted = recording(tmp_path, arm, random_delta(np.random.default_rng(seed), arm.layout), 1, 0.01)
+    estimate = identify(arm, [fitted])
+    folder = tmp_path / "results"
+    folder.mkdir()
+    write_results(folder, estimate)
+    write_report(folder, estimate, [fitted], [], [])
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    found = sections(page)
+    assert len(found["torque"].all("figure")) == len(found["friction"].all("figure")) == seed + 1
+    assert len(found["bodies"].all("figure")) == 2
+    if not all(chain.revolute):
+        assert "torque [N]" in found["torque"].words

@@ -2,7 +2,6 @@
 // Draws time plots again over a shorter time: drag to choose one, wheel, keys, double click. The plots of a recording
 // go together. Without this script the page shows all of every recording.
 (() => {
-  const SPACE = "http" + "://www.w3.org/2000/svg";
   const COLUMNS = 500;
   const LEAST = 8; // stretches that can be seen at least
 
@@ -83,7 +82,7 @@
   };
 
   const made = (name, attributes) => {
-    const element = document.createElementNS(SPACE, name);
+    const element = document.createElementNS(document.querySelector("svg").namespaceURI, name);
     for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
     return element;
   };
