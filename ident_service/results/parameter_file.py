@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import jsonschema
 import numpy as np
@@ -28,6 +28,7 @@ from ident_service.model.chain import Array
 from ident_service.model.expressions import parse_expression
 from ident_service.model.layout import INERTIAL, TERM_SYMBOLS
 from ident_service.results.files import write_atomically
+from ident_service.results.strict_json import strict_json
 
 MAX_BYTES = 64 * 2**20
 
@@ -72,9 +73,7 @@ def read_parameters(path: Path, names: tuple[str, ...] | None = None) -> Paramet
     if path.stat().st_size > MAX_BYTES:
         raise ParameterError(f"{path}: larger than {MAX_BYTES} bytes")
     try:
-        content = json.loads(
-            path.read_text(encoding="utf-8"), parse_constant=_refuse, parse_float=_finite, parse_int=_finite_whole
-        )
+        content = strict_json(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise ParameterError(f"{path}: not JSON: {error}") from None
     _validate(content, str(path))
@@ -173,22 +172,6 @@ def _validate(content: Any, where: str) -> None:
     if mistakes:
         listed = "; ".join(f"{mistake.json_path}: {mistake.message[:200]}" for mistake in mistakes[:10])
         raise ParameterError(f"{where}: not a parameter file: {listed}")
-
-
-def _refuse(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is not a number that JSON knows")
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    if not np.isfinite(value):
-        raise ValueError(f"{text[:40]} is too large for a double")
-    return value
-
-
-def _finite_whole(text: str) -> int:
-    _finite(text)
-    return int(text)
 
 
 def _names_in(expressions: tuple[str, ...]) -> tuple[str, ...]:
