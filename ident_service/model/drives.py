@@ -57,3 +57,22 @@ def joint_drives(chain: Chain, layout: Layout, delta: Array) -> JointDrives:
     gear = np.where(own, np.diag(chain.coupling), 0.0)
     inertia, viscous, coulomb = (layout.term_values(term, delta) for term in JOINT_TERMS)
     return JointDrives(own, gear**2 * inertia, gear**2 * viscous, np.abs(gear) * coulomb)
+
+
+@dataclass(frozen=True)
+class WrittenArm:
+    """An arm as some reader found it in a file, joints in the file's order.
+
+    Attributes:
+        chain: the mechanism; link frames are joint frames.
+        bodies: the ten inertial parameters per link (eq. 13), shape (joints, 10).
+        armature: [kg m^2 or kg], shape (joints,).
+        damping: [N m s/rad or N s/m], shape (joints,).
+        friction: dry friction [N m or N], shape (joints,).
+    """
+
+    chain: Chain
+    bodies: Array
+    armature: Array
+    damping: Array
+    friction: Array

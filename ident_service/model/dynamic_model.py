@@ -5,7 +5,7 @@ Pinocchio's algorithms know armature and leave friction alone, though a model ca
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -15,8 +15,8 @@ from ident_service.config.quantities import TextFile
 from ident_service.config.schema import Joint
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.chain import Array, Chain
-from ident_service.model.drives import joint_drives
+from ident_service.model.chain import Array
+from ident_service.model.drives import WrittenArm, joint_drives
 from ident_service.model.rigid_body import mjcf_model, pinocchio_model, read_mjcf, read_urdf, urdf_model
 
 
@@ -113,26 +113,7 @@ def _set_limits(model: pin.Model, arm: ArmModel) -> None:
         model.velocityLimit, model.effortLimit = speed, torque
 
 
-@dataclass(frozen=True)
-class ReadBack:
-    """An arm as pinocchio read it in a file, joints in the file's order.
-
-    Attributes:
-        chain: the mechanism; link frames are joint frames.
-        bodies: the ten inertial parameters per link (eq. 13), shape (joints, 10).
-        armature: [kg m^2 or kg], shape (joints,).
-        damping: [N m s/rad or N s/m], shape (joints,).
-        friction: dry friction [N m or N], shape (joints,).
-    """
-
-    chain: Chain
-    bodies: Array
-    armature: Array
-    damping: Array
-    friction: Array
-
-
-def read_back(file: TextFile, kind: Literal["urdf", "mjcf"], gravity: tuple[float, float, float]) -> ReadBack:
+def read_back(file: TextFile, kind: Literal["urdf", "mjcf"], gravity: tuple[float, float, float]) -> WrittenArm:
     """Read a file that was written, for comparison.
 
     Raises:
@@ -141,4 +122,4 @@ def read_back(file: TextFile, kind: Literal["urdf", "mjcf"], gravity: tuple[floa
     model = urdf_model(file) if kind == "urdf" else mjcf_model(file)
     chain, bodies = (read_urdf if kind == "urdf" else read_mjcf)(file, gravity)
     dry = model.upperDryFrictionLimit if hasattr(model, "upperDryFrictionLimit") else model.friction
-    return ReadBack(chain, bodies, np.array(model.armature), np.array(model.damping), np.array(dry))
+    return WrittenArm(chain, bodies, np.array(model.armature), np.array(model.damping), np.array(dry))

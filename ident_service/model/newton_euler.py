@@ -227,7 +227,7 @@ def _transposed(rotation: Rotation) -> Rotation:
 
 
 def _sum(a: _Body, b: _Body) -> _Body:
-    return _Body([add(x, y) for x, y in zip(a.L, b.L, strict=True)], add(a.l, b.l), a.m + b.m)
+    return _Body([add(x, y) for x, y in zip(a.L, b.L, strict=True)], add(a.first, b.first), a.m + b.m)
 
 
 def _weighted(share: Vector, values: Sequence[Value]) -> Value:
