@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ident_service.errors import ModelError
+from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array
 
 
@@ -38,7 +40,7 @@ def moved(parameters: Array, rotation: Array, translation: Array) -> Array:
 
 
 def about_center(parameters: Array) -> tuple[float, Array, Array]:
-    """Mass [kg], centre of mass [m], shape (3,), and inertia about it [kg m^2], shape (3, 3); the mass must not be 0."""
+    """Mass [kg], centre of mass [m], shape (3,), and inertia about it [kg m^2], shape (3, 3); no massless one."""
     xx, xy, xz, yy, yz, zz, *first, m = parameters
     center = np.array(first) / m
     about_origin = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
@@ -72,3 +74,36 @@ def rotation_rpy(roll: float, pitch: float, yaw: float) -> Array:
             [-sp, cp * sr, cp * cr],
         ]
     )
+
+
+def joint_bodies(model: ArmModel, delta: Array) -> Array:
+    """Each link's ten parameters in its joint's frame, shape (joints, 10).
+
+    Raises:
+        ModelError: a link without positive mass.
+    """
+    chain = model.chain
+    bodies = np.array(
+        [
+            moved(delta[model.layout.inertial(k)], chain.link_rotation[k], chain.link_translation[k])
+            for k in range(chain.joints)
+        ]
+    )
+    for name, body in zip(chain.names, bodies, strict=True):
+        if not body[9] > 0.0:
+            raise ModelError(f"the link of {name} has mass {body[9]:g} kg; give the constrained estimate instead")
+    return bodies
+
+
+def require_real(model: ArmModel, bodies: Array, reader: str) -> None:
+    """Refuse bodies for readers that refuse them.
+
+    Raises:
+        ModelError: no distribution of mass has the inertia of a link.
+    """
+    for name, body in zip(model.chain.names, bodies, strict=True):
+        if not is_real(body):
+            raise ModelError(
+                f"the link of {name} has an inertia that no distribution of mass has, which {reader} refuses; "
+                "identify with the feasible set pseudo_inertia"
+            )

@@ -36,7 +36,7 @@ def c_lines(tape: Tape, inputs: Mapping[int, str], outputs: Sequence[tuple[str, 
         outputs: targets and their values; all of them are written after everything has been read.
     """
     names = dict(inputs)
-    lines = []
+    lines: list[str] = []
     for at in needed_steps(tape, [value.index for _, value in outputs if isinstance(value, Symbol)]):
         operation, a, b = tape.steps[at]
         if operation == "input":
@@ -84,12 +84,12 @@ def run_c_lines(lines: Sequence[str], arrays: Mapping[str, Array]) -> dict[str, 
     def value(text: str) -> Array:
         text = text.strip("()")
         if text.startswith("-") and not text[1].isdigit():
-            return -value(text[1:])
+            return np.asarray(-value(text[1:]))
         if text in known:
             return known[text]
         if text.endswith("]"):
             name, number = text[:-1].split("[")
-            return arrays[name][int(number)]
+            return np.asarray(arrays[name][int(number)])
         return np.full(samples, float(text))
 
     for line in lines:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ident_service import __version__
+from ident_service.config.schema import JointTerm
 from ident_service.errors import ModelError
 from ident_service.model.chain import Array
 from ident_service.model.newton_euler import drive_torque, friction_torque, mass_matrix, rigid_torque
@@ -22,6 +23,7 @@ from ident_service.results.export.check import AGREEMENT, disagreement, random_s
 from ident_service.results.export.words import identifier, plain, unique
 
 _PARAMETER = re.compile(r"^    (-?[\d.e+-]+),? /\* \d+ ")
+_DRIVES: tuple[JointTerm, ...] = ("drive_inertia",)
 _Formulas = Callable[[Tape, dict[int, Value], dict[str, list[Symbol]]], list[Value]]
 
 
@@ -205,7 +207,7 @@ def _check(arm: IdentifiedArm, text: str) -> None:
     def run(function: str) -> Array:
         return read_c_header(text, c_prefix(arm), function, states).T
 
-    links = with_terms(model, delta, ("drive_inertia",))
+    links = with_terms(model, delta, _DRIVES)
     g = torque(model, links, (q, still, still))
     M = np.array([torque(model, links, (q, still, still + unit)) - g for unit in np.eye(n)]).transpose(1, 2, 0)
     pairs: Sequence[tuple[str, Array, Array]] = (

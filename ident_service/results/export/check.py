@@ -55,7 +55,7 @@ def with_terms(model: ArmModel, delta: Array, terms: Collection[JointTerm]) -> A
 
 
 def carried(model: ArmModel, delta: Array, terms: Collection[JointTerm]) -> Carried:
-    """Which values a format with some joint terms carries: those of joints with a drive of their own, if not negative."""
+    """Which values a format with some joint terms carries: no negative ones, and of joints with an own drive only."""
     drives = joint_drives(model.chain, model.layout, delta)
     known = [term for term in JOINT_TERMS if term in terms and term in model.layout.terms]
     return {term: drives.own & (drives.of(term) >= 0.0) for term in known}
@@ -79,25 +79,20 @@ def require_same_torques(model: ArmModel, delta: Array, written: WrittenArm, has
         raise ModelError(f"{refused}: its joints are {', '.join(written.chain.names)}; it was not written")
     order = [written.chain.names.index(joint) for joint in model.chain.names]
     layout = Layout(written.chain.revolute, JOINT_TERMS)
-    values, meant = np.zeros((2, layout.joints, layout.per_link))
+    values = np.zeros((layout.joints, layout.per_link))
     values[:, :10] = written.bodies
-    drives, terms = joint_drives(model.chain, model.layout, delta), {}
-    for place, (term, found) in enumerate(
-        zip(JOINT_TERMS, (written.armature, written.damping, written.friction), strict=True)
-    ):
-        if term in has:
-            terms[term] = np.where(has[term], drives.of(term), 0.0)
-            values[order, 10 + place] = np.where(has[term], found[order], 0.0)
-    states = random_states(model.chain.joints)
-    in_file = [np.empty_like(state) for state in states]
-    for state, own in zip(states, in_file, strict=True):
-        own[:, order] = state
-    predicted = np.einsum("jps,p->sj", joint_regressor(written.chain, layout, *in_file), values.ravel())[:, order]
-    _, velocity, acceleration = states
+    states = position, velocity, acceleration = random_states(model.chain.joints)
     shape: dict[JointTerm, Array] = {"drive_inertia": acceleration, "viscous": velocity, "coulomb": np.sign(velocity)}
-    meant = torque(model, with_terms(model, delta, ()), states) + sum(
-        value * shape[term] for term, value in terms.items()
-    )
+    found = dict(zip(JOINT_TERMS, (written.armature, written.damping, written.friction), strict=True))
+    drives = joint_drives(model.chain, model.layout, delta)
+    meant = torque(model, with_terms(model, delta, ()), states)
+    for place, term in enumerate(JOINT_TERMS):
+        if term in has:
+            values[order, 10 + place] = np.where(has[term], found[term][order], 0.0)
+            meant = meant + np.where(has[term], drives.of(term), 0.0) * shape[term]
+    back = np.argsort(order)  # from our order to the file's
+    H = joint_regressor(written.chain, layout, position[:, back], velocity[:, back], acceleration[:, back])
+    predicted = np.einsum("jps,p->sj", H, values.ravel())[:, order]
     if not (apart := disagreement(predicted, meant)) <= AGREEMENT:
         raise ModelError(f"{refused}: torques are up to {apart:.1e} of the largest apart; it was not written")
 

@@ -1,23 +1,54 @@
-"""Exports, each read back by an independent reader before it is kept."""
+"""URDF: the arm's own file with identified values where a URDF describes it, a generated one elsewhere.
+
+URDF has a place for viscous and dry friction of a joint, none for gravity, drive inertia or any other term.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from ident_service.config.quantities import TextFile
-from ident_service.errors import ModelError
+from ident_service.config.schema import JointTerm
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array
 from ident_service.model.urdf import urdf_text
+from ident_service.results.export.check import carried, left_out, require_same_torques
+from ident_service.results.export.original_urdf import original_urdf
 from ident_service.results.files import write_atomically
 
-_AGREEMENT = 1e-9
+_TERMS: tuple[JointTerm, ...] = ("viscous", "coulomb")
+
+
+def urdf_export(model: ArmModel, delta: Array, name: str) -> tuple[str, tuple[str, ...], tuple[str, ...]]:
+    """The identified URDF, after pinocchio has read the same torques out of it.
+
+    Args:
+        model: the arm.
+        delta: link parameters, shape (layout.size,).
+        name: of the file, for errors.
+
+    Returns:
+        The text, what it does not carry, and notes.
+
+    Raises:
+        ModelError: a link has no positive mass, or the file does not say what it should.
+    """
+    from ident_service.model.dynamic_model import read_back
+
+    has = carried(model, delta, _TERMS)
+    notes: tuple[str, ...] = ()
+    if model.config.kinematics.urdf is not None:
+        text, notes = original_urdf(model, delta, has)
+    else:
+        text = urdf_text(model, delta)
+    written = read_back(TextFile(name=name, text=text), "urdf", model.config.gravity)
+    require_same_torques(model, delta, written, has, name)
+    gravity = "gravity" if any(model.config.gravity) else ""
+    return text, tuple(filter(None, (gravity, *left_out(model, delta, has)))), notes
 
 
 def write_urdf(path: Path, model: ArmModel, delta: Array) -> None:
-    """Write the identified URDF, after pinocchio has read the same inertias out of it.
+    """Write the identified URDF, after pinocchio has read the same torques out of it.
 
     Args:
         path: the file.
@@ -28,14 +59,5 @@ def write_urdf(path: Path, model: ArmModel, delta: Array) -> None:
         ModelError: a link has no positive mass, or the file does not say what it should.
         UsageError: the file cannot be written.
     """
-    from ident_service.model.rigid_body import delta_from_inertia, joint_frame_inertias, read_urdf
-
-    text = urdf_text(model, delta)
-    chain, found = read_urdf(TextFile(name=path.name, text=text), model.config.gravity)
-    meant = np.array(
-        [delta_from_inertia(inertia) for inertia in joint_frame_inertias(model.chain, model.layout, delta)]
-    )
-    scale = np.maximum(np.abs(meant), np.abs(meant[:, 9:]))
-    if chain.names != model.chain.names or not np.allclose(found / scale, meant / scale, rtol=0.0, atol=_AGREEMENT):
-        raise ModelError(f"{path}: the URDF read back differs from the parameters; it was not written")
+    text, _, _ = urdf_export(model, delta, str(path))
     write_atomically(path, text)
