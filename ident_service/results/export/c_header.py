@@ -81,6 +81,7 @@ def _preface(arm: IdentifiedArm, name: str) -> str:
  *   {name}_gravity(q, tau)                    g(q)
  *   {name}_mass_matrix(q, M)                  M(q) by rows, all of it, drive inertia included
  *
+ * The offset of a sliding joint, if no motion tells it from gravity, is part of g(q), which {name}_friction then lacks.
  * Every array has {name}_JOINTS entries, M their square; results may overwrite arguments. No memory is allocated,
  * nothing global is written, only <math.h> is used; C99 and C++.
  *
@@ -204,15 +205,16 @@ def _check(arm: IdentifiedArm, text: str) -> None:
     delta = arm.base_delta if arm.delta is None else arm.delta
     states = {"q": q.T, "dq": dq.T, "ddq": ddq.T}
 
-    def run(function: str) -> Array:
-        return read_c_header(text, c_prefix(arm), function, states).T
+    def run(function: str, at: dict[str, Array] = states) -> Array:
+        return read_c_header(text, c_prefix(arm), function, at).T
 
     links = with_terms(model, delta, _DRIVES)
     g = torque(model, links, (q, still, still))
     M = np.array([torque(model, links, (q, still, still + unit)) - g for unit in np.eye(n)]).transpose(1, 2, 0)
     pairs: Sequence[tuple[str, Array, Array]] = (
         ("inverse dynamics", run("rigid_dynamics") + run("friction"), torque(model, delta, (q, dq, ddq))),
-        ("gravity", run("gravity"), g),
+        # Where offsets are grouped with masses, only the sum is the same.
+        ("gravity", run("gravity") + run("friction", {"dq": still.T}), torque(model, delta, (q, still, still))),
         ("mass matrix", run("mass_matrix"), M.reshape(len(q), n * n)),
     )
     for what, found, meant in pairs:
