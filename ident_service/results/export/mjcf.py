@@ -70,8 +70,12 @@ def _text(model: ArmModel, delta: Array, has: Carried, shared: Carried, lost: tu
         root.append(ET.Comment(f" This format has no place for: {plain('; '.join(lost))}. "))
     ET.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     ET.SubElement(root, "option", gravity=_numbers(chain.gravity))
+    *names, base = unique((*chain.names, *(f"{name}_link" for name in chain.names), "base_link"))[chain.joints :]
     places = {WORLD: ET.SubElement(root, "worldbody")}
-    names = unique((*chain.names, *(f"{name}_link" for name in chain.names)))[chain.joints :]
+    if chain.parents.count(WORLD) > 1:
+        # Of several bodies in the world, pinocchio reads the first: one that does not move holds them all.
+        places[WORLD] = ET.SubElement(places[WORLD], "body", name=base)
+        ET.SubElement(places[WORLD], "inertial", pos="0 0 0", mass="0", diaginertia="0 0 0")
     drives = joint_drives(chain, model.layout, delta)
     for k, name in enumerate(chain.names):
         body = places[k] = ET.SubElement(
