@@ -33,6 +33,12 @@ def random_states(joints: int, samples: int = _STATES) -> States:
     return position, velocity, acceleration
 
 
+def gravity_of(model: ArmModel) -> tuple[float, float, float]:
+    """Gravity in the base frame [m/s^2]."""
+    x, y, z = (float(component) for component in model.chain.gravity)
+    return x, y, z
+
+
 def disagreement(found: Array, meant: Array) -> float:
     """Largest difference, relative to the largest value meant."""
     if not np.all(np.isfinite(found)):

@@ -18,7 +18,7 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array
 from ident_service.model.drives import JOINT_TERMS, joint_drives
 from ident_service.results.export.bodies import about_center, joint_bodies, require_real
-from ident_service.results.export.check import Carried, carried, left_out, require_same_torques
+from ident_service.results.export.check import Carried, carried, gravity_of, left_out, require_same_torques
 from ident_service.results.export.words import plain, unique
 from ident_service.results.export.xml_places import xml_places
 
@@ -48,7 +48,7 @@ def mjcf_export(model: ArmModel, delta: Array, name: str) -> tuple[str, tuple[st
     if any(joint.velocity is not None for joint in model.config.joints.values()):
         lost = (*lost, "velocity limits")
     text = _text(model, delta, has, shared, lost)
-    written = read_back(TextFile(name=name, text=text), "mjcf", model.config.gravity)
+    written = read_back(TextFile(name=name, text=text), "mjcf", gravity_of(model))
     require_same_torques(model, delta, written, has, name)
     _require_same_tendons(model, delta, text, shared, name)
     return text, lost

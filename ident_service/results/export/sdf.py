@@ -15,7 +15,7 @@ from ident_service.model.chain import WORLD, Array
 from ident_service.model.drives import joint_drives
 from ident_service.model.urdf import roll_pitch_yaw
 from ident_service.results.export.bodies import about_center, joint_bodies, require_real
-from ident_service.results.export.check import Carried, carried, left_out, require_same_torques
+from ident_service.results.export.check import Carried, carried, gravity_of, left_out, require_same_torques
 from ident_service.results.export.sdf_reader import read_sdf
 from ident_service.results.export.words import plain, unique
 
@@ -39,11 +39,11 @@ def sdf_export(model: ArmModel, delta: Array, name: str) -> tuple[str, tuple[str
         ModelError: a link that no real body is, or the file does not say what it should.
     """
     has = carried(model, delta, _TERMS)
-    gravity = ("gravity",) if any(model.config.gravity) else ()
+    gravity = ("gravity",) if model.chain.gravity.any() else ()
     lost = (*gravity, *left_out(model, delta, has))
     joints = _names(model)
     text = _text(model, delta, has, joints, lost)
-    written = read_sdf(text, name, model.config.gravity, dict(zip(joints, model.chain.names, strict=True)))
+    written = read_sdf(text, name, gravity_of(model), dict(zip(joints, model.chain.names, strict=True)))
     require_same_torques(model, delta, written, has, name)
     renamed = [f"{own} is called {new}" for own, new in zip(model.chain.names, joints, strict=True) if own != new]
     return text, lost, tuple(renamed)

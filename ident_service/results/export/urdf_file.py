@@ -12,7 +12,7 @@ from ident_service.config.schema import JointTerm
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array
 from ident_service.model.urdf import urdf_text
-from ident_service.results.export.check import carried, left_out, require_same_torques
+from ident_service.results.export.check import carried, gravity_of, left_out, require_same_torques
 from ident_service.results.export.original_urdf import original_urdf
 from ident_service.results.files import write_atomically
 
@@ -41,9 +41,9 @@ def urdf_export(model: ArmModel, delta: Array, name: str) -> tuple[str, tuple[st
         text, notes = original_urdf(model, delta, has)
     else:
         text = urdf_text(model, delta)
-    written = read_back(TextFile(name=name, text=text), "urdf", model.config.gravity)
+    written = read_back(TextFile(name=name, text=text), "urdf", gravity_of(model))
     require_same_torques(model, delta, written, has, name)
-    gravity = "gravity" if any(model.config.gravity) else ""
+    gravity = "gravity" if model.chain.gravity.any() else ""
     return text, tuple(filter(None, (gravity, *left_out(model, delta, has)))), notes
 
 
