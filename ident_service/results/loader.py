@@ -8,6 +8,7 @@ from pathlib import Path
 from ident_service.config.load import arm_from_json, load_arm
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import ModelError, ParameterError, UsageError
+from ident_service.model.arm_model import arm_model
 from ident_service.model.dynamic_model import DynamicModel
 from ident_service.results.export.arm import IdentifiedArm, identified_arm, read_identified
 from ident_service.results.parameter_file import read_parameters
@@ -37,18 +38,18 @@ def _identified(path: Path, arm: str | Path | None) -> IdentifiedArm:
     config = arm_from_json(beside) if arm is None else load_arm(arm)
     if arm is None and named and named["sha256"] != config.sha256:
         raise ParameterError(f"{file}: was identified for another arm than {beside} describes")
-    source = hashlib.sha256(file.read_bytes()).hexdigest()
-    found = identified_arm(_as_identified(config, parameters.content), parameters, source, file)
-    if named and tuple(named["joints"]) != found.model.chain.names:
+    joints = arm_model(config).chain.names
+    if named and tuple(named["joints"]) != joints:
         raise ParameterError(f"{file}: is about the joints {', '.join(named['joints'])}, not those of {config.name}")
-    return found
+    source = hashlib.sha256(file.read_bytes()).hexdigest()
+    return identified_arm(_as_identified(config, parameters.content, len(joints)), parameters, source, file)
 
 
-def _as_identified(config: ArmConfig, content: dict[str, object]) -> ArmConfig:
+def _as_identified(config: ArmConfig, content: dict[str, object], joints: int) -> ArmConfig:
     """The arm with the friction's shape that a parameter file was fitted with."""
     friction = content.get("friction")
     velocity = friction.get("stribeck_velocity") if isinstance(friction, dict) else None
-    if not velocity:
+    if not velocity or len(velocity) != joints:
         return config
     shape = config.identification.friction.model_copy(update={"stribeck_velocity": tuple(velocity)})
     return config.model_copy(update={"identification": config.identification.model_copy(update={"friction": shape})})
