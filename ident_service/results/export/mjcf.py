@@ -1,7 +1,7 @@
 """MJCF: bodies, armature, damping, dry friction, limits and motors; gravity as in the arm's description.
 
 A drive that moves several joints becomes a fixed tendon, whose armature, damping and frictionloss are those of the
-drive; MuJoCo knows the armature of tendons since 3.3. Bodies' frames are joint frames.
+drive; MuJoCo knows the armature of tendons since 3.3.1. Bodies' frames are joint frames.
 """
 
 from __future__ import annotations
