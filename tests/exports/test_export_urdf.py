@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 import tempfile
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
@@ -239,6 +240,15 @@ def test_a_bolted_link_that_is_no_body_itself_does_not_stay(tmp_path: Path) -> N
     assert all(is_real(body) for body in link_bodies(written_text).values())
 
 
+def test_a_bolted_link_of_nothing_stays_as_it_is(tmp_path: Path) -> None:
+    zero = '<link name="frame"><inertial><mass value="0"/><inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/>'
+    text = FOREIGN.replace('<link name="frame"/>', f"{zero}</inertial></link>")
+    model = foreign(tmp_path, text)
+    found, notes = written(model, weights(model))
+    assert notes[0].endswith("as it was: tool, camera")
+    assert zero in found
+
+
 def test_exporting_twice_changes_nothing_more(tmp_path: Path) -> None:
     model = foreign(tmp_path)
     delta = weights(model)
@@ -252,7 +262,8 @@ def test_exporting_twice_changes_nothing_more(tmp_path: Path) -> None:
 
 def test_friction_that_the_model_lacks_stays_as_it_was(tmp_path: Path) -> None:
     model = arm_of_file(tmp_path, "urdf", FOREIGN, terms="[drive_inertia, viscous]")
-    text, _ = written(model, weights(model))
+    text, notes = written(model, weights(model))
+    assert "joint one has the friction of the original file" in notes
     found = re.search(r"<dynamics friction=\"9\" comment=\"old\" damping=\"([^\"]+)\"/>", text)
     assert found is not None
     assert float(found.group(1)) == model.layout.term_values("viscous", weights(model))[0]
@@ -278,6 +289,25 @@ def test_random_files_take_other_bodies(seed: int, joints: int, square: bool) ->
     new, _ = written(model, arm.delta)
     assert_same(torque_in_pinocchio(arm, new), torque_of(arm, states_of(model.chain), ()))
     assert skeleton(new) == skeleton(text)
+
+
+@pytest.mark.parametrize("mark", ["", "\ufeff"])
+def test_elements_stand_where_they_are_said_to_stand(mark: str) -> None:
+    """Cut out of the text by their places, against Python's own tree."""
+    data = (mark + FOREIGN).encode()
+    pairs = [(xml_places(mark + FOREIGN, "arm.urdf"), ET.fromstring(FOREIGN.encode()))]  # noqa: S314  # ours
+    count = 0
+    while pairs:
+        found, meant = pairs.pop()
+        cut = data[found.start : found.end].decode()
+        own = {key: value for key, value in found.attributes.items() if not key.startswith("xmlns")}
+        assert (found.tag, own) == (meant.tag, meant.attrib)
+        assert cut.startswith(f"<{found.tag}")
+        assert cut.endswith("/>" if found.head == found.end else f"</{found.tag}>")
+        assert data[found.head - 1 : found.head] == b">"
+        pairs += zip(found.children, meant, strict=True)
+        count += 1
+    assert count == FOREIGN.count("</") + FOREIGN.count("/>")
 
 
 HOSTILE = {

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -184,3 +186,9 @@ def test_an_arm_of_a_urdf_is_loaded_like_any_other(tmp_path: Path) -> None:
     assert made.delta is not None
     states = states_of(arm.chain)
     assert_same(computed(DynamicModel(arm, made.delta), states), predicted(arm, made.delta, states))
+
+
+def test_importing_the_results_loads_no_pinocchio() -> None:
+    code = "import sys, ident_service.results as r; assert callable(r.load_model); print('pinocchio' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout == "False\n"

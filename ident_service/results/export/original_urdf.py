@@ -61,7 +61,9 @@ def original_urdf(model: ArmModel, delta: Array, has: Carried) -> tuple[str, tup
         joint = robot.joints[model.chain.names[k]]
         link = _named(joint, "child", file.name)
         whole = delta_from_inertia(inertia)
-        bolted = [(name, inertial) for name, inertial in robot.bolted_to(link) if inertial is not None]
+        bolted = [
+            (name, inertial) for name, inertial in robot.bolted_to(link) if inertial is not None and inertial.any()
+        ]
         rest = whole - sum((inertial for _, inertial in bolted), np.zeros(10))
         names = ", ".join(name for name, _ in bolted)
         if bolted and is_real(rest) and all(is_real(inertial) for _, inertial in bolted):
@@ -75,6 +77,8 @@ def original_urdf(model: ArmModel, delta: Array, has: Carried) -> tuple[str, tup
             key: repr(float(drives.of(term)[k])) for term, key in _FRICTION.items() if term in has and has[term][k]
         }
         edits += _dynamics(file.text, joint, written)
+        if kept := _kept(joint, written):
+            notes.append(f"joint {model.chain.names[k]} has the {' and '.join(kept)} of the original file")
     return edited(file.text, edits), tuple(notes)
 
 
@@ -174,6 +178,13 @@ def _removed(link: Element, name: str) -> Edit:
     if inertial is None:
         raise ModelError(f"{name}: link {link.attributes.get('name')!r} has no inertial")
     return Edit(inertial.start, inertial.end, "<!-- its inertia is part of the link that it is fixed to -->")
+
+
+def _kept(joint: Element, written: dict[str, str]) -> list[str]:
+    """Friction of the original file that is neither zero nor replaced."""
+    element = joint.first("dynamics")
+    old = {} if element is None else element.attributes
+    return [key for key in _FRICTION.values() if key in old and key not in written and old[key].strip("0. ")]
 
 
 def _dynamics(text: str, joint: Element, values: dict[str, str]) -> Iterator[Edit]:
