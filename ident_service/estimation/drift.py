@@ -33,7 +33,6 @@ from typing import Literal
 
 import numpy as np
 import scipy.stats
-from numpy.typing import NDArray
 
 from ident_service.errors import ParameterError
 from ident_service.model.chain import Array

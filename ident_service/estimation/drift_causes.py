@@ -35,7 +35,7 @@ _MEANINGS: Mapping[str, str] = {
     "drive inertia": "another motor or gear, or a torque constant that is not what it was",
     "last": "another tool or payload",
     "body": "a part mounted on or taken off, or a cable package moved",
-    "first moments": "a part mounted on or taken off, a calibration of the joint's zero position, or the torque constant",
+    "first moments": "a part mounted on or taken off, another zero position of the joint, or the torque constant",
     "inertia": "a part mounted on or taken off, or a torque constant that is not what it was",
 }
 

@@ -9,11 +9,13 @@ from ident_service.config.drivers import SimulatedDriver
 from ident_service.config.load import load_arm
 from ident_service.config.quantities import ParameterTable
 from ident_service.config.schema import ArmConfig, SeededMotion
+from ident_service.estimation.identify import identify
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.factory import make_arm
 from ident_service.record.open import open_recording
 from ident_service.record.recording import Recording
+from ident_service.results.run_folder import write_manifest, write_results
 from ident_service.service.commission import record_motion
 
 
@@ -63,3 +65,12 @@ def recorded_arm(config: ArmConfig, path: Path, motion: str = "identification") 
     model = arm_model(config)
     record_motion(make_arm(config), model, excitation(model, motion), path)
     return open_recording(path, model.chain.names)
+
+
+def identified_folder(config: ArmConfig, folder: Path) -> Path:
+    """A folder of results from the arm's identification motion alone, as `ident identify` leaves it."""
+    folder.mkdir(parents=True)
+    recording = recorded_arm(config, folder / "identification.mcap")
+    write_results(folder, identify(arm_model(config), [recording]))
+    write_manifest(folder)
+    return folder
