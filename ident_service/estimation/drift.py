@@ -230,10 +230,10 @@ def drift(first: Identified, second: Identified) -> Drift:
     # Values are printed with rounding; what is known exactly is known to that.
     rounding = _ROUNDING * (np.abs(first.values) + np.abs(second.values)) + np.finfo(float).tiny
     deviations = np.where(seen, np.maximum(np.sqrt(np.where(seen, total, 0.0)), rounding), np.inf)
-    singles = [_test(first, second, (place,)) for place in range(len(difference))]
-    joint = _test(first, second, tuple(range(len(difference))))
+    singles = [difference_test(first, second, (place,)) for place in range(len(difference))]
+    joint = difference_test(first, second, tuple(range(len(difference))))
     groups = _groups(first.leading)
-    tests = [_test(first, second, places) for places in groups.values()]
+    tests = [difference_test(first, second, places) for places in groups.values()]
     corrected = holm([joint.p, *(test.p for test in tests)])
     effects = []
     for ((kind, number), places), test, p in zip(groups.items(), tests, corrected[1:], strict=True):
@@ -242,10 +242,10 @@ def drift(first: Identified, second: Identified) -> Drift:
         shares = torque_shares(first, second, np.where(seen, only, 0.0))
         worst = None if shares is None else int(np.argmax(shares[0]))
         torque, residual = (None, None) if shares is None else (float(shares[0][worst]), float(shares[1][worst]))
-        changed = p < ALPHA and _relevant(shares)
+        changed = p < ALPHA and relevant(shares)
         effects.append(Effect(kind, number, places, test, p, worst, torque, residual, changed))
     whole = torque_shares(first, second, np.where(seen, difference, 0.0))
-    drifted = any(effect.changed for effect in effects) or (corrected[0] < ALPHA and _relevant(whole))
+    drifted = any(effect.changed for effect in effects) or (corrected[0] < ALPHA and relevant(whole))
     return Drift(
         difference=difference,
         deviations=deviations,
@@ -282,7 +282,7 @@ def torque_shares(first: Identified, second: Identified, difference: Array) -> t
     return change / np.maximum(motion.torque, tiny), change / np.maximum(motion.residual, tiny)
 
 
-def _relevant(shares: tuple[Array, Array] | None) -> bool:
+def relevant(shares: tuple[Array, Array] | None) -> bool:
     """Whether some joint's torque changes by enough of itself and of what is unexplained anyway."""
     if shares is None:
         return True
@@ -297,7 +297,14 @@ def _groups(leading: Sequence[str]) -> dict[tuple[Kind, int], tuple[int, ...]]:
     return {key: tuple(places) for key, places in groups.items()}
 
 
-def _test(first: Identified, second: Identified, places: tuple[int, ...]) -> Test:
+def difference_test(first: Identified, second: Identified, places: Sequence[int]) -> Test:
+    """Test that these parameters are the same in both.
+
+    Args:
+        first: one set.
+        second: the other.
+        places: which parameters, from 0.
+    """
     chosen = np.array(places, dtype=np.intp)
     seen = chosen[[np.isfinite(first.covariance[k, k] + second.covariance[k, k]) for k in places]]
     d = second.values[seen] - first.values[seen]
@@ -322,12 +329,15 @@ def _test(first: Identified, second: Identified, places: tuple[int, ...]) -> Tes
         if degrees - r + 1.0 >= r or r == 1:
             break
     statistic = float(z[:r] @ z[:r])
+    return Test(statistic, r, degrees, probability(statistic, r, degrees), len(places) - r)
+
+
+def probability(statistic: float, directions: int, degrees: float) -> float:
+    """How often a larger T^2 comes about by chance, with `degrees` of freedom of its covariances."""
     if np.isinf(degrees):
-        p = float(scipy.stats.chi2.sf(statistic, r))
-    else:
-        below = max(degrees - r + 1.0, 1.0)
-        p = float(scipy.stats.f.sf(statistic * below / (degrees * r), r, below))
-    return Test(statistic, r, degrees, p, len(places) - r)
+        return float(scipy.stats.chi2.sf(statistic, directions))
+    below = max(degrees - directions + 1.0, 1.0)
+    return float(scipy.stats.f.sf(statistic * below / (degrees * directions), directions, below))
 
 
 def _degrees(parts: Sequence[Array], blocks: Sequence[int | None]) -> float:
