@@ -23,10 +23,13 @@ from ident_service.motion.controls import StopWhen
 from ident_service.motion.factory import make_arm
 from ident_service.motion.run import RunReport, run
 from ident_service.motion.states import State
+from ident_service.record.kept import KeptRecording
 from ident_service.record.open import open_recording
 from ident_service.record.recorder_process import RecorderProcess
 from ident_service.results.files import appearing_folder, write_atomically
+from ident_service.results.report_files import write_report
 from ident_service.results.run_folder import write_manifest, write_results
+from ident_service.service.identification import recording_quality
 from ident_service.service.score import Score, score, true_parameters
 from sim_backend.arm import SimulatedArm, Truth
 from sim_backend.remote_arm import RemoteArm
@@ -140,11 +143,14 @@ def simulate(
             reports.append(report)
             write_atomically(staging / f"{planned.name}.excitation.json", planned.to_json() + "\n")
         tell("identifying")
-        recordings = [open_recording(path, model.chain.names) for path in paths]
+        recordings = [KeptRecording(open_recording(path, model.chain.names)) for path in paths]
         estimate = identify(model, recordings[:1], recordings[1:], set_name=set_name)
         scored = score(estimate, truth, observed, equations(recordings[1], model, estimate.base))
         write_results(staging, estimate)
         write_atomically(staging / "score.json", json.dumps(score_document(scored), indent=1) + "\n")
+        seen = [(one.path.name, recording_quality(one, model).warnings()) for one in recordings]
+        warnings = [f"{name}: {line}" for name, lines in seen for line in lines]
+        write_report(staging, estimate, recordings[:1], recordings[1:], warnings)
         write_manifest(staging)
     return Commissioning(folder, estimate, (reports[0], reports[1]), scored)
 
