@@ -17,7 +17,7 @@ def add(verbs: Verbs) -> None:
     sub = verbs.add("compare", _compare, "has the arm changed? (exit code 3: yes, or it cannot be said)")
     sub.add_argument("reference", type=Path, metavar="A", help="folder of results, or parameters.json: the reference")
     sub.add_argument("others", type=Path, nargs="+", metavar="B", help="what is compared with it")
-    sub.add_argument("--out", type=Path, metavar="PATH", help="FILE.json, or a folder for JSON and text")
+    sub.add_argument("--out", type=Path, metavar="PATH", help="FILE.json, or a folder for JSON, text and page")
 
     sub = verbs.add("payload", _payload, "what does an identified arm carry? (exit code 3: nothing, or no real body)")
     sub.add_argument("run", type=Path, metavar="RUN", help="folder of results of the arm without the load")

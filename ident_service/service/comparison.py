@@ -7,11 +7,12 @@ from pathlib import Path
 
 from ident_service.results.comparison import Comparison, compare
 from ident_service.results.comparison_document import write_comparison
+from ident_service.results.comparison_page import comparison_html
 from ident_service.results.comparison_sides import read_side
 from ident_service.results.comparison_text import comparison_text
 from ident_service.results.files import appearing_folder, write_atomically
 
-DOCUMENT, TEXT = "comparison.json", "comparison.txt"
+DOCUMENT, TEXT, PAGE = "comparison.json", "comparison.txt", "comparison.html"
 
 
 def compare_files(paths: Sequence[Path], out: Path | None = None) -> tuple[Comparison, tuple[Path, ...]]:
@@ -44,4 +45,5 @@ def write_comparison_files(folder: Path, comparison: Comparison) -> tuple[str, .
     """Write a comparison in every form into a folder that exists; returns the names."""
     write_comparison(folder / DOCUMENT, comparison)
     write_atomically(folder / TEXT, comparison_text(comparison))
-    return DOCUMENT, TEXT
+    write_atomically(folder / PAGE, comparison_html(comparison))
+    return DOCUMENT, TEXT, PAGE

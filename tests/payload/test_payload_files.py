@@ -58,10 +58,9 @@ def test_a_tool_is_found_and_written(arms: Path, ident: Ident, tmp_path: Path) -
     assert "no motion of this arm shows: Lxx2 Lxy2 Lxz2 Lyy2 Lyz2 lz2" in text
     assert "\nCHANGED\n  body of link 2: " in text
     assert "about +0.2 kg\n    may mean: another tool or payload" in text
-    wanted = (
-        "arm.json comparison.json comparison.txt identified.urdf manifest.json parameters.json payload.json payload.txt"
-    )
-    assert sorted(path.name for path in out.iterdir()) == wanted.split()
+    wanted = ["arm.json", "comparison.html", "comparison.json", "comparison.txt", "identified.urdf", "manifest.json"]
+    wanted += ["parameters.json", "payload.json", "payload.txt"]
+    assert sorted(path.name for path in out.iterdir()) == wanted
     document = json.loads((out / "payload.json").read_text())
     jsonschema.validate(
         document, json.loads(files("ident_service.results").joinpath("payload.schema.json").read_text())
