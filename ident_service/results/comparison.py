@@ -3,6 +3,10 @@
 Parameters are the same where their expressions are: two runs of one arm, or two arms of one kind. What only one side
 has is listed and left out. Whether anything has changed is `estimation/drift.py`'s to say; where a side has no
 covariance, as tables in papers, there are differences and no verdict.
+
+The shape of friction (way of pre-sliding, Stribeck velocity) may be fitted to each recording. With another shape the
+same parameter is another quantity, and no covariance knows of it: friction of such a joint is not compared, and without
+it nothing is called unchanged.
 """
 
 from __future__ import annotations
@@ -49,6 +53,7 @@ class Pair:
         crossed: the reference's parameters on this side's torques; None where these are not kept.
         provenance: what differs in how the two came about: key to both values.
         notes: what a reader must know.
+        other_shape: joints, from 1, whose friction has another shape on each side, and so is not compared.
     """
 
     side: Side
@@ -63,11 +68,14 @@ class Pair:
     crossed: Crossed | None
     provenance: Mapping[str, tuple[str, str]]
     notes: tuple[str, ...]
+    other_shape: tuple[int, ...] = ()
 
     @property
     def verdict(self) -> Verdict:
         """In one word."""
-        return "impossible" if self.drift is None else self.drift.verdict
+        if self.drift is None or (self.drift.verdict == "unchanged" and self.other_shape):
+            return "impossible"
+        return self.drift.verdict
 
 
 @dataclass(frozen=True)
@@ -110,17 +118,26 @@ def _pair(reference: Side, side: Side) -> Pair:
     shared = [(place, index[key]) for place, key in enumerate(reference.keys) if key in index]
     if not shared:
         raise ParameterError(f"{side.path}: no base parameter in common with {reference.path}; nothing to compare")
+    differing = _other_shape(reference, side)
+    shared = [pair for pair in shared if not _shaped(reference.leading[pair[0]], differing)]
+    if not shared:
+        raise ParameterError(f"{side.path}: has only friction of another shape in common with {reference.path}")
     places = tuple(np.array(column, dtype=np.intp) for column in zip(*shared, strict=True))
     free = reference.unconstrained is not None and side.unconstrained is not None
     first, second = (one.identified(at, free=free) for one, at in zip((reference, side), places, strict=True))
     found, compared, explained, reason = None, None, tuple[Cause, ...](), ""
     if first is None or second is None:
         without = [str(one.path) for one, known in ((reference, first), (side, second)) if known is None]
-        reason = f"no covariance in {' and '.join(without)}"
+        reason = f"no covariance in {' and '.join(without)}; differences are listed, nothing can be tested"
         difference = side.file.values[places[1]] - reference.file.values[places[0]]
     else:
         compared, found = (first, second), drift(first, second)
         difference = found.difference
+        if differing and found.verdict == "unchanged":
+            reason = (
+                f"friction of joint {', '.join(_names(side, differing))} was fitted with another shape and is not "
+                "compared; all else is unchanged. Give the reference's numbers in identification.friction and identify again"
+            )
         motion = second.motion or first.motion
         if motion is not None:
             K = reference.file.base.K[places[0]]
@@ -130,8 +147,8 @@ def _pair(reference: Side, side: Side) -> Pair:
     return Pair(
         side=side,
         places=(places[0], places[1]),
-        only_reference=_others(reference, places[0]),
-        only_side=_others(side, places[1]),
+        only_reference=_others(reference, side),
+        only_side=_others(side, reference),
         difference=difference,
         compared=compared,
         drift=found,
@@ -139,16 +156,35 @@ def _pair(reference: Side, side: Side) -> Pair:
         causes=explained,
         crossed=_crossed(reference, side, (places[0], places[1])),
         provenance=_provenance(reference, side),
-        notes=tuple(_notes(reference, side, free)),
+        notes=tuple(_notes(reference, side, free, differing)),
+        other_shape=differing,
     )
 
 
-def _others(side: Side, places: NDArray[np.intp]) -> tuple[str, ...]:
-    return tuple(
-        expression
-        for place, expression in enumerate(side.content["base_parameters"]["expressions"])
-        if place not in set(places.tolist())
+def _others(side: Side, other: Side) -> tuple[str, ...]:
+    expressions = side.content["base_parameters"]["expressions"]
+    return tuple(expression for expression, key in zip(expressions, side.keys, strict=True) if key not in other.keys)
+
+
+def _other_shape(reference: Side, side: Side) -> tuple[int, ...]:
+    found: set[int] = set()
+    for key, symbol in (("presliding", "fc"), ("stribeck_velocity", "fs")):
+        here, there = (one.content.get("friction", {}).get(key, []) for one in (reference, side))
+        for joint, (a, b) in enumerate(zip(here, there, strict=False), 1):
+            if a != b and f"{symbol}{joint}" in reference.leading:
+                found.add(joint)
+    return tuple(sorted(found))
+
+
+def _shaped(name: str, joints: Sequence[int]) -> bool:
+    """Whether what a parameter means hangs on the shape of the friction of these joints."""
+    return (
+        name.startswith("f") and not name.startswith("fo") and int(name.lstrip("abcdefghijklmnopqrstuvwxyz")) in joints
     )
+
+
+def _names(side: Side, joints: Sequence[int]) -> list[str]:
+    return [side.joints[joint - 1] if side.joints is not None else str(joint) for joint in joints]
 
 
 def _crossed(reference: Side, side: Side, places: tuple[NDArray[np.intp], NDArray[np.intp]]) -> Crossed | None:
@@ -189,7 +225,7 @@ def _flat(side: Side) -> dict[str, str]:
     return {key: str(value) for key, value in facts.items() if value is not None}
 
 
-def _notes(reference: Side, side: Side, free: bool) -> list[str]:
+def _notes(reference: Side, side: Side, free: bool, differing: Sequence[int]) -> list[str]:
     notes = []
     both = (reference.content, side.content)
     names = [content.get("arm", {}).get("name") for content in both]
@@ -202,10 +238,12 @@ def _notes(reference: Side, side: Side, free: bool) -> list[str]:
     recordings = [{one["sha256"] for one in content.get("provenance", {}).get("recordings", [])} for content in both]
     if reference.sha256 != side.sha256 and recordings[0] & recordings[1]:
         notes.append("both were fitted to the same recording: their doubts are not independent")
-    for key, words in (
-        ("friction", "friction has another shape (pre-sliding, Stribeck): its parameters are not quite the same"),
-        ("torque_scales", "torques were multiplied by different factors"),
-    ):
-        if all(key in content for content in both) and both[0][key] != both[1][key]:
-            notes.append(words)
+    if differing:
+        joints = ", ".join(_names(side, differing))
+        notes.append(
+            f"friction of joint {joints} has another shape (pre-sliding, Stribeck): not compared but for offsets"
+        )
+    scales = [content.get("torque_scales") for content in both]
+    if scales[0] != scales[1] and all(scales):
+        notes.append("torques were multiplied by different factors")
     return notes

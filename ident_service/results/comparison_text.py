@@ -33,7 +33,7 @@ def _pair(comparison: Comparison, pair: Pair) -> list[str]:
         lines += ["", f"all parameters together: {joint.sigma:.3g} sigma in {joint.directions} directions, "]
         lines[-1] += f"p = {joint.p:.2g}{left}"
     for name, share in _shares(pair):
-        lines.append(f"  joint {name}: the two predict torques that differ by {share:.2%} (root mean squares)")
+        lines.append(f"  joint {name}: the differences change its predicted torque by {share:.2%} (root mean squares)")
     if pair.crossed is not None:
         own, other = pair.crossed.own, pair.crossed.reference
         lines += [
@@ -59,8 +59,8 @@ def _pair(comparison: Comparison, pair: Pair) -> list[str]:
 
 def verdict_lines(pair: Pair) -> list[str]:
     """The verdict and what it rests on."""
-    if pair.drift is None:
-        return [f"NO VERDICT: {pair.reason}; differences are listed, nothing can be tested"]
+    if pair.drift is None or pair.verdict == "impossible":
+        return [f"NO VERDICT: {pair.reason}"]
     if pair.drift.verdict == "unchanged":
         floor = f"p >= {ALPHA:g} after Holm, or less than {RELEVANT_TORQUE:.0%} of every joint's torque"
         return [f"UNCHANGED ({floor} or {RELEVANT_RESIDUAL:.0%} of its residual)"]

@@ -212,3 +212,22 @@ def test_what_is_no_covariance_is_refused(commissioned: Path) -> None:
     path = changed_file(accepted, "crooked.json", base_parameters={"covariance": crooked})
     with pytest.raises(ParameterError, match=r"crooked\.json: covariance is not symmetric"):
         compare([read_side(accepted), read_side(path)])
+
+
+def test_friction_of_another_shape_is_not_compared(commissioned: Path, ident: Ident) -> None:
+    accepted, again, dry = (commissioned / name for name in ("accepted", "again", "dry"))
+    shape = {"friction": {"presliding": [0.0, 0.01], "stribeck_velocity": []}}
+    other = changed_file(again, "other_shape.json", **shape)
+    code, out, _ = ident("compare", accepted, other)
+    assert code == 3
+    assert "NO VERDICT: friction of joint elbow was fitted with another shape and is not compared; all else" in out
+    assert "note: friction of joint elbow has another shape" in out
+    (pair,) = compare([read_side(accepted), read_side(other)]).pairs
+    left_out = {"fv2", "fc2"}
+    assert {read_side(accepted).leading[place] for place in pair.places[0]}.isdisjoint(left_out)
+    assert len(pair.places[0]) == 11
+    assert pair.only_reference == pair.only_side == ()
+    # A change elsewhere is found nevertheless; this one is not, and nothing is called unchanged.
+    assert ident("compare", accepted, changed_file(dry, "dry_other.json", **shape))[0] == 3
+    both = [changed_file(folder, f"{folder.name}_same.json", **shape) for folder in (accepted, dry)]
+    assert "CHANGED\n  friction of joint elbow" in ident("compare", *both)[1]
