@@ -24,6 +24,7 @@ from ident_service.estimation.drift_causes import Cause, causes
 from ident_service.estimation.least_squares import TorqueError, torque_error
 from ident_service.model.chain import Array
 from ident_service.results.comparison_sides import Side
+from ident_service.results.run_folder import ARM
 
 Verdict = Literal["unchanged", "changed", "impossible"]
 
@@ -136,7 +137,7 @@ def _pair(reference: Side, side: Side) -> Pair:
         if differing and found.verdict == "unchanged":
             reason = (
                 f"friction of joint {', '.join(_names(side, differing))} was fitted with another shape and is not "
-                "compared; all else is unchanged. Give the reference's numbers in identification.friction and identify again"
+                f"compared; all else is unchanged. Identify again with the reference's shape: {_remedy(reference)}"
             )
         motion = second.motion or first.motion
         if motion is not None:
@@ -181,6 +182,11 @@ def _shaped(name: str, joints: Sequence[int]) -> bool:
     return (
         name.startswith("f") and not name.startswith("fo") and int(name.lstrip("abcdefghijklmnopqrstuvwxyz")) in joints
     )
+
+
+def _remedy(reference: Side) -> str:
+    arm = reference.path / ARM
+    return f"ident identify ... --arm {arm}" if reference.config is not None else "identification.friction as numbers"
 
 
 def _names(side: Side, joints: Sequence[int]) -> list[str]:

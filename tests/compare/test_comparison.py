@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from compare.conftest import Ident
 
+from ident_service.config.load import load_arm
 from ident_service.errors import ParameterError, UsageError
 from ident_service.estimation.least_squares import ordinary_least_squares
 from ident_service.results.comparison import compare
@@ -222,6 +223,9 @@ def test_friction_of_another_shape_is_not_compared(commissioned: Path, ident: Id
     assert code == 3
     assert "NO VERDICT: friction of joint elbow was fitted with another shape and is not compared; all else" in out
     assert "note: friction of joint elbow has another shape" in out
+    # What the message tells to do can be done: the folder's arm is a description with that shape.
+    assert f"--arm {accepted}/arm.json" in out
+    assert load_arm(accepted / "arm.json") == read_side(accepted).config
     (pair,) = compare([read_side(accepted), read_side(other)]).pairs
     left_out = {"fv2", "fc2"}
     assert {read_side(accepted).leading[place] for place in pair.places[0]}.isdisjoint(left_out)
