@@ -249,9 +249,11 @@ def _notes(reference: Side, side: Side, free: bool, differing: Sequence[int]) ->
         notes.append(
             f"friction of joint {joints} has another shape (pre-sliding, Stribeck): not compared but for offsets"
         )
-    for one in (reference, side):
-        if one.covariance is not None and "blocks" not in one.content.get("fit", {}):
-            notes.append(f"{one.path} does not say what its covariance was estimated from: taken for exactly known")
+    notes += [
+        f"{one.path} does not say what its covariance was estimated from: taken for exactly known"
+        for one in (reference, side)
+        if one.covariance is not None and "blocks" not in one.content.get("fit", {})
+    ]
     scales = [content.get("torque_scales") for content in both]
     if scales[0] != scales[1] and all(scales):
         notes.append("torques were multiplied by different factors")
