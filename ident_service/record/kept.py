@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from ident_service.record.recording import BLOCK_SAMPLES, Block, Recording
+from ident_service.record.recording import BLOCK_SAMPLES, Block, Matrix, Recording, Stamps, cut, join
 
 MAX_BYTES: Final = 128 << 20  # a quarter of an hour of seven joints at 1 kHz
 
@@ -22,7 +22,7 @@ class KeptRecording:
         self.joints = whole.joints
         self.torque_held = whole.torque_held
         self._whole, self._max_bytes = whole, max_bytes
-        self._kept: tuple[int, list[Block]] | None = None
+        self._kept: Block | None = None
 
     @property
     def torn(self) -> bool:
@@ -35,20 +35,27 @@ class KeptRecording:
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
         """Read the samples in order; see `Recording.blocks`. Nobody may write into a block."""
-        if self._kept is not None and self._kept[0] == samples:
-            yield from self._kept[1]
+        if self._kept is not None:
+            for start in range(0, len(self._kept.stamp_ns), samples):
+                yield cut(self._kept, start, start + samples)
             return
         blocks: list[Block] | None = []
         size = 0
         for block in self._whole.blocks(samples):
-            for array in (block.stamp_ns, block.position, block.torque, block.velocity):
-                if array is not None:
-                    array.setflags(write=False)
-                    size += array.nbytes
+            for array in _arrays(block):
+                array.setflags(write=False)
+                size += array.nbytes
             if blocks is not None and size <= self._max_bytes:
                 blocks.append(block)
             else:
                 blocks = None
             yield block
-        if blocks is not None:
-            self._kept = (samples, blocks)
+        if blocks:
+            self._kept = join(blocks)
+            for array in _arrays(self._kept):
+                array.setflags(write=False)
+
+
+def _arrays(block: Block) -> list[Matrix | Stamps]:
+    arrays: list[Matrix | Stamps] = [block.stamp_ns, block.position, block.torque]
+    return arrays if block.velocity is None else [*arrays, block.velocity]

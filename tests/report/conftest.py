@@ -20,6 +20,7 @@ from ident_service.results.report_files import read_evidence_of, write_report
 from ident_service.results.run_folder import read_results, write_manifest, write_results
 
 RATE = 250.0
+OPTIONS = Identification(smoothing=Smoothing(cutoff=40.0))
 
 
 @dataclass(frozen=True)
@@ -60,9 +61,10 @@ def made(
     noise: float = 0.02,
     prior: bool = True,
     warnings: tuple[str, ...] = (),
+    options: Identification = OPTIONS,
 ) -> Made:
     """Identify a two-link arm and write all that `ident identify` writes."""
-    arm = with_options(model_around(serial_chain(21, 2)), Identification(smoothing=Smoothing(cutoff=40.0)))
+    arm = with_options(model_around(serial_chain(21, 2)), options)
     arm = replace(arm, config=arm.config.model_copy(update={"name": name}))
     delta = random_delta(np.random.default_rng(5), arm.layout)
     arm = replace(arm, prior=1.1 * delta if prior else None)

@@ -65,6 +65,12 @@ def section(name: str, title: str, *content: str) -> str:
     return f'<section id="{name}"><h2>{plain(title)}</h2>' + "\n".join(content) + "</section>"
 
 
+def contents(names: Iterable[tuple[str, str]]) -> str:
+    """Where to go on the page: names and titles of sections."""
+    links = "".join(f'<li><a href="#{name}">{plain(title)}</a></li>' for name, title in names)
+    return f'<nav aria-label="Contents"><ul>{links}</ul></nav>'
+
+
 def _row(cells: Sequence[Cell]) -> str:
     first, *rest = cells
     return f'<th scope="row"{_class(first.kind)}>{plain(first.words)}</th>' + "".join(map(_cell, rest))

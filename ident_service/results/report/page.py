@@ -20,11 +20,12 @@ from ident_service.results.drawing import number, plain
 from ident_service.results.drawing_style import sheet
 from ident_service.results.evidence import Evidence, Traced
 from ident_service.results.evidence_file import runs_of
+from ident_service.results.evidence_making import CAD
 from ident_service.results.evidence_packing import packed, packed_mask
 from ident_service.results.parameter_file import ParameterFile
 from ident_service.results.report.figure import Figure, Zoom
 from ident_service.results.report.figures import Figures, figures
-from ident_service.results.report.markup import items, paragraph, prose, section
+from ident_service.results.report.markup import contents, items, paragraph, prose, section
 from ident_service.results.report.tables import (
     axis_table,
     error_table,
@@ -34,6 +35,8 @@ from ident_service.results.report.tables import (
     parameter_table,
 )
 from ident_service.results.report.verdict import verdict
+
+_NO_WARNING = "None: rate, jitter, gaps, saturation and standstill of the recordings are as they should be."
 
 
 def report_html(evidence: Evidence, parameters: ParameterFile, config: ArmConfig, sha256: Mapping[str, str]) -> str:
@@ -60,7 +63,8 @@ def report_html(evidence: Evidence, parameters: ParameterFile, config: ArmConfig
     )
     body = "\n".join(
         [
-            f"<header><h1>{plain(title)}</h1>{paragraph(_subtitle(parameters, config))}</header>",
+            f"<header><h1>{plain(title)}</h1>{paragraph(_subtitle(parameters, config))}",
+            f"{contents(_TITLES.items())}</header>",
             "<main>",
             *_sections(evidence, parameters, drawn, sha256),
             "</main>",
@@ -77,52 +81,48 @@ def _subtitle(parameters: ParameterFile, config: ArmConfig) -> str:
     return " \u00b7 ".join(part for part in parts if part)
 
 
+_TITLES = {
+    "verdict": "Verdict",
+    "warnings": "Warnings",
+    "parameters": "Parameters",
+    "torque": "Measured and predicted torque",
+    "residual": "Spectrum and autocorrelation of what is left",
+    "friction": "Friction",
+    "doubt": "Uncertainty and correlation",
+    "bodies": "Feasibility and bodies",
+    "timing": "Timing of the recordings",
+    "files": "What was run",
+}
+
+
 def _sections(
     evidence: Evidence, parameters: ParameterFile, drawn: Figures, sha256: Mapping[str, str]
 ) -> Iterable[str]:
-    yield section("verdict", "Verdict", paragraph(" ".join(verdict(evidence, parameters)), "verdict"))
-    warnings = (
-        items(evidence.warnings)
-        if evidence.warnings
-        else paragraph("None: rate, jitter, gaps, saturation and standstill of the recordings are as they should be.")
-    )
-    yield section("warnings", "Warnings", warnings)
-    no_cad = (
-        ""
-        if evidence.estimates[0].identification is None
-        else paragraph(
-            "The arm's description has no CAD values (prior), so there is nothing to compare with in that column."
-        )
-    )
-    yield section("parameters", "Parameters", no_cad, parameter_table(evidence, parameters))
-    yield section(
-        "torque",
-        "Measured and predicted torque",
-        error_table(evidence),
-        joint_table(evidence, parameters),
-        *_torque(evidence, drawn),
-    )
-    yield section(
-        "residual",
-        "Spectrum and autocorrelation of what is left",
-        _grid(drawn.residual, "No recording is long enough for a spectrum."),
-    )
-    yield section(
-        "friction",
-        "Friction",
-        _grid(drawn.friction, "The arm's model has no friction, so there is no curve to compare with the recordings."),
-    )
-    yield section(
-        "doubt",
-        "Uncertainty and correlation",
-        _grid(drawn.doubt, "The parameter file has no standard deviations."),
-    )
-    yield section("bodies", "Feasibility and bodies", *_bodies(evidence, drawn))
-    yield section("timing", "Timing of the recordings", _grid(drawn.timing, ""), axis_table(evidence))
-    yield section("files", "What was run", *_run(parameters), file_table(evidence, parameters, sha256))
+    content = {
+        "verdict": [paragraph(" ".join(verdict(evidence, parameters)), "verdict")],
+        "warnings": [items(evidence.warnings) if evidence.warnings else paragraph(_NO_WARNING)],
+        "parameters": _parameters(evidence, parameters),
+        "torque": _torque(evidence, parameters, drawn),
+        "residual": [_grid(drawn.residual, "No recording is long enough for a spectrum.")],
+        "friction": [_grid(drawn.friction, "The arm's model has no friction, so there is no curve to compare with.")],
+        "doubt": [_grid(drawn.doubt, "The parameter file has no standard deviations.")],
+        "bodies": _bodies(evidence, drawn),
+        "timing": [_grid(drawn.timing, ""), axis_table(evidence)],
+        "files": [*_run(parameters), file_table(evidence, parameters, sha256)],
+    }
+    for name, title in _TITLES.items():
+        yield section(name, title, *content[name])
 
 
-def _torque(evidence: Evidence, drawn: Figures) -> Iterable[str]:
+def _parameters(evidence: Evidence, parameters: ParameterFile) -> Iterable[str]:
+    if evidence.estimates[0].name != CAD:
+        yield paragraph("The arm's description has no CAD values (prior), so there is nothing to compare with.")
+    yield parameter_table(evidence, parameters)
+
+
+def _torque(evidence: Evidence, parameters: ParameterFile, drawn: Figures) -> Iterable[str]:
+    yield error_table(evidence)
+    yield joint_table(evidence, parameters)
     for one, made in zip(evidence.recordings, drawn.torque, strict=True):
         role = "fitted to" if one.role == "identification" else "never seen by the fit"
         yield f"<h3>{plain(one.name)}, {role}</h3>{_grid(made, '')}"

@@ -11,8 +11,8 @@ from ident_service.results.report.figure import LEFT, RIGHT, WIDTH, Figure
 
 _TOP, _HEIGHT, _BETWEEN, _BOTTOM = 42.0, 120.0, 66.0, 40.0
 _GOOD = (
-    "Good: a flat spectrum, and an autocorrelation that falls to zero at once and stays between the dashed lines. "
-    "Bad: peaks at frequencies of the motion or of a gear, and an autocorrelation that swings slowly."
+    "Good: a spectrum that is flat up to where a filter cuts it off, and an autocorrelation that falls at once and "
+    "stays about the dashed lines. Bad: peaks at frequencies of the motion or of a gear, and one that swings slowly."
 )
 
 

@@ -61,7 +61,9 @@ def error_table(evidence: Evidence) -> str:
         whole, moving = (one.identification, *one.validation), (one.moving, *one.moving_validation)
         errors = [_number(error, 4) for pair in zip(whole, moving, strict=True) for error in pair]
         rows.append([Cell(one.name + mark), feasible, margin, *errors])
-    heads = ["estimate", "feasible", "margin"]
+    # Every estimate was held against the arm's own set, whatever set it was fitted in.
+    kind = evidence.estimates[evidence.constrained].name.split()[-1]
+    heads = ["estimate", f"feasible ({kind})", "margin"]
     heads += [f"{name} {rows_of} [%]" for name in ("fitted", *unseen) for rows_of in ("all rows", "moving")]
     return table("Relative torque error (eq. 84) of every estimate, on all rows and away from standstill", heads, rows)
 

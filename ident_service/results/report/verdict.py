@@ -55,8 +55,8 @@ def _prediction(evidence: Evidence) -> str:
     fitted = "" if own.identification is None else _error(own.identification, own.moving)
     unseen = [one.name for one in evidence.recordings if one.role == "validation"]
     if not own.validation:
-        known = f" (on what it was fitted to its torque error is {fitted})" if fitted else ""
-        return f"It was judged on no recording that it had not seen{known}, so how well it predicts is not known."
+        known = f" On what it was fitted to its torque error is {fitted}." if fitted else ""
+        return f"It was judged on no recording that it had not seen, so how well it predicts is not known.{known}"
     moving = own.moving_validation or (None,) * len(own.validation)
     errors = ", ".join(
         f"{_error(error, alone)} on {name}" for name, error, alone in zip(unseen, own.validation, moving, strict=True)
