@@ -1,4 +1,8 @@
-"""What has changed, as findings that a person can act on: one cause where one explains it, else every effect."""
+"""What has changed, as findings that a person can act on.
+
+A body that explains the change stands for the effects on all links that it has in the base parameters; friction and
+drive inertia are base parameters of their own joint, and are findings beside it.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,7 @@ from ident_service.estimation.drift import Drift, Effect, Identified
 from ident_service.estimation.drift_causes import Cause, friction_ratio, meaning_of_cause, meaning_of_effect
 from ident_service.results.comparison import Pair
 
+_OF_JOINTS = ("friction", "drive inertia")
 EXPLAINS = 0.9  # of the squared change of torque; a single cause that explains less is not the whole story
 
 
@@ -42,12 +47,12 @@ def findings(pair: Pair) -> tuple[Finding, ...]:
     links = _links(pair)
     changes = found.changes
     best = pair.causes[0] if pair.causes and pair.causes[0].explained >= EXPLAINS else None
-    if best is not None and (best.kind == "body" or not changes):
-        return (_whole(pair, found, best, links),)
-    if best is not None:
-        changes = tuple(effect for effect in changes if (effect.kind, effect.number) == (best.kind, best.number))
+    whole: tuple[Finding, ...] = ()
+    if best is not None and best.kind == "body":
+        whole = (_whole(pair, found, best, links),)
+        changes = tuple(effect for effect in changes if effect.kind in _OF_JOINTS)
     single = tuple(_single(pair, found, compared, effect, links) for effect in changes)
-    return single or (_whole(pair, found, best, links),)
+    return (*whole, *single) or (_whole(pair, found, best, links),)
 
 
 def joint_name(pair: Pair, number: int) -> str:
@@ -84,8 +89,7 @@ def _whole(pair: Pair, found: Drift, cause: Cause | None, links: int) -> Finding
 
 
 def _single(pair: Pair, found: Drift, compared: tuple[Identified, Identified], effect: Effect, links: int) -> Finding:
-    of_joint = effect.kind in ("friction", "drive inertia")
-    owner = f"joint {joint_name(pair, effect.number)}" if of_joint else f"link {effect.number}"
+    owner = f"joint {joint_name(pair, effect.number)}" if effect.kind in _OF_JOINTS else f"link {effect.number}"
     return Finding(
         what=f"{effect.kind} of {owner}",
         sigma=effect.test.sigma,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -235,3 +236,35 @@ def test_friction_of_another_shape_is_not_compared(commissioned: Path, ident: Id
     assert ident("compare", accepted, changed_file(dry, "dry_other.json", **shape))[0] == 3
     both = [changed_file(folder, f"{folder.name}_same.json", **shape) for folder in (accepted, dry)]
     assert "CHANGED\n  friction of joint elbow" in ident("compare", *both)[1]
+
+
+def test_several_changes_are_all_found(commissioned: Path) -> None:
+    accepted, dry = read_side(commissioned / "accepted"), commissioned / "dry"
+    table = json.loads((dry / "parameters.json").read_text())["base_parameters"]
+    values, place = table["unconstrained_values"], {name: k for k, name in enumerate(accepted.leading)}
+
+    def found(name: str, change: np.ndarray) -> list[str]:
+        # The recorded torques change as the parameters do.
+        joints = read_side(dry).information
+        assert joints is not None
+        pairs = zip(joints.supports, joints.factors, strict=True)
+        factors = tuple(
+            np.column_stack([factor[:, :-1], factor[:, -1] + factor[:, :-1] @ change[support]])
+            for support, factor in pairs
+        )
+        moved = changed_file(
+            dry,
+            name,
+            base_parameters={"unconstrained_values": (values + change).tolist()},
+            information=information_document(replace(joints, factors=factors)),
+        )
+        return [one.what for one in findings(compare([accepted, read_side(moved)]).pairs[0])]
+
+    # The shoulder too, by a third of the elbow in residuals.
+    shoulder = np.zeros(len(values))
+    shoulder[place["fc1"]] = 0.18
+    assert found("both_dry.json", shoulder) == ["friction of joint elbow", "friction of joint shoulder"]
+    # A tool of 1 kg besides, which moves the base parameters of both links.
+    names = list(accepted.file.base.names)
+    tool = accepted.file.base.K[:, names.index("m2")] + 0.05 * accepted.file.base.K[:, names.index("lx2")]
+    assert found("dry_tooled.json", tool) == ["body of link 2", "friction of joint elbow"]
