@@ -13,7 +13,19 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ident_service import __version__
-from ident_service.cli import arm, bus, commission, configs, emulate, exports, motions, parameters, recovery, results
+from ident_service.cli import (
+    arm,
+    bus,
+    commission,
+    comparing,
+    configs,
+    emulate,
+    exports,
+    motions,
+    parameters,
+    recovery,
+    results,
+)
 from ident_service.cli.answer import (
     DONE,
     FAILED,
@@ -30,7 +42,7 @@ from ident_service.errors import ArmFault, ConfigError, IdentError, MotionRefuse
 
 __all__ = ["DONE", "FAILED", "FAULTED", "USAGE", "VERDICT_NO", "main"]
 
-GROUPS = (commission, motions, arm, recovery, parameters, results, exports, configs, bus, emulate)
+GROUPS = (commission, motions, arm, recovery, parameters, results, comparing, exports, configs, bus, emulate)
 _EXIT_CODES: tuple[tuple[type[IdentError], int], ...] = (
     (ConfigError, USAGE),
     (UsageError, USAGE),

@@ -28,6 +28,7 @@ from ident_service.model.chain import Array
 from ident_service.model.expressions import parse_expression
 from ident_service.model.layout import INERTIAL, TERM_SYMBOLS
 from ident_service.results.files import write_atomically
+from ident_service.results.information_document import information_document
 from ident_service.results.strict_json import strict_json
 
 MAX_BYTES = 64 * 2**20
@@ -117,6 +118,7 @@ def parameters_document(estimate: Estimate) -> dict[str, Any]:
             "expressions": list(base.expressions),
             "units": list(base.units),
             "values": estimate.beta.tolist(),
+            "unconstrained_values": estimate.fit.beta.tolist(),
             "standard_deviations": _perhaps(estimate.standard_deviations),
             "white_standard_deviations": _perhaps(estimate.white_standard_deviations),
             "covariance": [_perhaps(row) for row in estimate.covariance],
@@ -139,9 +141,11 @@ def parameters_document(estimate: Estimate) -> dict[str, Any]:
         "torque_scales": estimate.prepared.torque_scales.tolist(),
         "fit": {
             "samples": estimate.samples,
+            "blocks": len(estimate.fitted.blocks),
             "condition_number": estimate.fit.condition_number if np.isfinite(estimate.fit.condition_number) else None,
             **_errors(own.identification, model.chain.names),
         },
+        "information": information_document(estimate.prepared.equations.total),
         "validation": [
             {"recording": s.recording, "sha256": s.sha256, **_errors(s.error, model.chain.names)}
             for s in own.validation

@@ -96,8 +96,8 @@ def identify_files(request: Request, folder: Path, tell: Callable[[str], None] =
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"{folder}: is a file, not a folder")
     model = arm_model(_config(request))
-    recordings = [_open(path, model) for path in request.recordings]
-    validation = [_open(path, model) for path in request.validation]
+    recordings = [open_for(path, model) for path in request.recordings]
+    validation = [open_for(path, model) for path in request.validation]
     found = [(recording, recording_quality(recording, model)) for recording in [*recordings, *validation]]
     warnings = tuple(f"{recording.path}: {line}" for recording, seen in found for line in seen.warnings())
     estimate = identify(model, recordings, validation, method=request.method, set_name=request.set_name)
@@ -135,7 +135,13 @@ def _config(request: Request) -> ArmConfig:
     return config.model_copy(update={"identification": options.model_copy(update=changes)})
 
 
-def _open(path: Path, model: ArmModel) -> Recording:
+def open_for(path: Path, model: ArmModel) -> Recording:
+    """A recording as its arm's description says it is to be read; FILE@2:1.5 leaves out 2 s and 1.5 s.
+
+    Raises:
+        UsageError: no such file.
+        RecordingError: it does not fit the arm.
+    """
     start, end = 0.0, 0.0
     if not path.exists() and (match := _TRIMMED.match(str(path))):
         path, start, end = Path(match["path"]), float(match["start"]), float(match["end"])
