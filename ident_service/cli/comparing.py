@@ -29,8 +29,8 @@ def add(verbs: Verbs) -> None:
 
 
 def _compare(arguments: argparse.Namespace) -> Answer:
-    from ident_service.results.comparison_document import comparison_document
-    from ident_service.results.comparison_text import comparison_text
+    from ident_service.results.comparison.document import comparison_document
+    from ident_service.results.comparison.text import comparison_text
     from ident_service.service.comparison import compare_files
 
     comparison, files = compare_files([arguments.reference, *arguments.others], arguments.out)
@@ -40,7 +40,7 @@ def _compare(arguments: argparse.Namespace) -> Answer:
 
 
 def _payload(arguments: argparse.Namespace) -> Answer:
-    from ident_service.results.comparison_text import comparison_text
+    from ident_service.results.comparison.text import comparison_text
     from ident_service.service.commission import new_run_folder
     from ident_service.service.payload import payload_files
 

@@ -9,12 +9,9 @@ import json
 import subprocess
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import numpy as np
 
 from ident_service import __version__
@@ -29,6 +26,7 @@ from ident_service.model.expressions import parse_expression
 from ident_service.model.layout import INERTIAL, TERM_SYMBOLS
 from ident_service.results.files import write_atomically
 from ident_service.results.information_document import information_document
+from ident_service.results.schemas import require_schema
 from ident_service.results.strict_json import strict_json
 
 MAX_BYTES = 64 * 2**20
@@ -51,12 +49,6 @@ class ParameterFile:
     content: dict[str, Any]
 
 
-@cache
-def _validator() -> jsonschema.Draft202012Validator:
-    schema = json.loads(files("ident_service.results").joinpath("parameters.schema.json").read_text(encoding="utf-8"))
-    return jsonschema.Draft202012Validator(schema)
-
-
 def read_parameters(path: Path, names: tuple[str, ...] | None = None) -> ParameterFile:
     """Read a parameter file.
 
@@ -77,7 +69,7 @@ def read_parameters(path: Path, names: tuple[str, ...] | None = None) -> Paramet
         content = strict_json(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise ParameterError(f"{path}: not JSON: {error}") from None
-    _validate(content, str(path))
+    require_schema(content, "parameters", path, "a parameter file")
     table = content["base_parameters"]
     expressions, values = tuple(table["expressions"]), np.array(table["values"], dtype=float)
     for key, column in table.items():
@@ -167,15 +159,8 @@ def write_parameters(path: Path, document: dict[str, Any]) -> None:
         ParameterError: the document does not fit the schema.
         UsageError: the file cannot be written.
     """
-    _validate(document, str(path))
+    require_schema(document, "parameters", path, "a parameter file")
     write_atomically(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
-
-
-def _validate(content: Any, where: str) -> None:
-    mistakes = sorted(_validator().iter_errors(content), key=lambda mistake: mistake.json_path)
-    if mistakes:
-        listed = "; ".join(f"{mistake.json_path}: {mistake.message[:200]}" for mistake in mistakes[:10])
-        raise ParameterError(f"{where}: not a parameter file: {listed}")
 
 
 def _names_in(expressions: tuple[str, ...]) -> tuple[str, ...]:

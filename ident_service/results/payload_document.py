@@ -6,12 +6,9 @@ import json
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from datetime import UTC, datetime
-from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import numpy as np
 
 from ident_service import __version__
@@ -28,6 +25,7 @@ from ident_service.model.chain import Array
 from ident_service.model.layout import INERTIAL
 from ident_service.results.files import write_atomically
 from ident_service.results.information_document import information_document
+from ident_service.results.schemas import require_schema
 
 _WORDS: Mapping[Word, tuple[str, str]] = {
     "none": ("NO PAYLOAD", "the arm moves as it was identified"),
@@ -41,12 +39,6 @@ _WORDS: Mapping[Word, tuple[str, str]] = {
 }
 # What no longer holds for an arm with a load, or is about other recordings.
 _STALE = ("bootstrap", "essential", "recording_quality", "validation", "fit", "information", "link_parameters")
-
-
-@cache
-def _validator() -> jsonschema.Draft202012Validator:
-    schema = json.loads(files("ident_service.results").joinpath("payload.schema.json").read_text(encoding="utf-8"))
-    return jsonschema.Draft202012Validator(schema)
 
 
 def payload_document(payload: Payload, arm: KnownArm, arm_sha256: str, recordings: Sequence[Mapping[str, str]]) -> Any:
@@ -118,8 +110,7 @@ def write_payload(path: Path, document: Any) -> None:
         ParameterError: the document does not fit the schema.
         UsageError: the file cannot be written.
     """
-    if mistakes := [f"{one.json_path}: {one.message[:200]}" for one in _validator().iter_errors(document)]:
-        raise ParameterError(f"{path}: not a payload: {'; '.join(mistakes[:10])}")
+    require_schema(document, "payload", path, "a payload")
     write_atomically(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 

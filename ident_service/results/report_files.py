@@ -9,9 +9,9 @@ from pathlib import Path
 from ident_service.errors import ParameterError, UsageError
 from ident_service.estimation.identify import Estimate
 from ident_service.record.recording import Recording
-from ident_service.results.evidence import Evidence
-from ident_service.results.evidence_file import EVIDENCE, read_evidence, write_evidence
-from ident_service.results.evidence_making import gather_evidence
+from ident_service.results.evidence.evidence import Evidence
+from ident_service.results.evidence.file import EVIDENCE, read_evidence, write_evidence
+from ident_service.results.evidence.making import gather_evidence
 from ident_service.results.files import write_atomically
 from ident_service.results.parameter_file import read_parameters
 from ident_service.results.report.page import report_html

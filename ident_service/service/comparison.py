@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from ident_service.results.comparison import Comparison, compare
-from ident_service.results.comparison_document import write_comparison
-from ident_service.results.comparison_page import comparison_html
-from ident_service.results.comparison_sides import read_side
-from ident_service.results.comparison_text import comparison_text
+from ident_service.results.comparison.comparison import Comparison, compare
+from ident_service.results.comparison.document import write_comparison
+from ident_service.results.comparison.page import comparison_html
+from ident_service.results.comparison.sides import read_side
+from ident_service.results.comparison.text import comparison_text
 from ident_service.results.files import appearing_folder, write_atomically
 
 DOCUMENT, TEXT, PAGE = "comparison.json", "comparison.txt", "comparison.html"

@@ -13,8 +13,8 @@ from ident_service.errors import ParameterError, UsageError
 from ident_service.estimation.fit import gather
 from ident_service.estimation.payload import KnownArm, Payload, identify_payload
 from ident_service.model.arm_model import arm_model
-from ident_service.results.comparison import Comparison, compare
-from ident_service.results.comparison_sides import Side, read_side
+from ident_service.results.comparison.comparison import Comparison, compare
+from ident_service.results.comparison.sides import Side, read_side
 from ident_service.results.export.urdf_file import write_urdf
 from ident_service.results.files import appearing_folder, require_place, write_atomically
 from ident_service.results.parameter_file import read_parameters, write_parameters

@@ -17,9 +17,9 @@ from compare.conftest import Ident
 from ident_service.config.load import load_arm
 from ident_service.errors import ParameterError, UsageError
 from ident_service.estimation.least_squares import ordinary_least_squares
-from ident_service.results.comparison import compare
-from ident_service.results.comparison_findings import findings
-from ident_service.results.comparison_sides import read_side
+from ident_service.results.comparison.comparison import compare
+from ident_service.results.comparison.findings import findings
+from ident_service.results.comparison.sides import read_side
 from ident_service.results.information_document import information_document, information_from
 
 

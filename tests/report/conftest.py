@@ -14,7 +14,7 @@ from ident_service.config.schema import ArmConfig, Identification, Smoothing
 from ident_service.estimation.feasible.feasible_set import SetName
 from ident_service.estimation.identify import Estimate, identify
 from ident_service.model.arm_model import ArmModel
-from ident_service.results.evidence import Evidence
+from ident_service.results.evidence.evidence import Evidence
 from ident_service.results.parameter_file import ParameterFile
 from ident_service.results.report_files import read_evidence_of, write_report
 from ident_service.results.run_folder import read_results, write_manifest, write_results

@@ -10,7 +10,7 @@ from helpers.random_arms import random_body, random_rotation
 from report.conftest import Made
 
 from ident_service.model.kinematics import frame_origins, link_poses
-from ident_service.results.evidence_bodies import bounds_of, ellipsoid, posed
+from ident_service.results.evidence.bodies import bounds_of, ellipsoid, posed
 from ident_service.results.report.body_figures import ellipse
 
 
@@ -121,7 +121,7 @@ def test_friction_points_are_the_friction_that_was_put_in(good: Made) -> None:
 
 
 def test_a_model_without_friction_has_none(good: Made) -> None:
-    from ident_service.results.evidence_friction import FrictionSeen
+    from ident_service.results.evidence.friction import FrictionSeen
 
     model = replace(good.estimate.model, layout=replace(good.estimate.model.layout, terms=("drive_inertia",)))
     from ident_service.model.base import base_parameters

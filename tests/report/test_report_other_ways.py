@@ -15,8 +15,8 @@ from report.pages import sections
 from ident_service.config.schema import Identification, Smoothing
 from ident_service.estimation.identify import identify
 from ident_service.model.regressor import joint_regressor
-from ident_service.results.evidence_making import gather_evidence
-from ident_service.results.evidence_timing import timing
+from ident_service.results.evidence.making import gather_evidence
+from ident_service.results.evidence.timing import timing
 from ident_service.results.report_files import write_report
 from ident_service.results.run_folder import write_results
 

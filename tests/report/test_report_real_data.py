@@ -9,7 +9,7 @@ import pytest
 from report.pages import parsed, sections
 
 from benchmarks.real_data import CASES, DATA, Case
-from ident_service.results.evidence import Evidence
+from ident_service.results.evidence.evidence import Evidence
 from ident_service.results.report_files import read_evidence_of
 from ident_service.results.run_folder import read_results
 from ident_service.service.identification import Request, identify_files

@@ -8,7 +8,7 @@ from typing import Any
 
 from report.conftest import Made
 
-from ident_service.results.evidence import Evidence
+from ident_service.results.evidence.evidence import Evidence
 from ident_service.results.parameter_file import ParameterFile
 from ident_service.results.report.verdict import verdict
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from ident_service.results.drawing import Array, Axes, Canvas, number, round_values
 from ident_service.results.drawing_chart import FONT, draw_key
-from ident_service.results.evidence import Body, Evidence, Posed
+from ident_service.results.evidence.evidence import Body, Evidence, Posed
 from ident_service.results.report.figure import LEFT, RIGHT, WIDTH, Figure
 
 _TOP, _BOTTOM = 42.0, 40.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ident_service.results.evidence import Evidence
+from ident_service.results.evidence.evidence import Evidence
 from ident_service.results.parameter_file import ParameterFile
 from ident_service.results.report.body_figures import body_figures
 from ident_service.results.report.doubt_figures import correlation_figure, deviation_figure

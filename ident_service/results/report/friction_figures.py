@@ -6,7 +6,7 @@ import numpy as np
 
 from ident_service.results.drawing import Axes, Canvas
 from ident_service.results.drawing_chart import draw_frame, draw_key, range_around
-from ident_service.results.evidence import Evidence
+from ident_service.results.evidence.evidence import Evidence
 from ident_service.results.report.figure import LEFT, RIGHT, WIDTH, Figure
 
 _TOP, _HEIGHT, _BOTTOM = 42.0, 200.0, 40.0

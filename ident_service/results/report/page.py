@@ -18,10 +18,10 @@ import numpy as np
 from ident_service.config.schema import ArmConfig
 from ident_service.results.drawing import number, plain
 from ident_service.results.drawing_style import sheet
-from ident_service.results.evidence import Evidence, Traced
-from ident_service.results.evidence_file import runs_of
-from ident_service.results.evidence_making import CAD
-from ident_service.results.evidence_packing import packed, packed_mask
+from ident_service.results.evidence.evidence import Evidence, Traced
+from ident_service.results.evidence.file import runs_of
+from ident_service.results.evidence.making import CAD
+from ident_service.results.evidence.packing import packed, packed_mask
 from ident_service.results.parameter_file import ParameterFile
 from ident_service.results.report.figure import Figure, Zoom
 from ident_service.results.report.figures import Figures, figures

@@ -6,7 +6,7 @@ import numpy as np
 
 from ident_service.results.drawing import Array, Axes, Canvas, number
 from ident_service.results.drawing_chart import draw_frame, draw_key, range_around
-from ident_service.results.evidence import Evidence, Spectrum, Traced
+from ident_service.results.evidence.evidence import Evidence, Spectrum, Traced
 from ident_service.results.report.figure import LEFT, RIGHT, WIDTH, Figure
 
 _TOP, _HEIGHT, _BETWEEN, _BOTTOM = 42.0, 120.0, 66.0, 40.0

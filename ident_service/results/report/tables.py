@@ -9,8 +9,8 @@ import numpy as np
 
 from ident_service.estimation.doubt import Verdict
 from ident_service.results.drawing import number
-from ident_service.results.evidence import Condition, Evidence
-from ident_service.results.evidence_making import CAD
+from ident_service.results.evidence.evidence import Condition, Evidence
+from ident_service.results.evidence.making import CAD
 from ident_service.results.parameter_file import ParameterFile
 from ident_service.results.report.markup import Cell, table
 

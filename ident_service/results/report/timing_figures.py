@@ -6,7 +6,7 @@ import numpy as np
 
 from ident_service.results.drawing import Axes, Canvas, number
 from ident_service.results.drawing_chart import draw_frame
-from ident_service.results.evidence import Evidence, Timing
+from ident_service.results.evidence.evidence import Evidence, Timing
 from ident_service.results.report.figure import LEFT, RIGHT, WIDTH, Figure
 
 _TOP, _HEIGHT, _BOTTOM = 28.0, 150.0, 40.0

@@ -8,7 +8,7 @@ import numpy as np
 
 from ident_service.results.drawing import Array, Axes, Canvas, number
 from ident_service.results.drawing_chart import draw_frame, draw_key, range_around
-from ident_service.results.evidence import Evidence, JointTrace, Mask, Traced
+from ident_service.results.evidence.evidence import Evidence, JointTrace, Mask, Traced
 from ident_service.results.report.figure import LEFT, RIGHT, WIDTH, Figure, Zoom
 
 _TOP, _TORQUE, _RESIDUAL, _BETWEEN, _BOTTOM = 42.0, 150.0, 74.0, 26.0, 40.0

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from ident_service.estimation.doubt import IDENTIFIED_BELOW, WEAK_BELOW
 from ident_service.results.drawing import number
-from ident_service.results.evidence import Evidence
+from ident_service.results.evidence.evidence import Evidence
 from ident_service.results.parameter_file import ParameterFile
 
 _MUCH_WORSE = 1.5  # times the error on what was fitted to

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ident_service.results.evidence import Array, Mask
+from ident_service.results.evidence.evidence import Array, Mask
 
 Index = NDArray[np.int64]
 

@@ -13,8 +13,8 @@ from ident_service.config.schema import JointTerm
 from ident_service.estimation.equations import Rows
 from ident_service.estimation.identify import Estimate
 from ident_service.model.layout import TERM_SYMBOLS, Layout
-from ident_service.results.evidence import Array, Friction
-from ident_service.results.evidence_series import Scatter, spread
+from ident_service.results.evidence.evidence import Array, Friction
+from ident_service.results.evidence.series import Scatter, spread
 
 _CURVE = 160  # samples of a curve, closer together near standstill
 _TERMS: tuple[JointTerm, ...] = tuple(term for term in TERM_SYMBOLS if term != "drive_inertia")

@@ -16,7 +16,7 @@ import numpy as np
 
 from ident_service.errors import ParameterError
 from ident_service.results.drawing import LARGEST
-from ident_service.results.evidence import Array, Mask
+from ident_service.results.evidence.evidence import Array, Mask
 
 _LEVELS = 65535
 _MOST = 1 << 22  # values of one array

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import numpy as np
 
 from ident_service.errors import ParameterError, UsageError
 from ident_service.results.drawing import LARGEST
-from ident_service.results.evidence import (
+from ident_service.results.evidence.evidence import (
     Array,
     Body,
     Condition,
@@ -27,19 +24,14 @@ from ident_service.results.evidence import (
     Timing,
     Traced,
 )
-from ident_service.results.evidence_packing import packed, packed_mask, unpacked, unpacked_mask
+from ident_service.results.evidence.packing import packed, packed_mask, unpacked, unpacked_mask
 from ident_service.results.files import write_atomically
+from ident_service.results.schemas import require_schema
 from ident_service.results.strict_json import strict_json
 
 EVIDENCE = "evidence.json"
 MAX_BYTES = 64 * 2**20
 _LARGEST_LOG = 60.0  # ten to the power of
-
-
-@cache
-def _validator() -> jsonschema.Draft202012Validator:
-    schema = json.loads(files("ident_service.results").joinpath("evidence.schema.json").read_text(encoding="utf-8"))
-    return jsonschema.Draft202012Validator(schema)
 
 
 def write_evidence(path: Path, evidence: Evidence) -> None:
@@ -82,9 +74,7 @@ def _validate(content: Any, path: Path) -> None:
         raise ParameterError(f"{path}: not evidence of an identification")
     if version != 1:
         raise ParameterError(f"{path}: evidence of version {version!r}, but this software reads version 1")
-    mistake = jsonschema.exceptions.best_match(_validator().iter_errors(content))
-    if mistake is not None:
-        raise ParameterError(f"{path}: not evidence: {mistake.json_path}: {mistake.message[:200]}")
+    require_schema(content, "evidence", path, "evidence")
 
 
 def evidence_document(evidence: Evidence) -> dict[str, Any]:

@@ -11,12 +11,12 @@ from ident_service.config.schema import JointTerm
 from ident_service.estimation.drift import ALPHA, Drift
 from ident_service.model.chain import Array
 from ident_service.model.layout import TERM_SYMBOLS, Layout
-from ident_service.results.comparison import Pair
-from ident_service.results.comparison_findings import joint_name
-from ident_service.results.comparison_sides import Side
+from ident_service.results.comparison.comparison import Pair
+from ident_service.results.comparison.findings import joint_name
+from ident_service.results.comparison.sides import Side
 from ident_service.results.drawing import Axes, Canvas
 from ident_service.results.drawing_chart import draw_frame, draw_key, range_around
-from ident_service.results.evidence_friction import friction_term
+from ident_service.results.evidence.friction import friction_term
 from ident_service.results.report.figure import LEFT, RIGHT, WIDTH, Figure
 
 _TOP, _HEIGHT, _BOTTOM = 42.0, 200.0, 40.0

@@ -1,6 +1,6 @@
 """What a person needs to see before believing an estimate, and what `parameters.json` does not say.
 
-Boundary: data. It is gathered in `evidence_making.py`, kept in `evidence.json` (`evidence_file.py`), and drawn by the
+Boundary: data. It is gathered in `making.py`, kept in `evidence.json` (`file.py`), and drawn by the
 report. The correlation of the parameters is not here, because the parameter file has their covariance.
 """
 

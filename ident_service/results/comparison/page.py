@@ -11,11 +11,11 @@ from importlib.resources import files
 import numpy as np
 
 from ident_service.estimation.drift import ALPHA
-from ident_service.results.comparison import Comparison, Pair
-from ident_service.results.comparison_figures import friction_curves, z_figure
-from ident_service.results.comparison_findings import findings
-from ident_service.results.comparison_sides import Side
-from ident_service.results.comparison_text import finding_line, verdict_lines
+from ident_service.results.comparison.comparison import Comparison, Pair
+from ident_service.results.comparison.figures import friction_curves, z_figure
+from ident_service.results.comparison.findings import findings
+from ident_service.results.comparison.sides import Side
+from ident_service.results.comparison.text import finding_line, verdict_lines
 from ident_service.results.drawing import number, plain
 from ident_service.results.drawing_style import sheet
 from ident_service.results.report.figure import Figure

@@ -15,7 +15,7 @@ from ident_service.estimation.identify import Estimate
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters
 from ident_service.model.kinematics import branches, frame_origins, link_poses
-from ident_service.results.evidence import Array, Body, Condition, Posed
+from ident_service.results.evidence.evidence import Array, Body, Condition, Posed
 
 
 def conditions_of(estimate: Estimate) -> tuple[Condition, ...]:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from ident_service.estimation.drift import ALPHA, RELEVANT_RESIDUAL, RELEVANT_TORQUE
-from ident_service.results.comparison import Comparison, Pair
-from ident_service.results.comparison_findings import Finding, findings
-from ident_service.results.comparison_sides import Side
+from ident_service.results.comparison.comparison import Comparison, Pair
+from ident_service.results.comparison.findings import Finding, findings
+from ident_service.results.comparison.sides import Side
 
 _WIDTH = 46
 

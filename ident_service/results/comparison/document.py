@@ -4,29 +4,20 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import numpy as np
 
 from ident_service import __version__
-from ident_service.errors import ParameterError
 from ident_service.estimation.drift import ALPHA, RELEVANT_RESIDUAL, RELEVANT_TORQUE, Test
 from ident_service.estimation.least_squares import TorqueError
 from ident_service.model.chain import Array
-from ident_service.results.comparison import Comparison, Pair
-from ident_service.results.comparison_findings import findings
-from ident_service.results.comparison_sides import Side
+from ident_service.results.comparison.comparison import Comparison, Pair
+from ident_service.results.comparison.findings import findings
+from ident_service.results.comparison.sides import Side
 from ident_service.results.files import write_atomically
-
-
-@cache
-def _validator() -> jsonschema.Draft202012Validator:
-    schema = json.loads(files("ident_service.results").joinpath("comparison.schema.json").read_text(encoding="utf-8"))
-    return jsonschema.Draft202012Validator(schema)
+from ident_service.results.schemas import require_schema
 
 
 def comparison_document(comparison: Comparison) -> dict[str, Any]:
@@ -50,8 +41,7 @@ def write_comparison(path: Path, comparison: Comparison) -> None:
         UsageError: the file cannot be written.
     """
     document = comparison_document(comparison)
-    if mistakes := [f"{one.json_path}: {one.message[:200]}" for one in _validator().iter_errors(document)]:
-        raise ParameterError(f"{path}: not a comparison: {'; '.join(mistakes[:10])}")
+    require_schema(document, "comparison", path, "a comparison")
     write_atomically(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 

@@ -14,7 +14,8 @@ from ident_service.estimation.equations import Rows, equation_rows
 from ident_service.estimation.identify import Candidate, Estimate
 from ident_service.model.threads import one_blas_thread
 from ident_service.record.recording import Recording
-from ident_service.results.evidence import (
+from ident_service.results.evidence.bodies import bounds_of, conditions_of, posed
+from ident_service.results.evidence.evidence import (
     Array,
     Estimated,
     Evidence,
@@ -24,10 +25,9 @@ from ident_service.results.evidence import (
     Timing,
     Traced,
 )
-from ident_service.results.evidence_bodies import bounds_of, conditions_of, posed
-from ident_service.results.evidence_friction import FrictionSeen
-from ident_service.results.evidence_series import Envelope, Scatter, Welch
-from ident_service.results.evidence_timing import timing
+from ident_service.results.evidence.friction import FrictionSeen
+from ident_service.results.evidence.series import Envelope, Scatter, Welch
+from ident_service.results.evidence.timing import timing
 
 _STRETCHES = 8000  # of all recordings together; a screen has some thousand columns
 _FEWEST_STRETCHES = 400

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from ident_service.estimation.drift import Drift, Effect, Identified
 from ident_service.estimation.drift_causes import Cause, friction_ratio, meaning_of_cause, meaning_of_effect
-from ident_service.results.comparison import Pair
+from ident_service.results.comparison.comparison import Pair
 
 _OF_JOINTS = ("friction", "drive inertia")
 EXPLAINS = 0.9  # of the squared change of torque; a single cause that explains less is not the whole story

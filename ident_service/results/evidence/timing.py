@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ident_service.record.cycles import Cycles, read_cycles
 from ident_service.record.recording import Recording
-from ident_service.results.evidence import Array, Timing
+from ident_service.results.evidence.evidence import Array, Timing
 
 _BINS = 60
 _GAPS = 100

@@ -23,7 +23,7 @@ from ident_service.estimation.drift import Drift, Identified, drift
 from ident_service.estimation.drift_causes import Cause, causes
 from ident_service.estimation.least_squares import TorqueError, torque_error
 from ident_service.model.chain import Array
-from ident_service.results.comparison_sides import Side
+from ident_service.results.comparison.sides import Side
 from ident_service.results.run_folder import ARM
 
 Verdict = Literal["unchanged", "changed", "impossible"]
