@@ -10,6 +10,7 @@ from pathlib import Path
 
 from drivers.arm import Arm
 from drivers.clock import Clock
+from ident_service.config.limits import motion_limits
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import ArmError, UsageError
 from ident_service.estimation.equations import equations
@@ -21,6 +22,7 @@ from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.urdf import urdf_text
 from ident_service.motion.controls import StopWhen
 from ident_service.motion.factory import make_arm
+from ident_service.motion.plans import Excite
 from ident_service.motion.run import RunReport, run
 from ident_service.motion.states import State
 from ident_service.record.kept import KeptRecording
@@ -93,6 +95,17 @@ def record_motion(
         return run(arm, model, motion, recorder, StopWhen(stop_requested))
 
 
+def require_clear_from_home(model: ArmModel, motion: Excitation) -> None:
+    """See whether an arm that stands at home may be led along a motion and back.
+
+    Raises:
+        MotionRefused: it would leave limits, or come too near to something.
+    """
+    limits, plan = motion_limits(model.config), Excite(motion)
+    plan.require_possible(model, limits)
+    plan.legs(model, limits.home, limits)
+
+
 def simulate(
     config: ArmConfig,
     folder: Path,
@@ -127,6 +140,8 @@ def simulate(
         raise UsageError(f"{config.name} has no simulated driver; use a description that has one")
     first = excitation(model, "identification") if motion is None else replace(motion, name="identification")
     motions = [first, excitation(model, "validation")]
+    for planned in motions[1:]:  # the first is looked at when it begins; nothing shall have moved in vain
+        require_clear_from_home(model, planned)
     reports, observed = [], list[Truth]()
     with appearing_folder(folder) as staging:
         paths = [staging / f"{planned.name}.mcap" for planned in motions]
