@@ -315,7 +315,9 @@ class _Preflight:
         if self.described is None or "identities" not in self.checks:
             self._passed(unreachable(str(error)))
         else:
-            code = next(code for code in CODES if code not in self.checks)
+            # None about the motion: a way home may begin although one of them failed. The last where all are made.
+            left = (code for code in CODES if code not in self.checks and code not in ABOUT_THE_MOTION)
+            code = next(left, CODES[-1])
             remedy = "Check power, cables, bus and the drives' own fault codes."
             self._passed(failed(code, str(error), remedy))
 

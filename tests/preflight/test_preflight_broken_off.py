@@ -1,0 +1,76 @@
+"""A preflight whose bus goes, or that somebody stops, allows no motion, whatever it is about and whenever it ends."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from flight_bench import Flight, check_of, verdicts
+
+from drivers.arm import Arm
+from ident_service.errors import DriverError
+from ident_service.excitation.excitation import Excitation
+from ident_service.motion.preflight.check import Verdict
+from ident_service.motion.preflight.preflight import preflight
+from ident_service.motion.preflight.ticket import Ticket
+from ident_service.motion.stoppable import StoppableArm
+
+
+def bus_goes(flight: Flight, after: int) -> Arm:
+    """The arm, whose bus is gone after so many torques."""
+
+    def told(torque: np.ndarray) -> np.ndarray:
+        if len(flight.arm.torques) > after:
+            raise DriverError("the bus is gone")
+        return torque
+
+    flight.arm.told = told
+    return flight.arm
+
+
+def stopped(flight: Flight, after: int) -> Arm:
+    """The arm, of which somebody asks a stop after so many torques."""
+    return StoppableArm(flight.arm, lambda: len(flight.arm.torques) >= after)
+
+
+def checked(flight: Flight, arm: Arm, motion: Excitation | None) -> Ticket:
+    return preflight(arm, flight.model, motion, confirm=flight.confirm, clock=flight.clock, look_seconds=0.2)
+
+
+def for_a_way_home(ticket: Ticket) -> list[str]:
+    """Why it does not allow a way home on the same arm."""
+    return ticket.valid_for(replace(ticket.subject, excitation="", excitation_sha256=""), ticket.created)
+
+
+@pytest.mark.parametrize("ends", [bus_goes, stopped])
+@pytest.mark.parametrize("after", [0, 100, 1000])
+def test_without_a_motion(ends: Callable[[Flight, int], Arm], after: int) -> None:
+    flight = Flight()
+    ticket = checked(flight, ends(flight, after), None)
+    assert ticket.verdict is Verdict.FAILED
+    failed = [check.code for check in ticket.checks if check.verdict is Verdict.FAILED]
+    assert failed == ["direction" if after == 1000 else "gravity"]
+    assert for_a_way_home(ticket)
+
+
+def test_with_a_motion_that_does_not_fit() -> None:
+    """What fails about the motion forbids no way home, so that the bus must fail another check."""
+    flight = Flight()
+    other = Flight(changes={"gravity": (0.0, -9.8, 0.0)}).motion
+    ticket = checked(flight, bus_goes(flight, 0), other)
+    assert verdicts(ticket)["motion_fits"] is Verdict.FAILED
+    assert verdicts(ticket)["gravity"] is Verdict.FAILED
+    assert for_a_way_home(ticket) == ["the check did not pass: gravity"]
+
+
+def test_when_every_check_has_been_made() -> None:
+    """Nobody typed the arm's name, so that the watchdog's check stands; then the bus goes while torque fades."""
+    whole = Flight(typed="")
+    assert checked(whole, whole.arm, whole.motion).verdict is Verdict.NEEDS_PERSON
+    flight = Flight(typed="")
+    ticket = checked(flight, bus_goes(flight, len(whole.arm.torques) - 50), flight.motion)
+    assert check_of(ticket, "direction").verdict is Verdict.PASSED
+    assert check_of(ticket, "watchdog").reason == "the bus is gone"
+    assert ticket.verdict is Verdict.FAILED
