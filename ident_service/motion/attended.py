@@ -7,15 +7,16 @@ simply done. With the torque on nothing else is done at all: the loop's thread w
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from drivers.arm import Arm
-from ident_service.errors import ArmError
 
 _SWITCH = 2e-4  # s after which the cycles get the interpreter from the other thread, instead of 5 ms
+_FIRST_COME = (os.SCHED_FIFO, os.SCHED_RR)  # threads of one priority let each other run only when they wait
 
 
 @contextmanager
@@ -26,30 +27,52 @@ def attended(arm: Arm) -> Iterator[None]:
         arm: open, not enabled.
 
     Raises:
-        ArmError: a cycle failed, told when the block has ended.
+        ArmError: a cycle failed, told when the block has ended; likewise whatever else a driver may raise.
     """
     if arm.clock.lock_step:
         yield
         return
     ended = threading.Event()
-    failures: list[ArmError] = []
+    failures: list[Exception] = []
 
     def cycles() -> None:
         try:
             while not ended.is_set():
                 arm.exchange(None)
-        except ArmError as error:
+        except Exception as error:  # noqa: BLE001 - whatever it is, nobody attends to the arm from here on
             failures.append(error)
 
     thread = threading.Thread(target=cycles, name="attended")
     before = sys.getswitchinterval()
     sys.setswitchinterval(min(before, _SWITCH))
-    thread.start()
     try:
-        yield
+        thread.start()
+        with _behind():
+            yield
     finally:
         ended.set()
-        thread.join()
+        if thread.ident is not None:
+            thread.join()
         sys.setswitchinterval(before)
     if failures:
         raise failures[0]
+
+
+@contextmanager
+def _behind() -> Iterator[None]:
+    """One priority below threads that were started before, where real time was granted (`realtime.py`).
+
+    They have this thread's priority and core, and would not run at all until it waits.
+    """
+    policy, granted = os.sched_getscheduler(0), os.sched_getparam(0)
+    lower = granted.sched_priority - 1
+    if policy not in _FIRST_COME or lower < os.sched_get_priority_min(policy):
+        yield
+        return
+    with suppress(OSError):
+        os.sched_setscheduler(0, policy, os.sched_param(lower))
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            os.sched_setscheduler(0, policy, granted)

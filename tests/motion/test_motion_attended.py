@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
+import time
 from collections.abc import Callable
 
 import pytest
@@ -11,13 +13,14 @@ import pytest
 from drivers.clock import Clock, RealClock, VirtualClock
 from ident_service.errors import DriverError
 from ident_service.motion.attended import attended
+from ident_service.motion.realtime import asked
 
 
 class Looked:
     """The part of an arm that is used: cycles without torque, one of which may fail."""
 
-    def __init__(self, clock: Clock, fails_at: int | None = None) -> None:
-        self.clock, self.fails_at = clock, fails_at
+    def __init__(self, clock: Clock, fails_at: int | None = None, error: Exception | None = None) -> None:
+        self.clock, self.fails_at, self.error = clock, fails_at, error or DriverError("the bus is gone")
         self.cycles, self.torques = 0, list[object]()
         self.enough = threading.Event()
 
@@ -25,7 +28,7 @@ class Looked:
         self.torques.append(torque)
         self.cycles += 1
         if self.cycles == self.fails_at:
-            raise DriverError("the bus is gone")
+            raise self.error
         if self.cycles >= 10:
             self.enough.set()
         self.clock.sleep_until_ns(self.clock.now_ns() + 1_000_000)
@@ -59,6 +62,28 @@ def test_a_cycle_that_fails_is_told_when_the_work_is_done() -> None:
         during(arm, lambda: done.append("work"))
     assert done == ["work"]
     assert arm.cycles == 1
+
+
+def test_what_a_driver_should_not_raise_is_told_too() -> None:
+    with pytest.raises(ZeroDivisionError):
+        during(Looked(RealClock(), fails_at=1, error=ZeroDivisionError()), lambda: None)
+
+
+def test_cycles_go_on_beside_work_that_has_real_time() -> None:
+    """Work and cycles share a core and a priority there, and the work never waits."""
+    with asked() as granted:
+        if not granted.scheduling:
+            pytest.skip("this machine grants no real time")
+        arm, before = Looked(RealClock()), os.sched_getparam(0)
+
+        def work() -> None:
+            end = time.thread_time() + 1.0
+            while not arm.enough.is_set() and time.thread_time() < end:
+                pass
+
+        during(arm, work)
+        assert arm.enough.is_set()
+        assert os.sched_getparam(0) == before
 
 
 def test_work_that_fails_ends_the_cycles_and_is_told_first() -> None:
