@@ -1,4 +1,4 @@
-"""An arm whose next cycle fails once somebody asks for a stop: for whoever moves it without a loop that asks.
+"""An arm that takes no torque once somebody asks for a stop: for whoever moves it without a loop that asks.
 
 Preflight moves an arm by hand's breadths, and ends whatever goes wrong with torque off; so does a stop in it.
 """
@@ -12,7 +12,7 @@ from ident_service.errors import DriverError
 
 
 class StoppableArm(Arm):
-    """Another arm, which is asked for a stop before every torque."""
+    """Another arm; before it is energised, and before every torque, somebody may have asked for a stop."""
 
     def __init__(self, arm: Arm, asked: Callable[[], bool]) -> None:
         """Take an arm, and who says whether it is to stop."""
@@ -29,7 +29,8 @@ class StoppableArm(Arm):
         return self._arm.describe()
 
     def enable(self) -> None:
-        """As the arm does."""
+        """As the arm does; raises DriverError instead once a stop was asked for."""
+        self._require_not_asked()
         self._arm.enable()
 
     def reset(self) -> None:
@@ -38,8 +39,8 @@ class StoppableArm(Arm):
 
     def exchange(self, torque: Vector | None) -> Sample:
         """As the arm does; raises DriverError instead of sending a torque once a stop was asked for."""
-        if torque is not None and self._asked():
-            raise DriverError("somebody asked for a stop")
+        if torque is not None:
+            self._require_not_asked()
         return self._arm.exchange(torque)
 
     def stop(self, kind: StopKind) -> None:
@@ -49,3 +50,7 @@ class StoppableArm(Arm):
     def close(self) -> None:
         """As the arm does."""
         self._arm.close()
+
+    def _require_not_asked(self) -> None:
+        if self._asked():
+            raise DriverError("somebody asked for a stop")

@@ -74,3 +74,18 @@ def test_when_every_check_has_been_made() -> None:
     assert check_of(ticket, "direction").verdict is Verdict.PASSED
     assert check_of(ticket, "watchdog").reason == "the bus is gone"
     assert ticket.verdict is Verdict.FAILED
+
+
+def test_a_stop_that_is_asked_for_while_a_person_thinks_keeps_the_drives_off() -> None:
+    flight = Flight()
+
+    def confirm(question: str) -> str:
+        flight.arm.calls.append("asked")
+        return flight.typed
+
+    arm = StoppableArm(flight.arm, lambda: "asked" in flight.arm.calls)
+    ticket = preflight(arm, flight.model, flight.motion, confirm=confirm, clock=flight.clock, look_seconds=0.2)
+    assert "asked" in flight.arm.calls
+    assert "enable" not in flight.arm.calls
+    assert check_of(ticket, "gravity").reason == "somebody asked for a stop"
+    assert ticket.verdict is Verdict.FAILED
