@@ -99,8 +99,8 @@ def take_home(config: ArmConfig, state: Path, confirm: Callable[[str], str], arm
         typed = confirm(f"type the arm's name, {config.name}, if it stands in this posture and at rest:")
         if typed.strip() != config.name:
             raise MotionRefused(f"{config.name}: not zeroed: the arm's name was not typed; nothing has changed")
+        # Before: one that outlived this would be for another zero, and name the same counts after a loss of power.
+        existed = ticket.exists()
+        ticket.unlink(missing_ok=True)
         drives = (make_arm(config) if arm is None else arm).zero()
-    existed = ticket.exists()
-    # It names the zero that it was made with, so that it would be refused anyway; this only says so earlier.
-    ticket.unlink(missing_ok=True)
     return Zeroed(config.name, posture, drives, fault_file(state, config.name).remembered(), existed)

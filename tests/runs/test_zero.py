@@ -129,6 +129,27 @@ def test_a_ticket_dies_with_the_zero_that_it_was_made_for(config: ArmConfig, beh
     assert any("others than those that were checked" in reason for reason in why), why
 
 
+def test_no_ticket_outlives_a_zeroing_that_is_cut_short(
+    config: ArmConfig, behind: LockStepArm, state: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Switched off and on, drives count from 0 again, so that a ticket cannot tell one zero from the other."""
+    take_home(config, state, sure)
+    ticket = checked(config)
+    path = ticket_path(state, config.name)
+    path.write_text(ticket.to_json())
+    arm = make_arm(config)
+    zero = arm.zero
+
+    def cut_short() -> tuple[str, ...]:
+        zero()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(arm, "zero", cut_short)
+    with pytest.raises(KeyboardInterrupt):
+        take_home(config, state, sure, arm)
+    assert not path.exists()
+
+
 def test_nothing_changes_when_nobody_says_so(config: ArmConfig, behind: LockStepArm, state: Path) -> None:
     for typed in ("", "yes", "pucks"):
         with pytest.raises(MotionRefused, match="nothing has changed"):
