@@ -168,6 +168,8 @@ class _Run:
         """Everything checked and put together, and the torque that holds the arm where it stands."""
         model, chain, arm = self.model, self.model.chain, self.arm
         limits = motion_limits(model.config)
+        if model.prior is None:
+            raise MotionRefused(f"{model.config.name}: computed torque needs prior parameters")
         described = arm.describe()
         if described.joint_names != chain.names:
             raise MotionRefused(
@@ -179,19 +181,19 @@ class _Run:
         period = 1.0 / described.rate
         sample = self._look(limits, period)
         with attended(arm):
-            loop, torque = self._planned(sample, limits, period, described.position_resolution)
+            dynamics = InverseDynamics(chain, model.layout, model.prior)
+            loop, torque = self._planned(dynamics, sample, limits, period, described.position_resolution)
         self._loop = loop
         self._stamp_ns = sample.stamp_ns
         return loop, torque
 
-    def _planned(self, sample: Sample, limits: MotionLimits, period: float, resolution: Vector) -> tuple[Loop, Vector]:
+    def _planned(
+        self, dynamics: InverseDynamics, sample: Sample, limits: MotionLimits, period: float, resolution: Vector
+    ) -> tuple[Loop, Vector]:
         model, chain = self.model, self.model.chain
-        if model.prior is None:
-            raise MotionRefused(f"{model.config.name}: computed torque needs prior parameters")
         home = sample.position.copy()
         admitted = self.plan.admits(model, home, limits)
         legs, limits = self.plan.legs(model, home, limits), admitted
-        dynamics = InverseDynamics(chain, model.layout, model.prior)
         owed = owed_ways(dynamics, model, limits, period, resolution)
         contact = Contact(model)
         guard = Guard(chain.names, limits, period, home, revolute=chain.revolute, contact=contact, owed=owed)
