@@ -32,7 +32,7 @@ def attended(arm: Arm) -> Iterator[None]:
     if arm.clock.lock_step:
         yield
         return
-    ended = threading.Event()
+    ended, over = threading.Event(), threading.Event()
     failures: list[Exception] = []
 
     def cycles() -> None:
@@ -41,6 +41,8 @@ def attended(arm: Arm) -> Iterator[None]:
                 arm.exchange(None)
         except Exception as error:  # noqa: BLE001 - whatever it is, nobody attends to the arm from here on
             failures.append(error)
+        finally:
+            over.set()
 
     thread = threading.Thread(target=cycles, name="attended")
     before = sys.getswitchinterval()
@@ -51,11 +53,23 @@ def attended(arm: Arm) -> Iterator[None]:
             yield
     finally:
         ended.set()
-        if thread.ident is not None:
-            thread.join()
         sys.setswitchinterval(before)
+        if thread.ident is not None:
+            _wait_for(over)
     if failures:
         raise failures[0]
+
+
+def _wait_for(over: threading.Event) -> None:
+    """However often somebody interrupts that: whoever goes on uses the arm."""
+    interrupted: KeyboardInterrupt | None = None
+    while not over.is_set():
+        try:
+            over.wait()
+        except KeyboardInterrupt as error:
+            interrupted = error
+    if interrupted is not None:
+        raise interrupted
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import threading
 import time
@@ -93,6 +94,31 @@ def test_work_that_fails_ends_the_cycles_and_is_told_first() -> None:
     ended = arm.cycles
     assert "attended" not in {one.name for one in threading.enumerate()}
     assert arm.cycles == ended
+
+
+def test_no_second_interruption_leaves_two_threads_with_the_arm() -> None:
+    arm, main = Looked(RealClock()), threading.get_ident()
+    inside = threading.Event()
+
+    def exchange(torque: object) -> None:
+        inside.set()
+        for _ in range(2):  # both come before this cycle is over
+            signal.pthread_kill(main, signal.SIGINT)
+            time.sleep(0.05)
+        inside.clear()
+
+    arm.exchange = exchange  # type: ignore[method-assign]
+    left: list[bool] = []
+
+    def until_left() -> None:
+        try:
+            during(arm, lambda: time.sleep(60.0))
+        finally:
+            left.append(inside.is_set())
+
+    with pytest.raises(KeyboardInterrupt):
+        until_left()
+    assert left == [False]
 
 
 def interrupted() -> None:
