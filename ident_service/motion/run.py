@@ -139,6 +139,8 @@ class _Run:
             waiting = "; ".join(f"{fault.code} ({fault.cause})" for fault in self.latch.faults)
             raise MotionRefused(f"faults that nobody has acknowledged: {waiting}")
         loop, torque = self._prepared()
+        if self.controls.stop:  # planning takes a second or more; nobody wants to see the arm energised after a stop
+            raise MotionRefused("a stop was asked for before the arm was energised; nothing has moved")
         try:
             self.states.enter(State.CHECKED)
             self.arm.enable()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from ident_service.motion.deadlines import LATE, LONGEST_GAP, Deadlines
@@ -88,3 +89,17 @@ def test_the_first_cycle_has_no_schedule() -> None:
     deadlines = Deadlines(Findings(), 1e-3)
     assert deadlines.cycle(10**12, 10**15) is None
     assert deadlines.lateness_ns == 0
+
+
+def test_answers_that_come_now_sooner_now_later_are_not_late_while_stamps_are_in_time() -> None:
+    times, draw = Times(), np.random.default_rng(1)
+    after = draw.uniform(-0.2, 0.2, 5000) * MS
+    steps = np.rint(MS + np.diff(after, prepend=0.0)).astype(int).tolist()
+    assert {code(times.cycle(MS, step)) for step in steps[500:]} == {None}
+
+
+@pytest.mark.parametrize(("lost", "keeps"), [(0.002, True), (0.02, False)])
+def test_a_loop_that_loses_a_little_of_every_period_does_not_keep_the_rate(lost: float, keeps: bool) -> None:
+    times = Times()
+    found = {code(times.cycle(MS, MS + round(lost * MS))) for _ in range(1000)}
+    assert ("late_cycles" not in found) == keeps

@@ -11,7 +11,7 @@ from motion_bench import LOOKED
 from run_bench import HOME, LIMITS, MIDWAY, PERIOD, Bench
 
 from drivers.arm import StopKind
-from ident_service.errors import DriverError
+from ident_service.errors import DriverError, MotionRefused
 from ident_service.motion.control import ComputedTorque
 from ident_service.motion.guard import TORQUE_RATE, TORQUE_RATE_SHARE
 from ident_service.motion.states import State
@@ -81,9 +81,17 @@ def test_a_stop_that_is_asked_for_is_controlled(make: Callable[..., Bench], cycl
     bench.stopped_under_control()
 
 
-def test_a_stop_before_the_first_cycle_moves_nothing(make: Callable[..., Bench]) -> None:
+def test_a_stop_before_the_first_cycle_energises_nothing(make: Callable[..., Bench]) -> None:
     bench = make()
-    assert bench.run(lambda: True).state is State.STOPPED
+    with pytest.raises(MotionRefused, match="a stop was asked for before the arm was energised"):
+        bench.run(lambda: True)
+    assert bench.story.states == []
+    assert bench.arm.torques == []
+
+
+def test_a_stop_in_the_first_cycle_holds_the_arm_where_it_stands(make: Callable[..., Bench]) -> None:
+    bench, asked = make(), iter([False])
+    assert bench.run(lambda: next(asked, True)).state is State.STOPPED
     assert bench.story.states == ["checked", "armed", "approaching", "stopping", "stopped"]
     assert (np.abs(bench.truth[-1].position - HOME) < 0.02).all()  # held without asking for a position
 

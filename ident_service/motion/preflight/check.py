@@ -1,6 +1,6 @@
 """What a preflight check says: a code, a verdict, what was measured against which limit, and what to do about it.
 
-Boundary: words and numbers; what is measured, and how, is in the `preflight_*.py` beside this file.
+Boundary: words and numbers; what is measured, and how, is in the files beside this one.
 """
 
 from __future__ import annotations
@@ -40,6 +40,8 @@ CODES = (
 
 # What these find is wrong with the motion, or with where the arm stands for it; the arm may be held, and sent home.
 ABOUT_THE_MOTION = ("motion_fits", "motion_proven", "ways_clear")
+# Nothing replaces these, so that a ticket without them allows nothing, whatever its other checks say.
+INDISPENSABLE = ("gravity", "direction")
 
 
 @dataclass(frozen=True)

@@ -257,7 +257,8 @@ class _Preflight:
                 raise
             self._faulted(session, error)
             raise _Ended from error
-        self._judged(session, gravity, held, planned, moved)
+        with attended(self.arm):
+            self._judged(session, gravity, held, planned, moved)
         if silent is not None:
             self._passed(silent)
 

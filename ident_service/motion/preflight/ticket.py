@@ -20,7 +20,7 @@ from ident_service import __version__
 from ident_service.errors import MotionRefused, UsageError
 from ident_service.excitation.excitation import Excitation
 from ident_service.model.arm_model import ArmModel
-from ident_service.motion.preflight.check import ABOUT_THE_MOTION, CODES, Check, Measure, Verdict
+from ident_service.motion.preflight.check import ABOUT_THE_MOTION, CODES, INDISPENSABLE, Check, Measure, Verdict
 
 FORMAT, VERSION = "ident-ticket", 1
 VALID = timedelta(minutes=15)
@@ -85,6 +85,9 @@ class Ticket:
                 return worse
         return Verdict.PASSED
 
+    def _verdicts(self, code: str) -> set[Verdict]:
+        return {check.verdict for check in self.checks if check.code == code}
+
     def valid_for(self, subject: Subject, now: datetime) -> list[str]:
         """Why this ticket does not allow a motion; empty when it does.
 
@@ -103,6 +106,8 @@ class Ticket:
             and not (no_motion and check.code in ABOUT_THE_MOTION)
         ]:
             found.append(f"the check did not pass: {', '.join(codes)}")
+        elif codes := [code for code in INDISPENSABLE if Verdict.PASSED not in self._verdicts(code)]:
+            found.append(f"the check was not made: {', '.join(codes)}")
         if now < self.created:
             found.append("it was made in the future: a clock has been set")
         elif now >= self.expires:
