@@ -12,6 +12,7 @@
     ├── MotionRefused (ValueError)     a motion that would leave the arm's limits, refused before anything moves
     └── ArmError (RuntimeError)        something below the motion loop
         ├── DriverError (OSError)      the arm cannot be opened, enabled or reached
+        │   ├── AnotherDrive           a drive answers that the description does not name
         │   └── PositionUnknown        its encoders lost their zero: a person must say where the arm stands
         └── ArmFault                   the guard or a drive stopped a motion; carries code and last samples
 
@@ -96,6 +97,10 @@ class ArmError(IdentError, RuntimeError):
 
 class DriverError(ArmError, OSError):
     """The arm cannot be opened, enabled or reached."""
+
+
+class AnotherDrive(DriverError):
+    """A drive answers that is not the one that the description names."""
 
 
 class PositionUnknown(DriverError):

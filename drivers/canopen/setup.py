@@ -17,7 +17,7 @@ from drivers.canopen.words import axis_status
 from drivers.canopen.zero import Zeros
 from drivers.status import AxisStatus
 from ident_service.config.canopen import CanopenDrive, DriveIdentity, Reactions
-from ident_service.errors import DriverError
+from ident_service.errors import AnotherDrive, DriverError
 
 DRIVE_PROFILE = 402  # low word of 1000h
 _FIRMWARE = 0x100A
@@ -94,7 +94,7 @@ def identify(objects: Objects, wanted: DriveIdentity) -> str:
             if refused.code not in DOES_NOT_EXIST:
                 raise
     if others := differences(found, wanted):
-        raise DriverError(f"node {objects.node}: is not the drive that the configuration names: {', '.join(others)}")
+        raise AnotherDrive(f"node {objects.node}: is not the drive that the configuration names: {', '.join(others)}")
     try:
         firmware = objects.read_bytes(_FIRMWARE, 0, "software version").decode("ascii", "replace").strip("\0 ")
     except SdoRefused:

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.answer import DONE, Answer, state_folder, tell
+from ident_service.cli.answer import DONE, FAILED, Answer, state_folder, tell
 from ident_service.cli.words import Parser
 from ident_service.errors import IdentError, MotionRefused, UsageError
 
@@ -170,7 +170,9 @@ def moved(
         raise
     files = _files(folder)
     text = _report_text(ran.report) + f"files: {folder}\n" + "".join(f"  {name}\n" for name in files)
-    return DONE, text, {"folder": str(folder), "files": files, "report": ran.report}
+    # A stop that was asked for is no fault, but what was to be done is not.
+    code = DONE if ran.report["state"] == "done" else FAILED
+    return code, text, {"folder": str(folder), "files": files, "report": ran.report}
 
 
 def _add_facts(error: IdentError, folder: Path, state: Path, arm: str) -> None:

@@ -60,6 +60,7 @@ def _home(arguments: argparse.Namespace) -> Answer:
 
 
 def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
+    from ident_service.config.canopen import CanopenDriver
     from ident_service.service.zeroing import home_posture, take_home
 
     posture = home_posture(config)
@@ -75,7 +76,11 @@ def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
     done = take_home(config, state_folder(arguments), confirm)
     lines = [f"{done.arm}: zeroed, until its drives lose their power", *(f"  {words}" for words in done.drives)]
     lines += [f"  latched still: {fault.code}: {fault.cause}" for fault in done.faults]
-    lines.append(f"next: `ident watch {done.arm}` against the arm, then `ident check {done.arm}`")
+    if isinstance(config.driver, CanopenDriver) and all(bus.interface == "lock_step" for bus in config.driver.buses):
+        lines.append(
+            "  but these drives are emulated within this command, and forget it now; over ident_wire they do not"
+        )
+    lines.append(f"next: `ident watch {arguments.arm}` against the arm, then `ident check {arguments.arm}`")
     document = asdict(done) | {"faults": [fault.code for fault in done.faults]}
     return DONE, "\n".join([*lines, ""]), document
 
@@ -94,7 +99,7 @@ def _recover(arguments: argparse.Namespace) -> Answer:
         raise UsageError("--out is for the recording of --leave-limit; without it nothing moves")
     if arguments.can_log:
         raise UsageError("--can-log is for --leave-limit; without it nothing moves")
-    found = recover(config, state_folder(arguments))
+    found = recover(config, state_folder(arguments), called=arguments.arm)
     document = {
         "arm": found.arm,
         "usable": found.usable,

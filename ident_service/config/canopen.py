@@ -201,6 +201,18 @@ def maps_dummies(eds: str) -> bool:
         return False
 
 
+def eds_mistake(eds: str) -> str | None:
+    """Why a text is no EDS (CiA 306-1: an ini file with the section DeviceInfo); None where it may be one."""
+    parser = configparser.ConfigParser(strict=False, interpolation=None)
+    try:
+        parser.read_string(eds)
+    except configparser.Error as error:
+        return str(error).splitlines()[0].removesuffix(" file: '<string>'")
+    if not any(name.lower() == "deviceinfo" for name in parser.sections()):
+        return "it has no section [DeviceInfo]"
+    return None
+
+
 def disagreements(
     driver: CanopenDriver,
     transmission: Transmission | None,
@@ -236,7 +248,9 @@ def disagreements(
     shares = driver.torque_frames == "shared" and any(
         sum(drive.bus == bus for drive in driver.drives) > 1 for bus in range(len(driver.buses))
     )
-    if shares and not maps_dummies(driver.eds.text):
+    if why := eds_mistake(driver.eds.text):
+        yield ("driver", "eds"), f"driver.eds: {driver.eds.name} is not an EDS (CiA 306): {why}; take the drive maker's"
+    elif shares and not maps_dummies(driver.eds.text):
         yield (
             ("driver", "eds"),
             f"driver.eds: {driver.eds.name} has no Dummy0003=1 under [DummyUsage], so that these drives cannot share"

@@ -1,8 +1,8 @@
 """Whether cycles come when they should, by the loop's clock and by the samples' stamps.
 
-An exchange ends when its answers have come, and on a bus they come now sooner, now later, while SYNC goes out on time. So
-the schedule of the loop's clock is that of the typical cycle, which it follows slowly, and not that of the quickest one:
-a loop that loses more than `LATE * FOLLOWS` of every period still falls behind it by more than is allowed.
+An exchange ends when its answers have come, and on a bus they come now sooner, now later, while SYNC goes out on time.
+So the schedule of the loop's clock is that of the typical cycle, which it follows slowly, and not that of the quickest
+one: a loop that loses more than `LATE * FOLLOWS` of every period still falls behind it by more than is allowed.
 """
 
 from __future__ import annotations

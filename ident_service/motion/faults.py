@@ -115,7 +115,7 @@ FAULTS: dict[str, Rule] = {
     # It can be measured, but does not do what it is told.
     "following_lost": Rule(_LOWER, "it is blocked, loaded, or a drive does not give its torque"),
     # The host, the bus or single axes; the other drives can brake.
-    "feedback_gone": Rule(_QUICK, "the axis, its encoder or its cable failed"),
+    "feedback_gone": Rule(_QUICK, "an axis, its encoder or cable failed; if all: the bus, or this machine stalled"),
     "drive_fault": Rule(_QUICK, "the drive gives no torque; read its own fault code before anything else"),
     "drive_emergency": Rule(_QUICK, "the drive has found an error; its manual says more about the code"),
     "drive_silent": Rule(_QUICK, "it has lost its power or its cable, or its program hangs"),

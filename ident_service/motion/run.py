@@ -154,9 +154,12 @@ class _Run:
                 self.states.enter(State.DONE)
         except BaseException as error:
             self._halt(error, loop)
+            _tell_before(error, loop)
             raise
         if loop.ended_by is not None:
-            raise ArmFault(loop.ended_by.code, loop.ended_by.message, loop.last)
+            fault = ArmFault(loop.ended_by.code, loop.ended_by.message, loop.last)
+            _tell_before(fault, loop)
+            raise fault
         peaks = loop.peaks
         return RunReport(
             self.states.state,
@@ -259,3 +262,12 @@ class _Run:
         if State.FAULTED in LAWFUL[self.states.state]:
             self.states.enter(State.FAULTED)
             loop.tell(rule.severity, now_ns, cause)
+
+
+def _tell_before(error: BaseException, loop: Loop) -> None:
+    """What came before a fault often says why it came."""
+    first, warnings = loop.ended_by, loop.guard.findings.warnings
+    if first is not None and first.message not in str(error):
+        error.add_note(f"first came {first.code}: {first.message}")
+    if warnings:
+        error.add_note("warned of before: " + ", ".join(f"{code} {count} times" for code, count in warnings.items()))

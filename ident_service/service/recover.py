@@ -60,26 +60,27 @@ class Recovery:
     usable: bool
 
 
-def recover(config: ArmConfig, state: Path, arm: Arm | None = None) -> Recovery:
+def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str | None = None) -> Recovery:
     """Look at an arm, reset its drives if all faults are acknowledged, and say what is next.
 
     Args:
         config: of the arm.
         state: the state folder.
         arm: not open; the configured one when None.
+        called: the arm as commands are to name it, its file for example; its name when None.
 
     Raises:
         UsageError: the file of faults was damaged by somebody.
         MotionRefused: the description has no position limits.
         DriverError: nothing is installed that can reach such an arm.
     """
-    limits = motion_limits(config)
+    limits, called = motion_limits(config), called or config.name
     faults = fault_file(state, config.name).remembered()
     pid = mover(control_path(state, config.name))
     if pid is not None:
         stop_first = (
-            f"`ident stop {config.name}` brings it to rest; process {pid} moves it.",
-            f"`ident recover {config.name}` again, when it stands.",
+            f"`ident stop {called}` brings it to rest; process {pid} moves it.",
+            f"`ident recover {called}` again, when it stands.",
         )
         return Recovery(config.name, faults, pid, None, "", "", (), {}, (), stop_first, False)
     arm = make_arm(config) if arm is None else arm
@@ -97,9 +98,9 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None) -> Recovery:
         unreachable = str(error)
     tripped = {} if seen is None else _tripped(seen)
     out = [] if seen is None else outside(seen.position, limits, seen.joint_names)
-    before = _before(config.name, faults, seen, unreachable, zero_lost, tripped, refusal, limits)
+    before = _before(called, faults, seen, unreachable, zero_lost, tripped, refusal, limits)
     usable = not before
-    steps = (*before, _at_last(config.name, seen, limits, bool(out)))
+    steps = (*before, _at_last(called, seen, limits, bool(out)))
     return Recovery(config.name, faults, None, seen, unreachable, zero_lost, reset, tripped, tuple(out), steps, usable)
 
 

@@ -150,7 +150,7 @@ def test_the_identified_parameters_are_those_of_the_simulated_wam(arms: Path) ->
     ],
 )
 def test_mistakes_are_told_with_their_place(arms: Path, driver: str, complaint: str) -> None:
-    (arms / "bare.eds").write_text("[DummyUsage]\nDummy0003=0\n", encoding="utf-8")
+    (arms / "bare.eds").write_text("[DeviceInfo]\n[DummyUsage]\nDummy0003=0\n", encoding="utf-8")
     path = extended(arms, driver)
     with pytest.raises(ConfigError) as caught:
         load_arm(path)
@@ -159,15 +159,33 @@ def test_mistakes_are_told_with_their_place(arms: Path, driver: str, complaint: 
     assert (first.path, first.line) == (path, 3)
 
 
-@pytest.mark.parametrize("eds", ["", "no EDS at all", "[DummyUsage]\nDummy0003=x\n", "\x00\x01", "[FileInfo]\nA=1\n"])
+@pytest.mark.parametrize("eds", ["", "[DummyUsage]\nDummy0003=x\n", "[FileInfo]\nA=1\n"])
 def test_drives_share_frames_only_where_their_eds_says_so(arms: Path, eds: str) -> None:
-    (arms / "bare.eds").write_text(eds, encoding="utf-8")
+    (arms / "bare.eds").write_text(f"[DeviceInfo]\n{eds}", encoding="utf-8")
     with pytest.raises(ConfigError, match="Dummy0003=1"):
         load_arm(extended(arms, "eds: bare.eds"))
     assert load_arm(extended(arms, "eds: bare.eds, torque_frames: single")).name == "mine"
 
 
-@pytest.mark.parametrize("eds", ["[DummyUsage]\nDummy0003=0x1\n", "[dummyusage]\nDUMMY0003 = 1\n"])
+@pytest.mark.parametrize("frames", ["shared", "single"])
+@pytest.mark.parametrize(
+    ("eds", "why"),
+    [
+        ("", "it has no section"),
+        ("no EDS at all", "File contains no section headers"),
+        ("\x00\x01", "File contains no section headers"),
+        ("[FileInfo]\nA=1\n", "it has no section"),
+    ],
+)
+def test_what_is_no_eds_is_refused_however_torques_are_sent(arms: Path, eds: str, why: str, frames: str) -> None:
+    (arms / "junk.eds").write_text(eds, encoding="utf-8")
+    with pytest.raises(ConfigError, match=rf"driver\.eds: junk\.eds is not an EDS \(CiA 306\): {why}"):
+        load_arm(extended(arms, f"eds: junk.eds, torque_frames: {frames}"))
+
+
+@pytest.mark.parametrize(
+    "eds", ["[DeviceInfo]\n[DummyUsage]\nDummy0003=0x1\n", "[deviceinfo]\n[dummyusage]\nDUMMY0003 = 1\n"]
+)
 def test_edss_are_read_as_their_standard_writes_them(arms: Path, eds: str) -> None:
     (arms / "other.eds").write_text(eds, encoding="utf-8")
     assert load_arm(extended(arms, "eds: other.eds")).name == "mine"

@@ -160,7 +160,7 @@ def test_an_arm_that_somebody_moves_is_not_even_looked_at(
     document = json.loads(capsys.readouterr().out)
     assert document["moved_by"] == os.getpid()
     assert document["seen"] is None
-    assert document["steps"][0].startswith("`ident stop planar2`")
+    assert document["steps"][0].startswith(f"`ident stop {tmp_path / 'arm.yaml'}`")  # as it can be typed
 
 
 @pytest.mark.parametrize(("out", "word"), [(0.15, "--leave-limit"), (0.25, "its zero may be wrong")])

@@ -13,6 +13,7 @@ import numpy as np
 from drivers.arm import Arm, ArmDescription, Sample, Vector
 from drivers.status import AxisStatus
 from ident_service.config.limits import MotionLimits
+from ident_service.errors import AnotherDrive, ArmError, PositionUnknown
 from ident_service.model.arm_model import ArmModel
 from ident_service.motion.preflight.check import Check, Verdict, failed, joint_units, judged, measure, measures, skipped
 
@@ -248,6 +249,14 @@ def noise_check(
     )
 
 
-def unreachable(reason: str) -> Check:
-    """The arm could not even be opened or looked at."""
-    return Check("identities", Verdict.FAILED, (), reason, "Check power, cables and that no other program has the arm.")
+def unreachable(error: ArmError) -> Check:
+    """The arm could not even be opened or looked at, and why."""
+    remedy = "Check power, cables and that no other program has the arm."
+    if isinstance(error, PositionUnknown):
+        remedy = "Do what this says; nobody else knows where the arm stands."
+    elif isinstance(error, AnotherDrive):
+        remedy = (
+            "Put the drives back in their places; after a repair calibrate zero and torque scale, then enter the new "
+            "identity."
+        )
+    return Check("identities", Verdict.FAILED, (), str(error), remedy)

@@ -314,7 +314,7 @@ class _Preflight:
     def _broken(self, error: ArmError) -> None:
         """The arm could not be opened, looked at or energised, or fell silent."""
         if self.described is None or "identities" not in self.checks:
-            self._passed(unreachable(str(error)))
+            self._passed(unreachable(error))
         else:
             # None about the motion: a way home may begin although one of them failed. The last where all are made.
             left = (code for code in CODES if code not in self.checks and code not in ABOUT_THE_MOTION)
