@@ -19,7 +19,7 @@ from ident_service.config.load import load_arm
 from ident_service.config.schema import ArmConfig
 from ident_service.config.shipped import shipped_arms
 from ident_service.config.source import read_alone
-from ident_service.errors import ConfigError, Problem, UsageError
+from ident_service.errors import ConfigError, Problem, UnknownId, UsageError
 from ident_service.results.files import appearing_folder
 from ident_service.service.registry.audit import note
 from ident_service.service.registry.database import Database, Row
@@ -78,12 +78,12 @@ def known_arm(db: Database, state: Path, name: str) -> KnownArm:
     """The arm of this name.
 
     Raises:
-        UsageError: there is none.
+        UnknownId: there is none.
         ConfigError: its description has become unreadable.
     """
     row = db.row("SELECT * FROM arms WHERE name = ?", name)
     if row is None:
-        raise UsageError(f"no arm {name!r} is known; the list of arms names them")
+        raise UnknownId(f"no arm {name!r} is known; the list of arms names them")
     path = shipped_arms().get(name) if row["source"] == "shipped" else state / row["folder"] / ARM_FILE
     if path is None:
         raise UsageError(f"the arm {name!r} was shipped with other software than this; upload its description")

@@ -18,7 +18,7 @@ import json
 import time
 from typing import Any, Final
 
-from ident_service.errors import UsageError
+from ident_service.errors import UnknownId
 from ident_service.service.registry.database import Database, Row
 
 STATES: Final = ("queued", "running", "done", "refused", "failed", "faulted", "cancelled", "interrupted")
@@ -50,11 +50,11 @@ def known_job(db: Database, job: str) -> Row:
     """The job of this id.
 
     Raises:
-        UsageError: there is none.
+        UnknownId: there is none.
     """
     row = db.row("SELECT * FROM jobs WHERE id = ?", job)
     if row is None:
-        raise UsageError(f"no job {job!r} is known; the list of jobs names them")
+        raise UnknownId(f"no job {job!r} is known; the list of jobs names them")
     return _read(row)
 
 

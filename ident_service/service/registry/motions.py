@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from ident_service.errors import UsageError
+from ident_service.errors import UnknownId
 from ident_service.excitation.excitation import excitation_from_json, read_excitation
 from ident_service.results.files import appearing_folder, write_atomically
 from ident_service.results.manifest import file_sha256
@@ -59,11 +59,11 @@ def known_motion(db: Database, motion: str) -> Row:
     """The motion of this id.
 
     Raises:
-        UsageError: there is none.
+        UnknownId: there is none.
     """
     row = db.row("SELECT * FROM motions WHERE id = ?", motion)
     if row is None:
-        raise UsageError(f"no motion {motion!r} is known; the list of motions names them")
+        raise UnknownId(f"no motion {motion!r} is known; the list of motions names them")
     return row
 
 

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import Any, Final
 
-from ident_service.errors import IdentError, ParameterError, UsageError
+from ident_service.errors import IdentError, ParameterError, UnknownId, UsageError
 from ident_service.motion.ending import ENDED
 from ident_service.results.manifest import MANIFEST, file_sha256, named_files, verified_files
 from ident_service.service.registry.database import Database, Row
@@ -85,11 +85,11 @@ def known_run(db: Database, run: str) -> Row:
     """The run of this id.
 
     Raises:
-        UsageError: there is none.
+        UnknownId: there is none.
     """
     row = db.row("SELECT * FROM runs WHERE id = ?", run)
     if row is None:
-        raise UsageError(f"no run {run!r} is known; the list of runs names them")
+        raise UnknownId(f"no run {run!r} is known; the list of runs names them")
     return row
 
 
@@ -125,10 +125,10 @@ def run_file(db: Database, state: Path, run: str, name: str) -> Path:
     """A file that the manifest of a run names.
 
     Raises:
-        UsageError: no such run, or no such file in it.
+        UnknownId: no such run, or no such file in it.
     """
     if name not in run_files(db, state, run):
-        raise UsageError(f"the run {run} has no file {name!r}; its manifest names them")
+        raise UnknownId(f"the run {run} has no file {name!r}; its manifest names them")
     return run_folder(db, state, run) / name
 
 
