@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ident_service import __version__
-from ident_service.cli import arm, bus, commission, configs, emulate, motions, parameters, recovery
+from ident_service.cli import arm, bus, commission, configs, daemon, emulate, keeping, motions, parameters, recovery
 from ident_service.cli.answer import (
     DONE,
     FAILED,
@@ -30,7 +30,7 @@ from ident_service.errors import ArmFault, ConfigError, IdentError, MotionRefuse
 
 __all__ = ["DONE", "FAILED", "FAULTED", "USAGE", "VERDICT_NO", "main"]
 
-GROUPS = (commission, motions, arm, recovery, parameters, configs, bus, emulate)
+GROUPS = (commission, motions, arm, recovery, parameters, configs, bus, emulate, keeping, daemon)
 _EXIT_CODES: tuple[tuple[type[IdentError], int], ...] = (
     (ConfigError, USAGE),
     (UsageError, USAGE),

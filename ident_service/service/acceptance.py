@@ -59,7 +59,7 @@ class Acceptance:
     who: str
 
 
-def accept(db: Database, state: Path, folder: Path, note: str, who: str) -> Acceptance:
+def accept(db: Database, state: Path, folder: Path, note: str, who: str, *, arm: str | None = None) -> Acceptance:
     """Make the parameters of a run's folder the arm's current ones.
 
     Args:
@@ -68,9 +68,10 @@ def accept(db: Database, state: Path, folder: Path, note: str, who: str) -> Acce
         folder: of results, verified against its manifest here.
         note: why.
         who: accepts.
+        arm: whose they are to be; the one that the folder names if None.
 
     Raises:
-        UsageError: no note, or nothing was identified in the folder.
+        UsageError: no note, nothing was identified in the folder, or it is about another arm.
         ParameterError: the folder is not what its manifest names, or no body can have its parameters.
     """
     from ident_service.results.run_folder import read_results
@@ -79,6 +80,8 @@ def accept(db: Database, state: Path, folder: Path, note: str, who: str) -> Acce
     results = read_results(folder)
     if results.parameters.content.get("feasibility", {}).get("feasible") is not True:
         raise ParameterError(f"{folder}: no body can have these parameters, so no arm has them; accept a feasible set")
+    if arm not in (None, results.config.name):
+        raise UsageError(f"{folder.name} is about the arm {results.config.name}, not {arm}")
     arm = results.config.name
     with _acting(state, arm):
         number = len(acceptances(state, arm)) + 1

@@ -13,6 +13,8 @@ from contextlib import suppress
 from typing import Any, Final
 from urllib.parse import urlsplit
 
+from fastapi import HTTPException
+
 from ident_service.service.api.metrics import Metrics
 from ident_service.service.api.settings import Settings
 
@@ -42,8 +44,11 @@ _HEADERS: Final = (
 )
 
 
-class _TooLarge(Exception):
+class _TooLarge(HTTPException):
     """The body has more bytes than it may."""
+
+    def __init__(self, most: int) -> None:
+        super().__init__(413, f"a request has {most} bytes at most")
 
 
 class Doors:
@@ -83,7 +88,7 @@ class Doors:
                 await self._app(scope, _counted(scope, receive), answer)
             except _TooLarge as error:
                 if not started:
-                    await _refuse(answer, 413, "TooLarge", str(error))
+                    await _refuse(answer, 413, "TooLarge", error.detail)
         finally:
             self._metrics.request(scope["method"], status, time.perf_counter() - began)
             _LOG.info(
@@ -133,7 +138,7 @@ def _counted(scope: Scope, receive: Receive) -> Receive:
         if message["type"] == "http.request":
             seen += len(message.get("body", b""))
             if seen > most:
-                raise _TooLarge(f"a request has {most} bytes at most")
+                raise _TooLarge(most)
         return message
 
     return counted

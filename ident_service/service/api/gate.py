@@ -115,6 +115,10 @@ class Gate:
                 _remember(self._good, key, None, _MOST_ADDRESSES)
         return found
 
+    def for_stop(self, secret: str) -> Access | None:
+        """Whose token this is, whatever failed before: a stop meets no throttle."""
+        return access(self._db, secret)
+
     def log_in(self, secret: str, address: str) -> tuple[str, Access] | None:
         """Exchange a token for a session; None if it is nobody's. Raises as `by_token`."""
         found = self.by_token(secret, address)
@@ -150,7 +154,7 @@ class Gate:
         return word
 
     def confirm(self, word: str, arm: str, who: str) -> bool:
-        """Whether the word was given to the same one for the same arm, and not too long ago; it is used up by asking."""
+        """Whether the word was given to the same one for the same arm, not too long ago; asking uses it up."""
         with self._lock:
             entry = self._challenges.pop(word, None)
         return entry is not None and (entry.arm, entry.who) == (arm, who) and entry.until >= self._now()

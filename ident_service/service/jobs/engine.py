@@ -85,10 +85,16 @@ class Engine:
         self._lock = threading.RLock()
         self._wake, self._closing = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._work, name="jobs", daemon=True)
+        self._first: Callable[[], Any] = lambda: None
         self.beat = now()
 
-    def start(self) -> None:
-        """Tell what was interrupted, then begin to run what is asked for; returns at once."""
+    def start(self, first: Callable[[], Any] = lambda: None) -> None:
+        """Tell what was interrupted, then begin to run what is asked for; returns at once.
+
+        Args:
+            first: done by the queue's thread before it begins anything.
+        """
+        self._first = first
         mark_interrupted(self.db, self.state)
         self._requeue()
         self._thread.start()
@@ -169,7 +175,10 @@ class Engine:
                 if live.order.moves and arm in (None, live.order.arm):
                     self._end(live, f"{by} asked for a stop")
                     ended.append(live.job)
-        note(self.db, by, "stop", arm or "all arms", reached=reached, jobs=ended)
+        try:
+            note(self.db, by, "stop", arm or "all arms", reached=reached, jobs=ended)
+        except Exception:  # a full disk, say: the arms stop all the same
+            LOG.exception("a stop could not be entered in the audit trail")
         return {"arms": reached, "jobs": ended}
 
     def pause(self, arm: str, by: str, *, wanted: bool) -> bool:
@@ -210,6 +219,7 @@ class Engine:
     def _work(self) -> None:
         try:
             explain_interrupted(self.db, self.state, self._closing.is_set)
+            self._first()
         except Exception:
             LOG.exception("what was interrupted could not be told")
         while True:
