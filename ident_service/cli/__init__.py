@@ -13,7 +13,19 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ident_service import __version__
-from ident_service.cli import arm, bus, commission, configs, daemon, emulate, keeping, motions, parameters, recovery
+from ident_service.cli import (
+    arm,
+    bus,
+    commission,
+    configs,
+    daemon,
+    emulate,
+    keeping,
+    motions,
+    parameters,
+    recovery,
+    remote,
+)
 from ident_service.cli.answer import (
     DONE,
     FAILED,
@@ -30,7 +42,7 @@ from ident_service.errors import ArmFault, ConfigError, IdentError, MotionRefuse
 
 __all__ = ["DONE", "FAILED", "FAULTED", "USAGE", "VERDICT_NO", "main"]
 
-GROUPS = (commission, motions, arm, recovery, parameters, configs, bus, emulate, keeping, daemon)
+GROUPS = (commission, motions, arm, recovery, parameters, configs, bus, emulate, keeping, daemon, remote)
 _EXIT_CODES: tuple[tuple[type[IdentError], int], ...] = (
     (ConfigError, USAGE),
     (UsageError, USAGE),
@@ -61,7 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         raise
     try:
         _own_packages_only()
-        verb: Callable[[argparse.Namespace], Answer] = arguments.verb
+        verb: Callable[[argparse.Namespace], Answer] = arguments.verb if arguments.server is None else remote.remotely
         code, text, document = verb(arguments)
     except KeyboardInterrupt:
         # Asked twice, or by somebody who does not want to wait for what could be saved.

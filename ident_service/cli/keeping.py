@@ -24,11 +24,9 @@ def add(verbs: Verbs) -> None:
     sub.add_argument("arm", metavar="NAME", help="of the arm")
     sub.add_argument("--note", required=True, help="why; for whoever reads it years later")
     sub.add_argument("--to", type=count, metavar="NUMBER", help="acceptance (default: before the current set's)")
-    sub = verbs.add("import", _import, "a run folder from another machine: verified, and copied below the state folder")
+    sub = verbs.add("import", _import, "a run folder from another machine: verified, copied below the state folder")
     sub.add_argument("run", type=Path, metavar="RUNFOLDER")
-    sub = verbs.add(
-        "prune", _prune, "let recordings go of runs that nobody accepted; says which, and deletes with --yes"
-    )
+    sub = verbs.add("prune", _prune, "let recordings go of runs that nobody accepted; deletes only with --yes")
     sub.add_argument("--keep", type=count, required=True, metavar="N", help="newest runs of each arm keep theirs")
     sub.add_argument("--yes", action="store_true", help="DELETE them")
 

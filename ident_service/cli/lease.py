@@ -75,6 +75,8 @@ class StdinLease:
 
 def add_lease(sub: Parser) -> None:
     """The option of every verb that a program may have an arm moved by."""
+    if not any("--confirm" in action.option_strings for action in sub._actions):
+        sub.add_argument("--confirm", metavar="NAME", help="with --server: the arm's name, typed by a person")
     sub.add_argument(
         "--lease-from-stdin",
         action="store_true",

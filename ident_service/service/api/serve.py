@@ -8,6 +8,7 @@ import logging
 import os
 import signal
 import socket
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -106,11 +107,11 @@ class _Server(uvicorn.Server):
         """A signal: the arms first. Another interrupt means in a hurry, and they are being stopped already."""
         tell_manager("STOPPING=1")
         # Not in the signal's own frame: what it interrupts may hold the lock that is needed.
-        loop = asyncio.get_running_loop() if not self.should_exit else None
-        if loop is not None:
-            loop.call_soon_threadsafe(lambda: loop.run_in_executor(None, self._service.engine.begin_closing))
-        if not (self.should_exit and sig == signal.SIGTERM):
-            super().handle_exit(sig, frame)
+        if not self.should_exit:
+            threading.Thread(target=self._service.engine.begin_closing, name="closing", daemon=True).start()
+        # uvicorn would raise the signal again at the end; ours is a good one.
+        self.force_exit = self.should_exit and sig == signal.SIGINT
+        self.should_exit = True
 
     async def main_loop(self) -> None:
         """Serve, and keep the watchdog quiet as long as the queue is looked after."""
