@@ -119,7 +119,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
     faults.require_none(faults.latched())
     require_writable(path.parent)
     arm, model = make_arm(config), arm_model(config)
-    lease, stopping = asked_lease(arguments), StopOnSignal()
+    lease, stopping = asked_lease(arguments, config), StopOnSignal()
     # Whoever looks for the one who moves the arm finds this process, and its stop ends the preflight. A person's Ctrl-C
     # ends it at once, a question too; a program's polite signal waits for the next cycle.
     with (
@@ -139,8 +139,8 @@ def _run(arguments: argparse.Namespace, seconds: float | None = None) -> Answer:
     """Run; `seconds` is how long the lease lasts that a program keeps, the ordinary time if None."""
     from ident_service.config.load import load_arm
 
-    lease = asked_lease(arguments, seconds)
     config = load_arm(arguments.arm)
+    lease = asked_lease(arguments, config, seconds)
     motion = _chosen(config, arguments.motion)
     sentence = f"{motion.name} motion of {motion.duration / arguments.speed:g} s"
     stopping = StopOnSignal()

@@ -8,14 +8,19 @@ Boundary: bytes and a clock; who asks, and what a stop is, is elsewhere.
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import select
 import sys
 import time
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from ident_service.cli.words import Parser
 from ident_service.errors import UsageError
+
+if TYPE_CHECKING:
+    from ident_service.config.schema import ArmConfig
 
 STOP = b"stop"
 _MOST = 4096  # bytes that a line may have; a longer one is none
@@ -84,8 +89,16 @@ def add_lease(sub: Parser) -> None:
     )
 
 
-def asked_lease(arguments: argparse.Namespace, seconds: float | None = None) -> StdinLease | None:
-    """The lease, where one was asked for; `seconds` it lasts, the ordinary time if None.
+def asked_lease(arguments: argparse.Namespace, config: ArmConfig, seconds: float | None = None) -> StdinLease | None:
+    """The lease, where one was asked for.
+
+    In virtual time silence does not count, as between our own processes (`motion/lifeline.py`); the end of the input
+    and the word `stop` do.
+
+    Args:
+        arguments: with `lease_from_stdin`.
+        config: of the arm.
+        seconds: that it lasts; the ordinary time if None.
 
     Raises:
         UsageError: standard input is a terminal, at which nobody renews a lease by hand, or closed.
@@ -95,8 +108,10 @@ def asked_lease(arguments: argparse.Namespace, seconds: float | None = None) -> 
     if sys.stdin is None or sys.stdin.isatty():
         raise UsageError("--lease-from-stdin is for programs that hold a pipe to standard input")
     from ident_service.motion.controls import LEASE_SECONDS
+    from ident_service.motion.factory import make_arm
 
-    return StdinLease(LEASE_SECONDS if seconds is None else seconds, sys.stdin.fileno())
+    lasts = LEASE_SECONDS if seconds is None else seconds
+    return StdinLease(math.inf if make_arm(config).clock.lock_step else lasts, sys.stdin.fileno())
 
 
 def until(stopping: Callable[[], bool], lease: StdinLease | None) -> Callable[[], bool]:

@@ -85,7 +85,7 @@ def _recover(arguments: argparse.Namespace) -> Answer:
 def _slowly(arguments: argparse.Namespace, config: ArmConfig, destination: Destination) -> Answer:
     from ident_service.motion.faults import HOLD
 
-    lease = asked_lease(arguments)
+    lease = asked_lease(arguments, config)
     tell(arguments, f"{config.name}: keep out of its reach; where the way ends the arm is held for {HOLD:g} s,")
     tell(arguments, "then its drives brake it: support it, an arm without brakes sinks. Ctrl-C stops.")
     stopping = StopOnSignal()

@@ -13,7 +13,7 @@ from ident_service.errors import IdentError
 from ident_service.service.api.answers import AuditLine, HealthAnswer, WhoAnswer
 from ident_service.service.api.asking import COOKIE, Cookie, Serving, Viewer, address_of, throttled, unknown
 from ident_service.service.api.gate import SESSION_SECONDS, Throttled
-from ident_service.service.api.mistakes import failures
+from ident_service.service.api.mistakes import failures, failures_of_files
 from ident_service.service.arm_state import fault_file
 from ident_service.service.registry.audit import trail
 
@@ -35,7 +35,7 @@ def healthz(service: Serving, response: Response) -> HealthAnswer:
     return HealthAnswer(healthy=healthy, version=__version__)
 
 
-@router.get("/metrics", response_class=PlainTextResponse)
+@router.get("/metrics", response_class=PlainTextResponse, responses=failures_of_files())
 def metrics(service: Serving, _: Viewer) -> PlainTextResponse:
     """Figures in Prometheus' text format."""
     rows = service.db.rows("SELECT kind, state, COUNT(*) AS number FROM jobs GROUP BY kind, state")

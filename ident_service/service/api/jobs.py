@@ -18,7 +18,7 @@ from ident_service.errors import MotionRefused
 from ident_service.motion.controls import HOLD_TO_RUN_SECONDS, LEASE_SECONDS
 from ident_service.service.api.answers import JobAnswer, JobResult, LeaseAnswer, StopAnswer
 from ident_service.service.api.asking import Bearer, Cookie, Operator, Service, Serving, Viewer, anybody_near
-from ident_service.service.api.mistakes import failures
+from ident_service.service.api.mistakes import failures, failures_of_files
 from ident_service.service.jobs.asked import MOVES, ArmName, Asked, Id
 from ident_service.service.jobs.commands import JOBS
 from ident_service.service.jobs.outcome import said
@@ -31,6 +31,10 @@ _EVENTS = 0.2  # s between looks at a job that is watched
 _BREATH = 10.0  # s without news, after which a comment shows that the line is up
 # Its own threads: whatever else is busy, a stop is not.
 _STOPS = ThreadPoolExecutor(4, thread_name_prefix="stop")
+_STREAM: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"text/event-stream": {}}, "description": "Events."},
+    **failures_of_files(404, 409),
+}
 State = Literal["queued", "running", "done", "refused", "failed", "faulted", "cancelled", "interrupted"]
 
 
@@ -85,7 +89,7 @@ def get_job(service: Serving, _: Viewer, job: Id) -> JobAnswer:
     return answer_of(service, rows.known_job(service.db, job))
 
 
-@router.get("/jobs/{job}/log", response_class=PlainTextResponse)
+@router.get("/jobs/{job}/log", response_class=PlainTextResponse, responses=failures_of_files(404, 409))
 def get_log(service: Serving, _: Viewer, job: Id) -> PlainTextResponse:
     """What its process said, the last of it."""
     row = rows.known_job(service.db, job)
@@ -100,7 +104,7 @@ def get_result(service: Serving, _: Viewer, job: Id) -> JobResult:
     return JobResult(job=row["id"], answer=without_paths(answer, str(service.state)))
 
 
-@router.get("/jobs/{job}/events", response_class=StreamingResponse)
+@router.get("/jobs/{job}/events", response_class=StreamingResponse, responses=_STREAM)
 async def watch_job(service: Serving, _: Viewer, job: Id) -> StreamingResponse:
     """Server-sent events: `job` whenever it changes, until it has ended."""
     row = await run_in_threadpool(rows.known_job, service.db, job)

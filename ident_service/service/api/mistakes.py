@@ -53,6 +53,14 @@ def failures(*statuses: int) -> dict[int | str, dict[str, Any]]:
     return {status: {"model": Failure, "description": _WORDS[status]} for status in sorted(every)}
 
 
+def failures_of_files(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """The same for a route whose good answers are not JSON: its failures are."""
+    content = {"application/json": {"schema": {"$ref": "#/components/schemas/Failure"}}}
+    return {
+        status: {"description": said["description"], "content": content} for status, said in failures(*statuses).items()
+    }
+
+
 def answer_mistakes(app: FastAPI) -> None:
     """Turn every error into that shape."""
 

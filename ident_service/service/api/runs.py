@@ -10,21 +10,25 @@ from fastapi.responses import FileResponse
 from ident_service.errors import UnknownId
 from ident_service.service.api.answers import ParametersAnswer, RecordingAnswer, RunAnswer, RunLine
 from ident_service.service.api.asking import Serving, Viewer
-from ident_service.service.api.mistakes import failures
+from ident_service.service.api.mistakes import failures, failures_of_files
 from ident_service.service.jobs.asked import ArmName, FileName, Id
 from ident_service.service.jobs.commands import REPORTS
 from ident_service.service.registry import runs
 
 router = APIRouter(prefix="/api/v1", tags=["runs"], responses=failures(404))
 _BINARY: dict[int | str, dict[str, Any]] = {
-    200: {"content": {"application/octet-stream": {}}, "description": "The file."}
+    200: {"content": {"application/octet-stream": {}}, "description": "The file."},
+    **failures_of_files(404),
 }
 # Of a page without network, whose own style and script stand in it; it can reach nothing of ours.
 _POLICY = (
     "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:; frame-ancestors 'self'; "
     "sandbox allow-scripts allow-downloads"
 )
-_PAGE: dict[int | str, dict[str, Any]] = {200: {"content": {"text/html": {}}, "description": "The report."}}
+_PAGE: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"text/html": {}}, "description": "The report."},
+    **failures_of_files(404),
+}
 
 
 @router.get("/runs")

@@ -6,6 +6,7 @@ any moment loses nothing of it. Other processes of the same machine (`ident acce
 
 from __future__ import annotations
 
+import re
 import sqlite3
 import threading
 from collections.abc import Iterator, Mapping, Sequence
@@ -124,8 +125,8 @@ class Database:
 def _statements(script: str) -> Iterator[str]:
     """The statements of a script one by one: `executescript` would end our transaction."""
     statement = ""
-    for line in script.splitlines(keepends=True):
-        statement += line
+    for piece in re.findall(r"[^;]*;|[^;]+$", script):
+        statement += piece
         if sqlite3.complete_statement(statement):
             yield statement
             statement = ""
