@@ -43,8 +43,10 @@ DOORS: dict[str, set[str]] = {
     "canopen": {"drivers", "sim_backend"},
     "can": {"drivers", "sim_backend"},
     "fastapi": {"service"},
+    "starlette": {"service"},
+    "uvicorn": {"service"},
 }
-HEAVY = ("pinocchio", "ruckig", "cvxpy", "clarabel", "mcap", "canopen", "can", "fastapi")
+HEAVY = ("pinocchio", "ruckig", "cvxpy", "clarabel", "mcap", "canopen", "can", "fastapi", "uvicorn")
 
 
 @dataclass(frozen=True)
