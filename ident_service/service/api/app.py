@@ -19,13 +19,15 @@ from ident_service.service.api.metrics import Metrics
 from ident_service.service.api.mistakes import answer_mistakes
 from ident_service.service.api.settings import Settings
 from ident_service.service.jobs.engine import Engine
+from ident_service.service.live import LiveRuns
+from ident_service.service.pages.routes import PAGES
 from ident_service.service.registry.arms import know_shipped
 from ident_service.service.registry.database import Database
 from ident_service.service.registry.runs import rebuild_runs
 from ident_service.service.registry.tokens import first_token
 
-ROUTERS = (about.router, arms.router, jobs.router, runs.router)
-"""In this order; pages add theirs."""
+ROUTERS = (about.router, arms.router, jobs.router, runs.router, *PAGES)
+"""In this order."""
 
 
 def create_app(settings: Settings, ready: Callable[[Service], None] = lambda _: None) -> FastAPI:
@@ -72,6 +74,7 @@ def create_app(settings: Settings, ready: Callable[[Service], None] = lambda _: 
         generate_unique_id_function=_operation,
     )
     app.state.service = service
+    app.state.live = LiveRuns()
     for router in ROUTERS:
         app.include_router(router)
     answer_mistakes(app)

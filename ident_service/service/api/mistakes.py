@@ -61,12 +61,17 @@ def failures_of_files(*statuses: int) -> dict[int | str, dict[str, Any]]:
     }
 
 
+def status_of(error: IdentError) -> int:
+    """The status of an answer that this error becomes."""
+    return next((status for kind, status in _STATUS if isinstance(error, kind)), 500)
+
+
 def answer_mistakes(app: FastAPI) -> None:
     """Turn every error into that shape."""
 
     @app.exception_handler(IdentError)
     async def _ident(_: Request, error: IdentError) -> JSONResponse:
-        status = next((status for kind, status in _STATUS if isinstance(error, kind)), 500)
+        status = status_of(error)
         if status == HTTPStatus.INTERNAL_SERVER_ERROR:
             _LOG.error("an answer failed", exc_info=error)
         return _answer(status, type(error).__name__, str(error))
