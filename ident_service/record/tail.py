@@ -70,18 +70,21 @@ class RecordingTail:
         Raises:
             RecordingError: it is damaged, or no recording of ours.
         """
-        try:
-            content = os.pread(self._stream.fileno(), most, self._position)
-        except OSError as error:
-            raise RecordingError(self._path, f"cannot be read: {error.strerror}") from None
         stamps: list[int] = []
         states: list[bytes] = []
         commands: list[bytes] = []
-        for opcode, record in self._records(content):
-            if opcode in (Opcode.DATA_END, Opcode.FOOTER):
-                self.ended = True
-                break
-            self._sort(opcode, record, stamps, states, commands)
+        while not stamps and not self.ended:
+            try:
+                records = self._records(os.pread(self._stream.fileno(), most, self._position))
+            except OSError as error:
+                raise RecordingError(self._path, f"cannot be read: {error.strerror}") from None
+            if not records:
+                return None
+            for opcode, record in records:
+                if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+                    self.ended = True
+                    break
+                self._sort(opcode, record, stamps, states, commands)
         whole = min(len(states), len(commands))
         if not whole:
             return None

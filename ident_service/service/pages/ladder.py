@@ -6,7 +6,6 @@ from the last description on: another description begins the ladder anew.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -24,7 +23,7 @@ from ident_service.service.registry import jobs as rows
 from ident_service.service.registry.database import Database, Row
 from ident_service.service.registry.motions import motions
 
-StepState = Literal["done", "next", "open", "busy"]
+StepState = Literal["done", "skipped", "next", "open", "busy"]
 TITLES: Final = {
     "description": "Description",
     "motion": "Motion",
@@ -46,7 +45,8 @@ class Step:
     Attributes:
         key: one of `TITLES`.
         title: for people.
-        state: `next` for exactly one step, unless a job of a step is under way, which then is `busy`.
+        state: `next` for exactly one step, unless a job of a step is under way, which then is `busy`; `skipped` for a
+            rehearsal that a run went without.
         words: what is done of it.
         job: id of the job that does it now.
     """
@@ -101,12 +101,14 @@ def ladder(db: Database, state: Path, config: ArmConfig) -> Ladder:
     checked, ticket = _ticket(ticket_path(state, arm), config)
     rehearsed = _newest(jobs, "rehearse")
     done: dict[str, tuple[bool, str]] = {
-        "description": (True, f"{len(config.joints) or 'all'} joints, {config.sha256[:12]}"),
+        "description": (True, f"by its SHA-256 {config.sha256[:12]}"),
         "motion": (True, f"{designed} designed, and the description's own" if designed else "the description's own"),
         "check": (checked or run_id is not None, ticket),
         "rehearse": (
             rehearsed is not None or run_id is not None,
-            "done slowly while a key was held" if rehearsed else "skipped" if run_id else "recommended before a run",
+            "done slowly, while a key was held"
+            if rehearsed
+            else "slowly, while you hold a key; recommended before a run",
         ),
         "run": (run_id is not None, run_id or "nothing recorded yet"),
         "identify": (identified is not None, identified or "no parameters from the newest run yet"),
@@ -117,16 +119,15 @@ def ladder(db: Database, state: Path, config: ArmConfig) -> Ladder:
     }
     busy = {_step(job["kind"]): str(job["id"]) for job in reversed(jobs) if job["state"] in rows.LIVE}
     upcoming = next(key for key, (finished, _) in done.items() if not finished)
-    steps = tuple(
-        Step(
-            key,
-            TITLES[key],
-            "busy" if key in busy else "done" if finished else "next" if key == upcoming and not busy else "open",
-            words,
-            busy.get(key),
-        )
-        for key, (finished, words) in done.items()
-    )
+
+    def state_of(key: str) -> StepState:
+        if key in busy:
+            return "busy"
+        if done[key][0]:
+            return "skipped" if key == "rehearse" and rehearsed is None else "done"
+        return "next" if key == upcoming and not busy else "open"
+
+    steps = tuple(Step(key, TITLES[key], state_of(key), words, busy.get(key)) for key, (_, words) in done.items())
     return Ladder(steps, run_id, identified, accepted, exported, reported)
 
 
@@ -166,8 +167,8 @@ def _ticket(path: Path, config: ArmConfig) -> tuple[bool, str]:
         return False, "not checked yet"
     try:
         ticket = read_ticket(path)
-    except (IdentError, json.JSONDecodeError) as error:
-        return False, f"its ticket cannot be read: {error}"
+    except IdentError:
+        return False, "its ticket cannot be read; check again"
     until = ticket.expires.strftime("%Y-%m-%d %H:%M UTC")
     if ticket.verdict is not Verdict.PASSED:
         return False, "the last one did not pass"
