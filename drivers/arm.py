@@ -106,6 +106,21 @@ class Arm(ABC):
         """
         return self
 
+    def zero(self) -> tuple[str, ...]:
+        """Take where the arm stands now for the home of its description; not open, it is opened and closed by this.
+
+        For a person who has led the arm there, and only where encoders count from where they were when power came.
+        Nothing is energised and nothing moves; until the encoders lose their power, `open` finds its positions by it.
+
+        Returns:
+            What each drive says of itself, for people.
+
+        Raises:
+            DriverError: open, an arm that needs no zero, one that moves, is powered or led by another host, or that
+                cannot be had; or a drive does not keep its zero. Then none has one, or all have the one before.
+        """
+        raise DriverError("this arm knows where it stands whenever it is opened; there is no zero to be set")
+
     def log_frames(self, path: Path) -> None:
         """Keep every frame of the fieldbus of the next session, from `open` to `close`.
 

@@ -13,6 +13,7 @@
     ├── MotionRefused (ValueError)     a motion that would leave the arm's limits, refused before anything moves
     └── ArmError (RuntimeError)        something below the motion loop
         ├── DriverError (OSError)      the arm cannot be opened, enabled or reached
+        │   └── PositionUnknown        its encoders lost their zero: a person must say where the arm stands
         └── ArmFault                   the guard or a drive stopped a motion; carries code and last samples
 
 Each leaf also is the builtin it resembles, so that callers who do not know this package can catch it.
@@ -100,6 +101,10 @@ class ArmError(IdentError, RuntimeError):
 
 class DriverError(ArmError, OSError):
     """The arm cannot be opened, enabled or reached."""
+
+
+class PositionUnknown(DriverError):
+    """Drives do not know where the arm stands; a person leads it home by hand and says so (`Arm.zero`)."""
 
 
 class ArmFault(ArmError):

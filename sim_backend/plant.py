@@ -108,8 +108,16 @@ class Plant:
 
     def rest(self) -> None:
         """Stand still where it is, as an arm that somebody holds."""
+        self.place(self._position)
+
+    def place(self, position: Array) -> None:
+        """Stand still somewhere, as an arm that somebody has led there.
+
+        Args:
+            position: [rad or m], shape (joints,).
+        """
         still = np.zeros(self._chain.joints)
-        self._set(self._position, still, still)
+        self._set(np.array(position, dtype=float), still, still)
 
     def load(self, loads: tuple[Load, ...]) -> None:
         """Attach point masses to the last link, in place of those attached before.

@@ -13,32 +13,36 @@ told beforehand `setup.py`.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector
 from drivers.canopen import dictionary as od
 from drivers.canopen.buses import Buses
-from drivers.canopen.codec import BusCodec, Drive, Emergency
+from drivers.canopen.codec import Drive, Emergency
 from drivers.canopen.coordinates import Coordinates, coordinates, unwrapped
 from drivers.canopen.enabling import Enabling, Resetting
-from drivers.canopen.events import axis_events
+from drivers.canopen.events import SilentDrives, axis_events
 from drivers.canopen.link import Link, open_links
 from drivers.canopen.lock import BusLock
 from drivers.canopen.looking import LookingArm
-from drivers.canopen.profile import Write, bus_profiles
+from drivers.canopen.profile import bus_profiles
 from drivers.canopen.sdo import Objects
 from drivers.canopen.session_log import SessionLog, logged_links, require_format
-from drivers.canopen.setup import Setup, configure, identify
-from drivers.canopen.words import DISABLE_VOLTAGE, QUICK_STOP, DriveState, NmtCommand, axis_status, joint_status
+from drivers.canopen.setup import Setup, configure, identify, released
+from drivers.canopen.words import DISABLE_VOLTAGE, QUICK_STOP, DriveState, NmtCommand, joint_status
+from drivers.canopen.zero import zeros_of
+from drivers.canopen.zeroing import ZeroingArm
 from drivers.clock import Clock, RealClock, VirtualClock
-from drivers.status import AxisEvent, AxisEventCode, AxisStatus
+from drivers.status import AxisEvent
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.schema import ArmConfig
-from ident_service.errors import DriverError
+from ident_service.errors import DriverError, PositionUnknown
 
 LIMIT_SLACK = 0.05  # rad or m beyond the joints' limits that the drives keep by themselves
 _HEARTBEAT_CHECK = 10  # cycles between two looks at everybody's heartbeat
@@ -66,15 +70,18 @@ class CanopenArm(Arm):
         self._period_ns = round(1e9 / config.control.rate)
         self._profiles = bus_profiles(config.driver, config.control.rate)
         self._coordinates: Coordinates = coordinates(config.driver, config.transmission)
+        self._zeros = zeros_of(config)
         self._limits = np.array([np.inf if j.torque is None else j.torque for j in config.joints.values()])
         if len(self._limits) != len(config.driver.drives):
             raise DriverError(f"{config.name}: joints must name all {len(config.driver.drives)} joints")
+        joints = len(self._limits)
+        self._all_fresh = _frozen(np.ones(joints, dtype=bool)), _frozen(np.zeros(joints, dtype=np.int64))
         # Joints that each drive moves, and drives that each joint needs.
         self._joints_of = {k: joints for motors, joints in self._coordinates.groups for k in motors}
         self._drives_of = self._coordinates.motors_of
-        joints = list(config.joints)
+        names = list(config.joints)
         self._names = [
-            f"{' and '.join(joints[j] for j in self._joints_of[k])}: drive {drive.node}"
+            f"{' and '.join(names[j] for j in self._joints_of[k])}: drive {drive.node}"
             for k, drive in enumerate(config.driver.drives)
         ]
         # Until the buses are open and bring theirs.
@@ -94,13 +101,20 @@ class CanopenArm(Arm):
         self._unwrapped: list[int] | None = None
         self._told: list[tuple[int | None, Emergency | None]] = []
         self._status: tuple[int, ...] = ()
-        self._cycle = 0
-        self._silent: set[int] = set()
+        self._cycle = self._begun = 0  # drives whose configuration has begun, the first ones
+        self._silent = SilentDrives()
         self._identities: tuple[str, ...] = ()
 
     def look(self) -> Arm:
         """An arm that reads the drives' objects by SDO and sends nothing else."""
         return LookingArm(self._config, self._open_bus)
+
+    def zero(self) -> tuple[str, ...]:
+        """Let the drives keep where they are as the home of the description; as in the contract."""
+        if self._buses is not None:
+            raise DriverError("the arm is open; close it before it is zeroed")
+        with ZeroingArm(self._config, self._open_bus) as arm:
+            return arm.take_home()
 
     def log_frames(self, path: Path) -> None:
         """Keep every frame of the next session in a `.log` of candump's, `.asc` or `.blf`; as in the contract."""
@@ -116,6 +130,7 @@ class CanopenArm(Arm):
         Raises:
             DriverError: a bus is in use, also by another host on it, or cannot be had; a drive does not answer, is
                 another one, or refuses a part of its configuration. Nothing stays open.
+            PositionUnknown: drives have lost their zero (`zero.py`); likewise.
         """
         if self._buses is not None:
             raise DriverError("the arm is already open")
@@ -126,7 +141,7 @@ class CanopenArm(Arm):
                 self._locks = [BusLock(bus) for bus in self._driver.buses]
             links = self._open_bus(self._config)
             if self._log_path is not None:
-                self._log, links = logged_links(links, self._log_path)
+                self._log, links = logged_links(links, self._log_path, [profile.fd for profile in self._profiles])
                 self._log_path = None
             buses = Buses(self._profiles, links, self._period_ns)
             self.clock = buses.clock
@@ -137,8 +152,10 @@ class CanopenArm(Arm):
                 raise
             self._buses = buses
             buses.call()
-            self._identities = tuple(self._configured(buses, number) for number in range(len(buses.drives)))
+            self._find_zero(buses)
+            self._identities = tuple(self._configured(buses))
             buses.begin()
+            self._require_no_restart(buses)
         except BaseException:
             self.close()
             raise
@@ -197,9 +214,10 @@ class CanopenArm(Arm):
         if torque is not None:
             if not self._enabled:
                 raise DriverError("a torque was given, but the arm is not enabled")
-            if np.shape(torque) != self._limits.shape or not np.isfinite(torque).all():
+            wanted = np.asarray(torque, dtype=float)
+            if wanted.shape != self._limits.shape or not np.isfinite(wanted).all():
                 raise DriverError(f"{len(self._limits)} finite torques are needed, not {torque}")
-            wanted = np.clip(np.asarray(torque, dtype=float), -self._limits, self._limits)
+            wanted = np.minimum(np.maximum(wanted, -self._limits), self._limits)  # np.clip takes three times as long
             self._counts, _ = self._coordinates.torque_counts(wanted)
             self._acting = _frozen(self._coordinates.joint_torque(self._counts))
         # Enabled, an exchange that only looks is no torque frame: drives that count them must notice.
@@ -251,17 +269,14 @@ class CanopenArm(Arm):
                 if cycle >= _FAREWELL and not (brakes and self.clock.now_ns() < last):
                     break
         there: dict[int, Objects] = {}  # by bus
-        for number, drive in enumerate(self._driver.drives):
+        for number, drive in enumerate(self._driver.drives[: self._begun]):
             with suppress(Exception):
+                objects = buses.objects(number)
                 # Between two conversations, so that the others do not miss their torque frames.
                 buses.cycle(self._counts if self._streaming else None)
-                objects = buses.objects(number)
-                # Asked for: a status report may be held back by its inhibit time.
-                off = not axis_status(objects.read(od.STATUS_WORD)) & AxisStatus.POWERED
+                for _ in released(objects, self._zeros, number, buses.restarted(number)):
+                    buses.cycle(self._counts if self._streaming else None)
                 there[drive.bus] = objects
-                if off:
-                    objects.write(Write(od.ABORT_CONNECTION, 0))
-                    objects.write(Write(od.HEARTBEAT_CONSUMER, 0))  # or 8130h would follow every session
         with suppress(Exception):
             buses.command(NmtCommand.ENTER_PRE_OPERATIONAL)
         for objects in there.values():
@@ -277,30 +292,33 @@ class CanopenArm(Arm):
         self._counts = [0] * len(self._limits)
         self._acting = _frozen(np.zeros(len(self._limits)))
 
-    def _configured(self, buses: Buses, number: int) -> str:
-        """One drive identified and configured; its identity in words."""
-        drive, objects = self._driver.drives[number], buses.objects(number)
-        identity = identify(objects, drive.identity)
-        lowest, highest = self._count_limits(number)
-        configure(objects, Setup(drive, buses.profile(number), self._driver.reactions, lowest, highest))
-        return identity
+    def _find_zero(self, buses: Buses) -> None:
+        """Coordinates by what the drives vouch for, before they are configured, which may make them forget it."""
+        if self._zeros is not None:
+            held = [self._zeros.held(buses.objects(number), number) for number in range(len(buses.drives))]
+            self._coordinates = self._coordinates.zeroed(self._zeros.all_of(held), self._zeros.home)
 
-    def _count_limits(self, number: int) -> tuple[int | None, int | None]:
-        """Between which counts a drive may be while all joints are within their limits, and a little more."""
-        found, joints = self._coordinates, list(self._config.joints.values())
-        turns = np.linalg.inv(found.joint_per_count)[number]
-        low = high = float(found.zero[number])
-        for joint, share, offset in zip(joints, turns, found.offset, strict=True):
-            if share == 0.0:
-                continue
-            if joint.position is None:
-                return None, None
-            ends = [
-                share * (joint.position[0] - LIMIT_SLACK - offset),
-                share * (joint.position[1] + LIMIT_SLACK - offset),
-            ]
-            low, high = low + min(ends), high + max(ends)
-        return round(low), round(high)
+    def _configured(self, buses: Buses) -> Iterator[str]:
+        """All drives identified and configured, one by one; the identity of each in words."""
+        joints = [joint.position or (-np.inf, np.inf) for joint in self._config.joints.values()]
+        lowest, highest = np.array(joints).T
+        limits = self._coordinates.count_limits(lowest - LIMIT_SLACK, highest + LIMIT_SLACK)
+        for number, drive in enumerate(self._driver.drives):
+            objects = buses.objects(number)
+            identity = identify(objects, drive.identity)
+            self._begun = number + 1
+            configure(objects, Setup(drive, buses.profile(number), self._driver.reactions, limits[number]))
+            if self._zeros is not None:
+                counts = self._coordinates.zero[number]
+                if not self._zeros.keep_on(objects, number, counts, buses.restarted(number)):
+                    raise PositionUnknown(self._zeros.lost([drive.node]))
+                identity += f", home at {counts} counts"  # a preflight ticket is for this zero
+            yield identity
+
+    def _require_no_restart(self, buses: Buses) -> None:
+        """Drives that restarted after they were configured have lost their zero."""
+        if self._zeros is not None and (restarted := [drive.node for drive in buses.drives if drive.boots]):
+            raise PositionUnknown(self._zeros.lost(restarted))
 
     def _through(self, buses: Buses, steps: Enabling | Resetting) -> None:
         """Cycle with zero torque until the drives have gone where they are led; a stop meanwhile wins."""
@@ -316,20 +334,24 @@ class CanopenArm(Arm):
     def _sample(self, buses: Buses, stamp_ns: int) -> Sample:
         drives = buses.drives
         if self._unwrapped is None:
-            self._unwrapped = [drive.position for drive in drives]
+            nearest = zip(self._coordinates.zero, drives, strict=True)
+            self._unwrapped = [unwrapped(zero, drive.position) for zero, drive in nearest]
         else:
             self._unwrapped = [
                 unwrapped(before, drive.position) for before, drive in zip(self._unwrapped, drives, strict=True)
             ]
-        ages = [max(drives[k].age for k in needed) for needed in self._drives_of]
-        age = np.array(ages, dtype=np.int64)
+        valid, age = self._all_fresh
+        if not buses.complete:
+            ages = [max(drives[k].age for k in needed) for needed in self._drives_of]
+            age = np.array(ages, dtype=np.int64)
+            valid = age == 0
         return Sample(
             self._cycle,
             stamp_ns,
             self._coordinates.positions(self._unwrapped),
             None,
             self._acting,
-            age == 0,
+            valid,
             age,
             buses.lost,
             self._statuses(drives),
@@ -342,33 +364,19 @@ class CanopenArm(Arm):
         told = [(drive.status, drive.emergency) for drive in drives]
         if told != self._told:
             self._told = told
-            self._status = tuple(_status([drives[k] for k in needed]) for needed in self._drives_of)
+            self._status = tuple(int(joint_status(drives[k].axis_status for k in needed)) for needed in self._drives_of)
         return self._status
 
     def _events(self, buses: Buses) -> list[AxisEvent]:
         found: list[AxisEvent] = []
         for codec in buses.codecs:
             events = codec.take_events()
-            if events:
+            look = self._cycle % _HEARTBEAT_CHECK == 0
+            if events or look:
                 joints = {self._driver.drives[k].node: self._joints_of[k][0] for k in codec.profile.drives}
                 found += axis_events(events, codec, joints)
-            if self._cycle % _HEARTBEAT_CHECK == 0:
-                found += self._missed(codec)
+                found += self._silent.new(codec, self.clock.now_ns(), joints) if look else []
         return found
-
-    def _missed(self, codec: BusCodec) -> list[AxisEvent]:
-        """Drives whose heartbeat is missing, each told once."""
-        silent = set(codec.silent(self.clock.now_ns()))
-        new = silent - self._silent
-        self._silent = self._silent - set(codec.profile.nodes) | silent
-        return [
-            AxisEvent(
-                AxisEventCode.DRIVE_SILENT,
-                self._joints_of[codec.profile.drives[codec.profile.nodes.index(node)]][0],
-                f"node {node}: no heartbeat for {codec.profile.heartbeat_timeout:g} s",
-            )
-            for node in sorted(new)
-        ]
 
 
 def from_config(config: ArmConfig, clock: Clock | None = None) -> CanopenArm:
@@ -384,14 +392,6 @@ def from_config(config: ArmConfig, clock: Clock | None = None) -> CanopenArm:
     return CanopenArm(config)
 
 
-def _status(drives: Sequence[Drive]) -> int:
-    words = []
-    for drive in drives:
-        error = 0 if drive.emergency is None else drive.emergency.code
-        words.append(AxisStatus(0) if drive.status is None else axis_status(drive.status, error))
-    return int(joint_status(words))
-
-
-def _frozen(array: Vector) -> Vector:
+def _frozen(array: NDArray[Any]) -> NDArray[Any]:
     array.setflags(write=False)
     return array

@@ -11,7 +11,7 @@ Boundary: frames and time. What torques mean and what states drives should be in
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 from drivers.canopen.bits import worst
@@ -43,6 +43,7 @@ class Buses:
         codecs: one a bus.
         drives: the state of every drive, in the arm's order.
         clock: of the links.
+        complete: whether every drive answered in the last cycle.
         lost: positions that did not come in their cycle, so far.
     """
 
@@ -56,6 +57,7 @@ class Buses:
         """
         self.codecs = [BusCodec(profile) for profile in profiles]
         self.clock: Clock = links[0].clock
+        self.complete = False
         self.lost = 0
         self._links = list(links)
         self._pairs = list(zip(self.codecs, self._links, strict=True))
@@ -97,6 +99,11 @@ class Buses:
     def profile(self, number: int) -> BusProfile:
         """Of the bus that a drive is on."""
         return self._at[number][0].profile
+
+    def restarted(self, number: int) -> Callable[[], bool]:
+        """What tells whether a drive has sent a boot-up message since the buses were opened."""
+        drive = self.drives[number]
+        return lambda: drive.boots > 0
 
     def listen(self) -> None:
         """Wait whether another host drives this arm, which anything of ours would disturb in the midst of it.
@@ -214,7 +221,9 @@ class Buses:
                     break
                 codec.receive(answer)
             codec.end_cycle()
-        self.lost += sum(not drive.answered for drive in self.drives)
+        self.complete = all(codec.complete for codec in self.codecs)
+        if not self.complete:
+            self.lost += sum(not drive.answered for drive in self.drives)
         self.keep_alive()
         return stamp_ns
 

@@ -36,10 +36,12 @@ from drivers.canopen.words import (
     DriveState,
     NmtCommand,
     NmtState,
+    axis_status,
     emergency_words,
     nmt_words,
     state_of,
 )
+from drivers.status import AxisStatus
 from ident_service.errors import DriverError
 
 _POSITION, _STATUS, _CONTROL = struct.Struct("<i"), struct.Struct("<Hh"), struct.Struct("<Hb")
@@ -99,6 +101,12 @@ class Drive:
     def state(self) -> DriveState:
         """Of CiA 402, unknown before the first status word."""
         return DriveState.UNKNOWN if self.status is None else state_of(self.status)
+
+    @property
+    def axis_status(self) -> AxisStatus:
+        """In the words of all fieldbuses; nothing before the first status word."""
+        error = 0 if self.emergency is None else self.emergency.code
+        return AxisStatus(0) if self.status is None else axis_status(self.status, error)
 
 
 @dataclass(slots=True)

@@ -89,6 +89,35 @@ class Coordinates:
         motors = np.linalg.solve(self.joint_per_count, position - self.offset)
         return [round(turn) + zero for turn, zero in zip(motors.tolist(), self.zero, strict=True)]
 
+    def count_limits(self, lowest: Vector, highest: Vector) -> list[tuple[int, int] | None]:
+        """Between which counts each motor is while all joints are between these positions.
+
+        Args:
+            lowest: [rad or m], shape (n,); not finite where a joint has no limit.
+            highest: the other end, likewise.
+
+        Returns:
+            Lowest and highest counts of each motor; None for one that moves a joint without limits.
+
+        Raises:
+            DriverError: counts that 32 bits do not hold.
+        """
+        found: list[tuple[int, int] | None] = []
+        for row, zero in zip(np.linalg.inv(self.joint_per_count), self.zero, strict=True):
+            moved = row != 0.0
+            ends = row[moved] * (np.array([lowest, highest]) - self.offset)[:, moved]
+            if not np.isfinite(ends).all():
+                found.append(None)
+                continue
+            low, high = round(zero + ends.min(axis=0).sum()), round(zero + ends.max(axis=0).sum())
+            if not -_TURN // 2 <= low <= high < _TURN // 2:
+                raise DriverError(
+                    f"position limits at counts {low} to {high} do not fit the 32 bits of 607Dh; "
+                    "a drive that counts from where it was when power came begins anew when its power is switched"
+                )
+            found.append((low, high))
+        return found
+
     def zeroed(self, counts: Sequence[int], position: Vector) -> Coordinates:
         """The same for an arm whose motors are at these counts while its joints are at this position.
 
@@ -171,6 +200,11 @@ def torque_limit_counts(max_torque: float, rated_torque: float) -> int:
     """A motor's largest torque as thousandths of its rated torque, rounded down; at most what 6071h can hold."""
     # 1.8/0.2 is a little below 9 in floating point.
     return min(int(_PER_MILLE * max_torque / rated_torque + 1e-6), MOST_COUNTS)
+
+
+def signed(value: int) -> int:
+    """A number of 32 bits without sign as the one with sign that has the same bits."""
+    return (value + _TURN // 2) % _TURN - _TURN // 2
 
 
 def unwrapped(before: int, counts: int) -> int:

@@ -51,3 +51,27 @@ def axis_events(events: Iterable[Event], codec: BusCodec, joint_of: Mapping[int,
             words = f"{bus}: {event.words}" if event.node == HOST else f"node {event.node}: {event.words}"
             found.append(AxisEvent(code, joint_of.get(event.node), words))
     return found
+
+
+class SilentDrives:
+    """Drives of all buses whose heartbeat is missing, each told once until it is heard again."""
+
+    def __init__(self) -> None:
+        self._told: set[tuple[int, int]] = set()
+
+    def new(self, codec: BusCodec, now_ns: int, joint_of: Mapping[int, int]) -> list[AxisEvent]:
+        """Those of one bus that have fallen silent since this was asked last.
+
+        Args:
+            codec: of the bus.
+            now_ns: of the links' clock [ns].
+            joint_of: first joint that each node moves.
+        """
+        bus, timeout = codec.profile.number, codec.profile.heartbeat_timeout
+        silent = {(bus, node) for node in codec.silent(now_ns)}
+        new = sorted(silent - self._told)
+        self._told = {place for place in self._told if place[0] != bus} | silent
+        return [
+            AxisEvent(AxisEventCode.DRIVE_SILENT, joint_of[node], f"node {node}: no heartbeat for {timeout:g} s")
+            for _, node in new
+        ]

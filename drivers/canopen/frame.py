@@ -16,6 +16,8 @@ class Frame(NamedTuple):
             linux/can/error.h and `data` its details.
         extended: a 29-bit identifier, which CANopen never uses.
         stamp_ns: when it was received, monotonic [ns]; 0 where nobody knows.
+        fd: a CAN FD frame with its bit rate switched. What a driver sends is one where its link's bus is configured so,
+            whatever stands here.
     """
 
     identifier: int
@@ -24,3 +26,4 @@ class Frame(NamedTuple):
     error: bool = False
     extended: bool = False
     stamp_ns: int = 0
+    fd: bool = False

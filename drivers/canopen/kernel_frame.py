@@ -53,4 +53,5 @@ def from_kernel(data: bytes, stamp_ns: int = 0) -> Frame:
         raise DriverError(f"a CAN frame of {length} bytes in a structure for {len(payload)}")
     remote, error, extended = bool(word & REMOTE), bool(word & ERROR), bool(word & EXTENDED)
     identifier = word & (0x1FFF_FFFF if extended or error else 0x7FF)
-    return Frame(identifier, b"" if remote else payload[:length], remote, error, extended, stamp_ns)
+    fd = len(data) == FD_BYTES
+    return Frame(identifier, b"" if remote else payload[:length], remote, error, extended, stamp_ns, fd)

@@ -29,11 +29,12 @@ from drivers.canopen.polling import Answers, Place, poll
 from drivers.canopen.sdo import TIMEOUT, Objects
 from drivers.canopen.setup import identify
 from drivers.canopen.words import axis_status, drive_words, joint_status
+from drivers.canopen.zero import zeros_of
 from drivers.clock import Clock, RealClock
 from drivers.status import AxisStatus
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.schema import ArmConfig
-from ident_service.errors import DriverError
+from ident_service.errors import DriverError, PositionUnknown
 
 RATE = 20.0  # Hz
 SHARE = 0.25  # of the bus in the worst case; below, the rate is lower
@@ -81,6 +82,7 @@ class LookingArm(Arm):
             raise DriverError(f"{config.name}: needs a CANopen driver and a transmission")
         self._config, self._driver, self._open_bus = config, config.driver, open_bus
         self._coordinates = coordinates(config.driver, config.transmission)
+        self._zeros = zeros_of(config)
         self._places: tuple[Place, ...] = tuple((drive.bus, drive.node) for drive in config.driver.drives)
         self._period_ns = round(1e9 / look_rate(config.driver))
         self.clock: Clock = RealClock()
@@ -92,6 +94,7 @@ class LookingArm(Arm):
         self._heard = Overheard()
         self._seen = [_Seen() for _ in self._places]
         self._identities: tuple[str, ...] = ()
+        self._missing: set[int] = set()  # drives that did not answer when the arm was opened, so that no zero is known
         self._cycle, self._lost = 0, 0
         self._next_ns: int | None = None
 
@@ -101,6 +104,7 @@ class LookingArm(Arm):
         Raises:
             DriverError: a bus is in use, by another host too, or cannot be had; no drive answers, or one is another
                 than the configured one. Nothing stays open.
+            PositionUnknown: drives have lost their zero (`zero.py`); likewise.
         """
         if self._links:
             raise DriverError("the arm is already open")
@@ -113,6 +117,7 @@ class LookingArm(Arm):
             self._heard.listen(self._links, self._driver.heartbeats.drives)
             self._require_alone()
             self._identities = self._identified()
+            self._find_zero()
         except BaseException:
             self.close()
             raise
@@ -132,6 +137,10 @@ class LookingArm(Arm):
             "drivers.canopen, SDO uploads only",
         )
 
+    def zero(self) -> tuple[str, ...]:
+        """Never; raises DriverError."""
+        raise DriverError("an arm that is only looked at cannot be zeroed")
+
     def enable(self) -> None:
         """Never; raises DriverError."""
         raise DriverError("an arm that is only looked at cannot be enabled")
@@ -145,6 +154,7 @@ class LookingArm(Arm):
 
         Raises:
             DriverError: not open, a torque, a bus is gone, or another host has begun to stream: it must not be delayed.
+            PositionUnknown: a drive restarted, and its zero is lost.
         """
         self._require_open()
         if torque is not None:
@@ -158,6 +168,7 @@ class LookingArm(Arm):
         troubled = [place for place, bits in register.values.items() if bits]
         codes = self._ask(troubled, _QUESTIONS[3], deadlines[3]).values
         self._require_alone()
+        self._require_no_restart()
         for place, seen in zip(self._places, self._seen, strict=True):
             _take(seen, position.values.get(place), status.values.get(place))
             if place in register.values:
@@ -203,13 +214,34 @@ class LookingArm(Arm):
                 f"no drive answers within {AWAKE:g} s; check power, cable and bit rate (`ident bus scan`)"
             )
         words = []
-        for drive in self._driver.drives:
+        for number, drive in enumerate(self._driver.drives):
             if (drive.bus, drive.node) in missing:
+                self._missing.add(number)
                 words.append(f"node {drive.node}: no answer")
                 continue
-            objects = Objects(self._links[drive.bus], drive.node, self._hear_on(drive.bus))
-            words.append(identify(objects, drive.identity))
+            words.append(identify(self._objects(number), drive.identity))
         return tuple(words)
+
+    def _find_zero(self) -> None:
+        """Coordinates by what the drives vouch for, where their encoders need it."""
+        if self._zeros is None:
+            return
+        self._heard.restarted.clear()
+        answers = [k for k in range(len(self._places)) if k not in self._missing]
+        held = {k: self._zeros.held(self._objects(k), k) for k in answers}
+        if lost := [self._places[k][1] for k, counts in held.items() if counts is None]:
+            raise PositionUnknown(self._zeros.lost(lost))
+        counts = [held.get(k) or 0 for k in range(len(self._places))]
+        self._coordinates = self._coordinates.zeroed(counts, self._zeros.home)
+
+    def _require_no_restart(self) -> None:
+        ours = self._heard.restarted.intersection(self._places)
+        if self._zeros is not None and ours:
+            raise PositionUnknown(self._zeros.lost([node for _, node in ours]))
+
+    def _objects(self, number: int) -> Objects:
+        bus, node = self._places[number]
+        return Objects(self._links[bus], node, self._hear_on(bus))
 
     def _hear_on(self, bus: int) -> Callable[[Frame], None]:
         return lambda frame: self._heard.take(bus, frame)
@@ -226,8 +258,11 @@ class LookingArm(Arm):
     def _sample(self, stamp_ns: int) -> Sample:
         seen, joints = self._seen, self._coordinates.motors_of
         age = np.array([max(seen[k].age for k in motors) for motors in joints], dtype=np.int64)
-        never = [any(seen[k].position is None for k in motors) for motors in joints]
-        position = self._coordinates.positions([one.unwrapped for one in seen])
+        unknown = self._missing if self._zeros is not None else set()
+        never = [any(seen[k].position is None or k in unknown for k in motors) for motors in joints]
+        # A count that came round its 32 bits since the drive was zeroed lies nearest to the zero.
+        counts = [unwrapped(zero, one.unwrapped) for zero, one in zip(self._coordinates.zero, seen, strict=True)]
+        position = self._coordinates.positions(counts)
         self._lost += sum(one.age > 0 for one in seen)
         status = [AxisStatus(0) if one.status is None else axis_status(one.status, one.emergency) for one in self._seen]
         now_ns, patience_ns = self.clock.now_ns(), round(self._driver.heartbeats.timeout * 1e9)

@@ -22,6 +22,7 @@ class Overheard:
     Attributes:
         nmt: what each node's last heartbeat said, and when it came [ns of the links' clock].
         booted: nodes whose last word was a boot-up message, which makes them pre-operational.
+        restarted: nodes that sent a boot-up message since somebody cleared this.
         answered: nodes that sent an SDO reply which nobody waited for.
         streaming: buses on which somebody sends SYNC.
     """
@@ -29,6 +30,7 @@ class Overheard:
     def __init__(self) -> None:
         self.nmt: dict[Place, tuple[int, int]] = {}
         self.booted: set[Place] = set()
+        self.restarted: set[Place] = set()
         self.answered: set[Place] = set()
         self.streaming: set[int] = set()
 
@@ -44,6 +46,7 @@ class Overheard:
             self.booted.discard((bus, node))
             if state == NmtState.BOOT_UP:
                 self.booted.add((bus, node))
+                self.restarted.add((bus, node))
                 state = NmtState.PRE_OPERATIONAL
             self.nmt[bus, node] = state, frame.stamp_ns
         elif 1 <= frame.identifier - SDO_REPLY <= 127:

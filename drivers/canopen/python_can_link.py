@@ -202,6 +202,7 @@ class PythonCanLink:
             message.is_error_frame,
             message.is_extended_id and not message.is_error_frame,
             now - round(age * 1e9) if 0.0 <= age < _PLAUSIBLE_S else now,
+            message.is_fd,
         )
         self._watch.heard(frame)
         return frame

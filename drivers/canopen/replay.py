@@ -24,7 +24,7 @@ _MOST_FRAMES = 20_000_000
 # candump -L: (seconds) interface identifier#data, ##flags for CAN FD, R for a remote frame; then R or T, or nothing.
 _LINE = re.compile(
     r"\((\d+)\.(\d{1,9})\) (\S*?)(\d*) ([0-9A-F]{3}|[0-9A-F]{8})#"
-    r"(?:(R)\d?|(?:#[0-9A-F])?((?:[0-9A-F]{2}){0,64}))(?: ([RT]))?",
+    r"(?:(R)\d?|(#[0-9A-F])?((?:[0-9A-F]{2}){0,64}))(?: ([RT]))?",
     re.IGNORECASE,
 )
 
@@ -75,7 +75,7 @@ def _read_candump(path: Path) -> Iterator[LoggedFrame]:
                 continue
             if (match := _LINE.fullmatch(text)) is None:
                 raise RecordingError(path, f"line {number}: not a frame as candump -L writes it: {text[:60]!r}")
-            seconds, fraction, _, bus, identifier, remote, data, direction = match.groups()
+            seconds, fraction, _, bus, identifier, remote, fd, data, direction = match.groups()
             word = int(identifier, 16)
             error = len(identifier) == 8 and bool(word & ERROR)
             frame = Frame(
@@ -85,6 +85,7 @@ def _read_candump(path: Path) -> Iterator[LoggedFrame]:
                 error,
                 len(identifier) == 8 and not error,
                 int(seconds) * 1_000_000_000 + int(fraction.ljust(9, "0")),
+                fd is not None,
             )
             yield LoggedFrame(int(bus or 0), (direction or "R").upper() == "T", frame)
 
@@ -107,6 +108,7 @@ def _read_other(path: Path) -> Iterator[LoggedFrame]:
                     message.is_error_frame,
                     message.is_extended_id and not message.is_error_frame,
                     round(message.timestamp * 1e9),
+                    message.is_fd,
                 )
                 bus = message.channel if isinstance(message.channel, int) else 0
                 yield LoggedFrame(bus, not message.is_rx, frame)

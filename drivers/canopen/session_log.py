@@ -55,8 +55,13 @@ def require_format(path: Path | str) -> Path:
     return Path(path)
 
 
-def logged_links(links: Sequence[Link], path: Path) -> tuple[SessionLog, list[Link]]:
+def logged_links(links: Sequence[Link], path: Path, fd: Sequence[bool]) -> tuple[SessionLog, list[Link]]:
     """Open links whose frames go into a new file from now on, and its log, to be closed after them.
+
+    Args:
+        links: of all buses.
+        path: of the file.
+        fd: of which buses data frames are sent as CAN FD's.
 
     Raises:
         DriverError: the file cannot be created; the links are closed then.
@@ -67,7 +72,7 @@ def logged_links(links: Sequence[Link], path: Path) -> tuple[SessionLog, list[Li
         for link in links:
             link.close()
         raise
-    return log, [log.link(link, number) for number, link in enumerate(links)]
+    return log, [log.link(link, number, fd=is_fd) for number, (link, is_fd) in enumerate(zip(links, fd, strict=True))]
 
 
 class SessionLog:
@@ -128,14 +133,15 @@ class SessionLog:
         except OSError:
             self.lost += len(frames)
 
-    def link(self, link: Link, bus: int = 0) -> LoggedLink:
+    def link(self, link: Link, bus: int = 0, *, fd: bool = False) -> LoggedLink:
         """A link whose frames are logged.
 
         Args:
             link: of the bus; closed with what is returned.
             bus: its number in the file.
+            fd: whether data frames are sent as CAN FD's.
         """
-        return LoggedLink(link, self, bus)
+        return LoggedLink(link, self, bus, fd)
 
     def close(self) -> None:
         """Finish the file and set `report`; any number of times."""
@@ -171,17 +177,17 @@ class SessionLog:
 class LoggedLink:
     """A link whose frames go into a log as well; sent ones are stamped when they were handed over."""
 
-    def __init__(self, link: Link, log: SessionLog, bus: int) -> None:
+    def __init__(self, link: Link, log: SessionLog, bus: int, fd: bool) -> None:
         """Take a link over."""
         self.clock = link.clock
-        self._link, self._log, self._bus = link, log, bus
+        self._link, self._log, self._bus, self._fd = link, log, bus, fd
         self._held: list[tuple[Frame, bool]] = []
         self._since_ns = 0
 
     def send(self, frame: Frame) -> None:
         """As the link's; what it refuses is not logged."""
         self._link.send(frame)
-        self._hold(frame._replace(stamp_ns=self.clock.now_ns()), True)
+        self._hold(frame._replace(stamp_ns=self.clock.now_ns(), fd=self._fd and not frame.remote), True)
 
     def receive(self, deadline_ns: int) -> Frame | None:
         """As the link's."""

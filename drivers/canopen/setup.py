@@ -6,13 +6,16 @@ it does: SYNC's period and window, the interpolation period, PDOs that are only 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 from drivers.canopen import dictionary as od
 from drivers.canopen.coordinates import torque_limit_counts
 from drivers.canopen.profile import BusProfile, Write
 from drivers.canopen.sdo import DOES_NOT_EXIST, READ_ONLY, Objects, SdoRefused
+from drivers.canopen.words import axis_status
+from drivers.canopen.zero import Zeros
+from drivers.status import AxisStatus
 from ident_service.config.canopen import CanopenDrive, DriveIdentity, Reactions
 from ident_service.errors import DriverError
 
@@ -29,15 +32,13 @@ class Setup:
         drive: its section.
         profile: of its bus.
         reactions: to what it finds by itself.
-        lowest: position that the drive itself does not pass [counts]; None where the joints have no limits.
-        highest: the other end.
+        limits: lowest and highest position that the drive itself does not pass [counts]; None where joints have none.
     """
 
     drive: CanopenDrive
     profile: BusProfile
     reactions: Reactions
-    lowest: int | None
-    highest: int | None
+    limits: tuple[int, int] | None
 
     def protections(self) -> list[Write]:
         """What the drive keeps to by itself."""
@@ -49,8 +50,8 @@ class Setup:
             Write(od.FAULT_OPTION, self.reactions.fault),
             Write(od.ABORT_CONNECTION, self.reactions.abort_connection),
         ]
-        if self.lowest is not None and self.highest is not None:
-            todo += [Write(od.LOWER_LIMIT, self.lowest), Write(od.UPPER_LIMIT, self.highest)]
+        if self.limits is not None:
+            todo += [Write(od.LOWER_LIMIT, self.limits[0]), Write(od.UPPER_LIMIT, self.limits[1])]
         return todo
 
     def timing(self) -> list[Write]:
@@ -130,6 +131,35 @@ def configure(objects: Objects, setup: Setup) -> None:
             )
     if (mode := objects.read(od.MODE_DISPLAY)) != od.CST:
         raise DriverError(f"node {objects.node}: is in mode {mode} (6061h) although {od.CST} was set")
+
+
+def released(objects: Objects, zeros: Zeros | None, number: int, restarted: Callable[[], bool]) -> Iterator[None]:
+    """Let a drive that is off forget that a host will be missed; one that is not shall miss it, and stop.
+
+    It comes in steps of a few frames each, for cycles between them. What a drive vouches for (`zero.py`) it vouches for
+    afterwards too, and nothing else: one that restarted in the session has lost its zero.
+
+    Args:
+        objects: of the drive.
+        zeros: of the arm, None where drives know their position.
+        number: of the drive.
+        restarted: whether it has sent a boot-up message in the session.
+
+    Raises:
+        DriverError: it does not answer, or refuses.
+    """
+    # Asked for: a status report may be held back by its inhibit time.
+    if axis_status(objects.read(od.STATUS_WORD)) & AxisStatus.POWERED:
+        return
+    counts = None
+    if zeros is not None:
+        counts = zeros.held(objects, number)
+        yield
+    objects.write(Write(od.ABORT_CONNECTION, 0))
+    objects.write(Write(od.HEARTBEAT_CONSUMER, 0))  # or 8130h would follow every session
+    if zeros is not None and counts is not None:
+        yield
+        zeros.keep_on(objects, number, counts, restarted)
 
 
 def _rated_torque(objects: Objects, drive: CanopenDrive) -> None:

@@ -17,14 +17,17 @@ from ident_service.cli import (
     arm,
     bus,
     commission,
+    comparing,
     configs,
     daemon,
     emulate,
+    exports,
     keeping,
     motions,
     parameters,
     recovery,
     remote,
+    results,
 )
 from ident_service.cli.answer import (
     DONE,
@@ -42,7 +45,10 @@ from ident_service.errors import ArmFault, ConfigError, IdentError, MotionRefuse
 
 __all__ = ["DONE", "FAILED", "FAULTED", "USAGE", "VERDICT_NO", "main"]
 
-GROUPS = (commission, motions, arm, recovery, parameters, configs, bus, emulate, keeping, daemon, remote)
+GROUPS = (
+    *(commission, motions, arm, recovery, parameters, results, comparing, exports, keeping),
+    *(configs, bus, emulate, daemon, remote),
+)
 _EXIT_CODES: tuple[tuple[type[IdentError], int], ...] = (
     (ConfigError, USAGE),
     (UsageError, USAGE),

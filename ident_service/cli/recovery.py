@@ -1,11 +1,12 @@
-"""Verbs that make an arm usable again: `recover` says what is in the way, `home` leads it home.
+"""Verbs that make an arm usable again: `recover` says what is in the way, `home` leads it home, or takes it for home.
 
-Boundary: words to requests, results to words; the work is `service/recover.py` and `service/run.py`.
+Boundary: words to requests, results to words; the work is `service/recover.py`, `service/zeroing.py`, `service/run.py`.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -30,6 +31,10 @@ def add(verbs: Verbs) -> None:
     """Register the verbs."""
     sub = verbs.add("home", _home, "lead the arm home, at a tenth of its velocity limits at most")
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    sub.add_argument(
+        "--zero", action="store_true", help="move nothing: a person has led the arm home, and its encoders begin there"
+    )
+    sub.add_argument("--confirm", metavar="NAME", help="with --zero: the arm's name, typed by a person who has looked")
     sub.add_argument("--out", type=Path, metavar="DIR", help=_HELP_OUT)
     add_can_log(sub)
     add_lease(sub)
@@ -47,7 +52,35 @@ def _home(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
     from ident_service.motion.plans import Destination
 
-    return _slowly(arguments, load_arm(arguments.arm), Destination.HOME)
+    config = load_arm(arguments.arm)
+    if arguments.zero:
+        if arguments.out is not None or arguments.can_log:
+            raise UsageError("--out and --can-log are for a motion; with --zero nothing moves")
+        return _zero(arguments, config)
+    if arguments.confirm is not None:
+        raise UsageError("--confirm is for --zero; a motion needs the ticket of `ident check`")
+    return _slowly(arguments, config, Destination.HOME)
+
+
+def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
+    from ident_service.service.zeroing import home_posture, take_home
+
+    posture = home_posture(config)
+    tell(arguments, f"{config.name}: nothing will move. From now on the arm stands, by what you say, in this posture:")
+    for joint in posture:
+        tell(arguments, f"  {joint}")
+
+    def confirm(question: str) -> str:
+        if arguments.confirm is not None:
+            return str(arguments.confirm)
+        return input(f"{question} ") if sys.stdin.isatty() and not arguments.json else ""
+
+    done = take_home(config, state_folder(arguments), confirm)
+    lines = [f"{done.arm}: zeroed, until its drives lose their power", *(f"  {words}" for words in done.drives)]
+    lines += [f"  latched still: {fault.code}: {fault.cause}" for fault in done.faults]
+    lines.append(f"next: `ident watch {done.arm}` against the arm, then `ident check {done.arm}`")
+    document = asdict(done) | {"faults": [fault.code for fault in done.faults]}
+    return DONE, "\n".join([*lines, ""]), document
 
 
 def _recover(arguments: argparse.Namespace) -> Answer:
@@ -74,6 +107,7 @@ def _recover(arguments: argparse.Namespace) -> Answer:
         "moved_by": found.mover,
         "seen": None if found.seen is None else watch_document(found.seen),
         "unreachable": found.unreachable,
+        "zero_lost": found.zero_lost,
         "reset": list(found.reset),
         "tripped": found.tripped,
         "outside": list(found.outside),
@@ -107,6 +141,8 @@ def _text(found: Recovery) -> str:
         lines.append(f"  process {found.mover} moves the arm")
     if found.unreachable:
         lines.append(f"  the arm cannot be looked at: {found.unreachable}")
+    if found.zero_lost:
+        lines.append(f"  the arm does not know where it stands: {found.zero_lost}")
     lines += [f"  {axis}: the drive has latched: {words}" for axis, words in found.tripped.items()]
     if found.reset:
         lines.append(f"  reset just now: {', '.join(found.reset)}")

@@ -138,7 +138,9 @@ class CanopenDriver(Section):
 
     `torque_frames` says whether up to four drives share a frame, by dummy mapping, or each has its own.
     `torque_deadline` [s] without torque frames makes a drive stop by itself (1400h:05). `bring_up` [s] is how long all
-    drives together may take for one step to `operation enabled`.
+    drives together may take for one step to `operation enabled`. `zero` says whether encoders know where they stand
+    (`absolute`), or count from where they were when power came; then a person leads the arm to the joints' `home` and
+    says so, `ident home ARM --zero`, after every loss of power.
     """
 
     kind: Literal["canopen"]
@@ -200,7 +202,11 @@ def maps_dummies(eds: str) -> bool:
 
 
 def disagreements(
-    driver: CanopenDriver, transmission: Transmission | None, joints: Sequence[str], rate: float
+    driver: CanopenDriver,
+    transmission: Transmission | None,
+    joints: Sequence[str],
+    rate: float,
+    homeless: Sequence[str] = (),
 ) -> Iterator[tuple[tuple[str | int, ...], str]]:
     """What does not fit an arm of these joints: the place in the arm's file, and what is wrong.
 
@@ -209,7 +215,14 @@ def disagreements(
         transmission: the arm's.
         joints: names of the arm's joints; none where the file does not name them.
         rate: cycles per second.
+        homeless: those without a `home`.
     """
+    if driver.zero == "at_home" and homeless:
+        yield (
+            ("driver", "zero"),
+            "driver.zero: at_home needs every joint's home, the posture in which a person zeroes the arm; missing: "
+            + ", ".join(f"joints.{name}.home" for name in homeless),
+        )
     if driver.torque_deadline * rate < _LEAST_DEADLINE:
         yield (
             ("driver", "torque_deadline"),

@@ -154,7 +154,8 @@ def _disagreements(config: ArmConfig) -> Iterator[tuple[KeyPath, str]]:
                 yield ("driver", key), f"driver.{key}: {len(given)} values for {len(names)} joints"
         yield from simulation.disagreements(config.driver, names, config.control.rate)
     if isinstance(config.driver, CanopenDriver):
-        yield from canopen.disagreements(config.driver, config.transmission, names, config.control.rate)
+        homeless = [name for name in names if (joint := config.joints.get(name)) is None or joint.home is None]
+        yield from canopen.disagreements(config.driver, config.transmission, names, config.control.rate, homeless)
     yield from recording.disagreements(config.recording, config.transmission, names)
     yield from workspace.disagreements(config.geometry, config.workspace, config.supply, names)
     yield from design.disagreements(config.design, names)

@@ -40,12 +40,16 @@ class Rows:
         H_b: base regressor, shape (joints, base, samples).
         torque: [N m or N], shape (samples, joints).
         keep: which of them an estimate is fitted to, shape (samples, joints).
+        position: smoothed [rad or m], shape (samples, joints).
+        velocity: smoothed [rad/s or m/s], shape (samples, joints).
     """
 
     time: Array
     H_b: Array
     torque: Array
     keep: NDArray[np.bool_]
+    position: Array
+    velocity: Array
 
 
 RowWeights = Callable[[Rows], Array]
@@ -163,7 +167,7 @@ def equation_rows(recording: Recording, model: ArmModel, base: BaseParameters) -
             reuse = H if H is not None and H.shape[2] >= len(part.time) else None
             regressor = _regressor(part, model, base, reuse)
             H = regressor if reuse is None else H
-            yield Rows(part.time, regressor, part.torque, part.keep)
+            yield Rows(part.time, regressor, part.torque, part.keep, part.position, part.velocity)
 
 
 def _regressor(motion: Motion, model: ArmModel, base: BaseParameters, out: Array | None = None) -> Array:
@@ -196,7 +200,8 @@ def _filtered_rows(recording: Recording, model: ArmModel, base: BaseParameters, 
         for joint, support in enumerate(supports(model.chain, model.layout, base.base)):
             filtered[joint, support] = scipy.signal.sosfiltfilt(sos, H[joint, support], axis=-1)[:, inner]
         torque = scipy.signal.sosfiltfilt(sos, motion.torque, axis=0)
-        yield Rows(motion.time[inner], filtered, torque[inner], motion.keep[inner])
+        motion = motion[inner]
+        yield Rows(motion.time, filtered, torque[inner], motion.keep, motion.position, motion.velocity)
 
 
 def _bounded(blocks: list[Information]) -> tuple[Information, ...]:

@@ -72,17 +72,24 @@ def base_parameters(chain: Chain, layout: Layout) -> BaseParameters:
     if "stribeck" in layout.terms:
         # Also at the speeds where this term differs from Coulomb friction.
         states[1, ::2] *= np.array(layout.stribeck_velocity) / np.pi
-    return _grouped(joint_regressor(chain, layout, *states).transpose(0, 2, 1).reshape(-1, layout.size), layout)
+    H = joint_regressor(chain, layout, *states).transpose(0, 2, 1).reshape(-1, layout.size)
+    return grouping(H, layout.names, layout.units)
 
 
-def _grouped(H: Array, layout: Layout) -> BaseParameters:
-    """The grouping that a regressor at enough states shows."""
+def grouping(H: Array, names: tuple[str, ...], units: tuple[str, ...]) -> BaseParameters:
+    """The grouping of parameters whose effects are the columns of a matrix.
+
+    Args:
+        H: a regressor at enough states, or K itself for some of its columns, shape (rows, names).
+        names: of the parameters.
+        units: of the parameters.
+    """
     base, K_d = _first_independent(H)
-    K = np.zeros((len(base), layout.size))
+    K = np.zeros((len(base), len(names)))
     K[np.arange(len(base)), base] = 1.0
-    dependent = np.setdiff1d(np.arange(layout.size), base)
+    dependent = np.setdiff1d(np.arange(len(names)), base)
     K[:, dependent] = K_d
-    return BaseParameters(layout.names, K, base, tuple(layout.units[column] for column in base))
+    return BaseParameters(names, K, base, tuple(units[column] for column in base))
 
 
 def static_base_parameters(chain: Chain, layout: Layout) -> BaseParameters:
@@ -94,7 +101,7 @@ def static_base_parameters(chain: Chain, layout: Layout) -> BaseParameters:
     H = joint_regressor(chain, layout, position, still, still)
     terms = [int(column) for term in layout.terms if term != "drive_inertia" for column in layout.term_columns(term)]
     H[:, terms] = joint_regressor(chain, layout, position, velocity, still, terms)
-    return _grouped(H.transpose(0, 2, 1).reshape(-1, layout.size), layout)
+    return grouping(H.transpose(0, 2, 1).reshape(-1, layout.size), layout.names, layout.units)
 
 
 def _first_independent(H: Array) -> tuple[NDArray[np.intp], Array]:

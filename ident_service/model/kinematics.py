@@ -1,4 +1,4 @@
-"""Where the links are: origins of all joint and link frames in the base frame, for many postures at once."""
+"""Where the links are: poses and origins of joint and link frames in the base frame, for many postures at once."""
 
 from __future__ import annotations
 
@@ -17,14 +17,38 @@ def frame_origins(chain: Chain, position: Array) -> Array:
     Returns:
         [m], shape (postures, 1 + 2 joints, 3): the base, then of every joint its own frame's and its link frame's.
     """
+    origins = np.zeros((len(position), 1 + 2 * chain.joints, 3))
+    for k, (R, p) in enumerate(_joint_poses(chain, position)):
+        origins[:, 1 + 2 * k] = p
+        origins[:, 2 + 2 * k] = p + R @ chain.link_translation[k]
+    return origins
+
+
+def link_poses(chain: Chain, position: Array) -> tuple[Array, Array]:
+    """Where every link frame is and how it is turned.
+
+    Args:
+        chain: the mechanism.
+        position: [rad or m], shape (postures, joints).
+
+    Returns:
+        Link frame to base frame, shape (postures, joints, 3, 3), and its origin in the base frame [m], shape
+        (postures, joints, 3).
+    """
+    poses = _joint_poses(chain, position)
+    turns = [R @ chain.link_rotation[k] for k, (R, _) in enumerate(poses)]
+    places = [p + R @ chain.link_translation[k] for k, (R, p) in enumerate(poses)]
+    return np.stack(turns, axis=1), np.stack(places, axis=1)
+
+
+def _joint_poses(chain: Chain, position: Array) -> list[tuple[Array, Array]]:
+    """Per joint, its frame to the base frame, shape (postures, 3, 3), and its origin [m], shape (postures, 3)."""
     postures = len(position)
-    origins = np.zeros((postures, 1 + 2 * chain.joints, 3))
-    turns: list[Array] = []
-    places: list[Array] = []
+    poses: list[tuple[Array, Array]] = []
     for k in range(chain.joints):
         parent = chain.parents[k]
-        R = np.broadcast_to(np.eye(3), (postures, 3, 3)) if parent == WORLD else turns[parent]
-        p = np.zeros((postures, 3)) if parent == WORLD else places[parent]
+        still = (np.broadcast_to(np.eye(3), (postures, 3, 3)), np.zeros((postures, 3)))
+        R, p = still if parent == WORLD else poses[parent]
         p = p + R @ chain.translation[k]
         R = R @ chain.rotation[k]
         axis = chain.axes[k]
@@ -34,11 +58,8 @@ def frame_origins(chain: Chain, position: Array) -> Array:
             R = R @ (np.eye(3) + sine * K + (1.0 - cosine) * (K @ K))
         else:
             p = p + position[:, k, None] * (R @ axis)
-        turns.append(np.asarray(R))
-        places.append(p)
-        origins[:, 1 + 2 * k] = p
-        origins[:, 2 + 2 * k] = p + R @ chain.link_translation[k]
-    return origins
+        poses.append((np.asarray(R), p))
+    return poses
 
 
 def branches(chain: Chain) -> tuple[tuple[int, ...], ...]:

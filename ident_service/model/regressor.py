@@ -27,11 +27,9 @@ from ident_service.errors import ModelError
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.layout import INERTIAL, Layout
 from ident_service.model.tape import Program, Symbol, Tape, Value
+from ident_service.model.vectors import ZERO, Rotation, Vector, add, constant, cross, dot, rotate, scaled, turned
 
-_Vector = list[Value]
-_Rotation = list[list[Value]]
-_Screw = tuple[_Vector, _Vector]
-_ZERO: _Vector = [0.0, 0.0, 0.0]
+_Screw = tuple[Vector, Vector]
 _ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
@@ -139,7 +137,7 @@ def _joint_terms(
     """Drive inertia and friction (`layout.py`): each drive's own columns, in the rows of the joints it moves."""
     entries: dict[tuple[int, int], Value] = {}
     for drive in range(chain.joints):
-        share = _constant(chain.coupling[drive])
+        share = constant(chain.coupling[drive])
         rate = sum((c * x for c, x in zip(share, dq, strict=True)), 0.0)
         if not isinstance(rate, Symbol):
             raise ModelError(f"drive {drive + 1} moves no joint")
@@ -169,50 +167,48 @@ class _Forward:
 
     def __init__(self, tape: Tape, chain: Chain, q: list[Symbol], dq: Sequence[Value], ddq: Sequence[Value]) -> None:
         self.screws: list[dict[int, _Screw]] = []
-        self.motion: list[tuple[_Vector, _Vector, _Vector]] = []
-        base: _Vector = [-float(g) for g in chain.gravity]
-        in_joint: list[tuple[_Vector, _Vector, _Vector]] = []
+        self.motion: list[tuple[Vector, Vector, Vector]] = []
+        base: Vector = [-float(g) for g in chain.gravity]
+        in_joint: list[tuple[Vector, Vector, Vector]] = []
         joint_screws: list[dict[int, _Screw]] = []
         for k in range(chain.joints):
             parent = chain.parents[k]
-            w, e, a = (_ZERO, _ZERO, base) if parent == WORLD else in_joint[parent]
-            axis = _constant(chain.axes[k])
-            arm = _constant(chain.translation[k])
+            w, e, a = (ZERO, ZERO, base) if parent == WORLD else in_joint[parent]
+            axis = constant(chain.axes[k])
+            arm = constant(chain.translation[k])
             if chain.revolute[k]:
-                rotation = _turned(chain.rotation[k], chain.axes[k], tape.apply("cos", q[k]), tape.apply("sin", q[k]))
+                rotation = turned(chain.rotation[k], chain.axes[k], tape.apply("cos", q[k]), tape.apply("sin", q[k]))
             else:
-                rotation = [_constant(row) for row in chain.rotation[k].T]
-                arm = _add(arm, _scaled(_constant(chain.rotation[k] @ chain.axes[k]), q[k]))
+                rotation = [constant(row) for row in chain.rotation[k].T]
+                arm = add(arm, scaled(constant(chain.rotation[k] @ chain.axes[k]), q[k]))
             # Carried along by the parent to the joint frame's origin, then everything in the joint frame.
-            a = _rotate(rotation, _add(a, _add(_cross(e, arm), _cross(w, _cross(w, arm)))))
+            a = rotate(rotation, add(a, add(cross(e, arm), cross(w, cross(w, arm)))))
             screws = _carried({} if parent == WORLD else joint_screws[parent], arm, rotation)
-            w, e = _rotate(rotation, w), _rotate(rotation, e)
-            along, rate = _scaled(axis, ddq[k]), _scaled(axis, dq[k])
+            w, e = rotate(rotation, w), rotate(rotation, e)
+            along, rate = scaled(axis, ddq[k]), scaled(axis, dq[k])
             if chain.revolute[k]:
-                e = _add(_add(e, along), _cross(w, rate))
-                w = _add(w, rate)
-                screws[k] = (axis, _ZERO)
+                e = add(add(e, along), cross(w, rate))
+                w = add(w, rate)
+                screws[k] = (axis, ZERO)
             else:
-                a = _add(_add(a, along), _scaled(_cross(w, rate), 2.0))
-                screws[k] = (_ZERO, axis)
+                a = add(add(a, along), scaled(cross(w, rate), 2.0))
+                screws[k] = (ZERO, axis)
             in_joint.append((w, e, a))
             joint_screws.append(screws)
             self._to_link(chain, k, (w, e, a), screws)
 
-    def _to_link(
-        self, chain: Chain, k: int, motion: tuple[_Vector, _Vector, _Vector], screws: dict[int, _Screw]
-    ) -> None:
+    def _to_link(self, chain: Chain, k: int, motion: tuple[Vector, Vector, Vector], screws: dict[int, _Screw]) -> None:
         w, e, a = motion
-        arm = _constant(chain.link_translation[k])
-        rotation = [_constant(row) for row in chain.link_rotation[k].T]
-        a = _add(a, _add(_cross(e, arm), _cross(w, _cross(w, arm))))
-        self.motion.append((_rotate(rotation, w), _rotate(rotation, e), _rotate(rotation, a)))
+        arm = constant(chain.link_translation[k])
+        rotation = [constant(row) for row in chain.link_rotation[k].T]
+        a = add(a, add(cross(e, arm), cross(w, cross(w, arm))))
+        self.motion.append((rotate(rotation, w), rotate(rotation, e), rotate(rotation, a)))
         self.screws.append(_carried(screws, arm, rotation))
 
 
-def _carried(screws: dict[int, _Screw], arm: _Vector, rotation: _Rotation) -> dict[int, _Screw]:
+def _carried(screws: dict[int, _Screw], arm: Vector, rotation: Rotation) -> dict[int, _Screw]:
     """The same screws seen from a frame whose origin is `arm` further and which is turned by `rotation`."""
-    return {i: (_rotate(rotation, u), _rotate(rotation, _add(v, _cross(u, arm)))) for i, (u, v) in screws.items()}
+    return {i: (rotate(rotation, u), rotate(rotation, add(v, cross(u, arm)))) for i, (u, v) in screws.items()}
 
 
 def _link_entries(states: _Forward, link: int) -> dict[tuple[int, int], Value]:
@@ -228,59 +224,25 @@ def _link_entries(states: _Forward, link: int) -> dict[tuple[int, int], Value]:
     ]
     moments = _inertia_columns(W, e)
     for joint, (u, v) in states.screws[link].items():
-        lever = _cross(a, u)
+        lever = cross(a, u)
         for axis in range(3):
-            entries[joint, 6 + axis] = _dot(v, [spin[i][axis] for i in range(3)]) + lever[axis]
+            entries[joint, 6 + axis] = dot(v, [spin[i][axis] for i in range(3)]) + lever[axis]
         for parameter in range(6):
-            entries[joint, parameter] = _dot(u, moments[parameter])
-        entries[joint, len(INERTIAL) - 1] = _dot(v, a)
+            entries[joint, parameter] = dot(u, moments[parameter])
+        entries[joint, len(INERTIAL) - 1] = dot(v, a)
     return entries
 
 
-def _inertia_columns(W: list[list[Value]], e: _Vector) -> list[_Vector]:
+def _inertia_columns(W: list[list[Value]], e: Vector) -> list[Vector]:
     """Per entry of L (eq. 13), the moment `L e + w x (L w)` of a unit entry; W is w w^T."""
-    columns: list[_Vector] = []
+    columns: list[Vector] = []
     for i, j in _ENTRIES:
         # L w has w_j at i and w_i at j; w x (L w) multiplies them with w again, which are entries of W.
-        product: list[_Vector] = [[0.0, 0.0, 0.0] for _ in range(3)]  # rows: component of L w, columns: times w_c
-        along: _Vector = [0.0, 0.0, 0.0]
+        product: list[Vector] = [[0.0, 0.0, 0.0] for _ in range(3)]  # rows: component of L w, columns: times w_c
+        along: Vector = [0.0, 0.0, 0.0]
         along[i], product[i] = e[j], list(W[j])
         if i != j:
             along[j], product[j] = e[i], list(W[i])
-        across: _Vector = [product[2][1] - product[1][2], product[0][2] - product[2][0], product[1][0] - product[0][1]]
-        columns.append(_add(along, across))
+        across: Vector = [product[2][1] - product[1][2], product[0][2] - product[2][0], product[1][0] - product[0][1]]
+        columns.append(add(along, across))
     return columns
-
-
-def _constant(values: Array) -> _Vector:
-    return [float(value) for value in values]
-
-
-def _turned(placement: Array, axis: Array, c: Symbol, s: Symbol) -> _Rotation:
-    """Rows of the rotation from the parent's frame into the turned joint frame (Rodrigues' formula, transposed)."""
-    x, y, z = (float(component) for component in axis)
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    still, sine, cosine = placement @ (np.eye(3) + K @ K), placement @ K, -(placement @ (K @ K))
-    return [
-        [float(still[j, i]) + (float(sine[j, i]) * s + float(cosine[j, i]) * c) for j in range(3)] for i in range(3)
-    ]
-
-
-def _dot(a: _Vector, b: _Vector) -> Value:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _rotate(rotation: _Rotation, vector: _Vector) -> _Vector:
-    return [_dot(row, vector) for row in rotation]
-
-
-def _scaled(vector: _Vector, factor: Value) -> _Vector:
-    return [component * factor for component in vector]
-
-
-def _cross(a: _Vector, b: _Vector) -> _Vector:
-    return [a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))]
-
-
-def _add(a: _Vector, b: _Vector) -> _Vector:
-    return [a[i] + b[i] for i in range(3)]

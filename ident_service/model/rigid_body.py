@@ -36,18 +36,32 @@ def read_urdf(file: TextFile, gravity: tuple[float, float, float]) -> tuple[Chai
     Raises:
         ModelError: not a URDF, entities or includes, or a joint that is neither revolute, continuous nor prismatic.
     """
-    _refuse_foreign(file, "URDF")
-    return _read(file, gravity, "URDF", lambda: pin.buildModelFromXML(file.text))
+    return _chain(urdf_model(file), gravity, file.name)
 
 
 def read_mjcf(file: TextFile, gravity: tuple[float, float, float]) -> tuple[Chain, Array]:
     """As `read_urdf`, for an MJCF file of hinge and slide joints."""
+    return _chain(mjcf_model(file), gravity, file.name)
+
+
+def urdf_model(file: TextFile) -> pin.Model:
+    """A URDF as pinocchio reads it.
+
+    Raises:
+        ModelError: not a URDF, or entities or includes in it.
+    """
+    _refuse_foreign(file, "URDF")
+    return _built(file, "URDF", lambda: pin.buildModelFromXML(file.text))
+
+
+def mjcf_model(file: TextFile) -> pin.Model:
+    """As `urdf_model`, for an MJCF file."""
     _refuse_foreign(file, "MJCF")
     with tempfile.TemporaryDirectory() as folder:
         # Pinocchio reads MJCF from a path only; alone in a folder, the file cannot reach any other.
         path = Path(folder) / "arm.xml"
         path.write_text(file.text, encoding="utf-8")
-        return _read(file, gravity, "MJCF", lambda: pin.buildModelFromMJCF(str(path)))
+        return _built(file, "MJCF", lambda: pin.buildModelFromMJCF(str(path)))
 
 
 def _refuse_foreign(file: TextFile, kind: str) -> None:
@@ -55,17 +69,15 @@ def _refuse_foreign(file: TextFile, kind: str) -> None:
         raise ModelError(f"{file.name}: {found.group(0)!r} is refused in a {kind}; give one self-contained file")
 
 
-def _read(
-    file: TextFile, gravity: tuple[float, float, float], kind: str, build: Callable[[], pin.Model]
-) -> tuple[Chain, Array]:
+def _built(file: TextFile, kind: str, build: Callable[[], pin.Model]) -> pin.Model:
     try:
-        model = build()
+        return build()
     except Exception as error:  # noqa: BLE001  # pinocchio raises whatever its XML libraries raise
         raise ModelError(f"{file.name}: not a {kind} that can be read: {error}") from None
-    return _chain(model, gravity, file.name)
 
 
 def _chain(model: pin.Model, gravity: tuple[float, float, float], name: str) -> tuple[Chain, Array]:
+    """Chain and link inertias of a model; `name` is the file's, for errors."""
     n = model.njoints - 1
     if n == 0:
         raise ModelError(f"{name}: no movable joint")

@@ -1,7 +1,7 @@
 """A chain with parameters as URDF: link frames are joint frames, inertias about centres of mass, no meshes.
 
-URDF has viscous damping and Coulomb friction per joint; drive inertia and torque offset have no place in it and stay
-in the parameter file.
+URDF has viscous damping and Coulomb friction per joint, written where a joint has a drive of its own and they are not
+negative; drive inertia and torque offset have no place in it and stay in the parameter file.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 from ident_service.config.schema import Joint
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array
+from ident_service.model.drives import joint_drives
 
 BASE_LINK = "base_link"
 
@@ -49,7 +50,7 @@ def urdf_text(model: ArmModel, delta: Array | None) -> str:
         ET.SubElement(joint, "parent", link=root if parent == WORLD else _link_name(model, parent))
         ET.SubElement(joint, "child", link=_link_name(model, k))
         ET.SubElement(
-            joint, "origin", xyz=_numbers(chain.translation[k]), rpy=_numbers(_roll_pitch_yaw(chain.rotation[k]))
+            joint, "origin", xyz=_numbers(chain.translation[k]), rpy=_numbers(roll_pitch_yaw(chain.rotation[k]))
         )
         ET.SubElement(joint, "axis", xyz=_numbers(chain.axes[k]))
         if bounded:
@@ -63,8 +64,9 @@ def urdf_text(model: ArmModel, delta: Array | None) -> str:
                 effort=repr(settings.torque or 0.0),
             )
         if delta is not None:
-            viscous, coulomb = (float(layout.term_values(term, delta)[k]) for term in ("viscous", "coulomb"))
-            ET.SubElement(joint, "dynamics", damping=repr(viscous), friction=repr(coulomb))
+            drives = joint_drives(chain, layout, delta)
+            damping, friction = (max(float(values[k]), 0.0) for values in (drives.damping, drives.friction))
+            ET.SubElement(joint, "dynamics", damping=repr(damping), friction=repr(friction))
     ET.indent(robot)
     return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
 
@@ -98,7 +100,7 @@ def _numbers(values: Array) -> str:
     return " ".join(repr(float(value) + 0.0) for value in values)
 
 
-def _roll_pitch_yaw(rotation: Array) -> Array:
+def roll_pitch_yaw(rotation: Array) -> Array:
     """URDF's fixed-axis angles [rad]: R = Rz(yaw) Ry(pitch) Rx(roll); exact near gimbal lock too."""
     yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
     # Roll and pitch of what is left after that very yaw, so that where it is arbitrary, they make up for it.

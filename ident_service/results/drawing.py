@@ -92,20 +92,23 @@ class Canvas:
         where = f'x="{left}" y="{top}" width="{width}" height="{height}" viewBox="{left} {top} {width} {height}"'
         self._parts.append(f"<svg {where}>")
 
-    def svg(self, title: str, description: str) -> str:
+    def svg(self, title: str, description: str, *, inline: bool = False) -> str:
         """The whole drawing.
 
         Args:
             title: what a screen reader says first.
             description: what the drawing shows, for who cannot see it.
+            inline: for a page that has the style sheet once and knows what an SVG is.
         """
+        space = "" if inline else ' xmlns="http://www.w3.org/2000/svg"'
         head = (
-            f'<svg xmlns="http://www.w3.org/2000/svg" class="ident-figure" role="img" width="{self._width}" '
+            f'<svg{space} class="ident-figure" role="img" width="{self._width}" '
             f'height="{self._height}" viewBox="0 0 {self._width} {self._height}" style="max-width:100%;height:auto">'
         )
         about = f"<title>{plain(title)}</title><desc>{plain(description)}</desc>"
         ground = '<rect class="ground" width="100%" height="100%"/>'
-        return "\n".join([head + about + style() + ground, *self._parts, "</svg>"]) + "\n"
+        sheet = "" if inline else style()
+        return "\n".join([head + about + sheet + ground, *self._parts, "</svg>"]) + "\n"
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,18 @@ _LIGHT = {
     "edge": "stroke:#6e7781",
     "rod": "stroke:#8c959f",
     "halo": "stroke:#ffffff",
+    "measured": "fill:#0072b2;stroke:#0072b2",
+    "predicted": "fill:#d55e00;stroke:#d55e00",
+    "residual": "fill:#007a5a;stroke:#007a5a",
+    "first": "stroke:#0072b2",
+    "second": "stroke:#d55e00",
+    "cloud": "fill:#0072b2",
+    "good": "fill:#0072b2",
+    "doubt": "fill:#e69f00",
+    "bad": "fill:#d55e00",
+    "plus": "fill:#0072b2",
+    "minus": "fill:#d55e00",
+    "body": "fill:#56b4e9;stroke:#0072b2",
 }
 _DARK = {
     "ground": "fill:#0d1117",
@@ -50,6 +62,18 @@ _DARK = {
     "edge": "stroke:#9da7b3",
     "rod": "stroke:#8c959f",
     "halo": "stroke:#0d1117",
+    "measured": "fill:#56b4e9;stroke:#56b4e9",
+    "predicted": "fill:#ff9440;stroke:#ff9440",
+    "residual": "fill:#2fc79b;stroke:#2fc79b",
+    "first": "stroke:#56b4e9",
+    "second": "stroke:#ff9440",
+    "cloud": "fill:#56b4e9",
+    "good": "fill:#56b4e9",
+    "doubt": "fill:#f0e442",
+    "bad": "fill:#ff9440",
+    "plus": "fill:#56b4e9",
+    "minus": "fill:#ff9440",
+    "body": "fill:#56b4e9;stroke:#9acdf2",
 }
 # From hardly visible on the ground to clearly visible, in either mode.
 _LIGHT_STEPS = ("#c6d9ea", "#b0cce4", "#95bbdb", "#76a9d0", "#538fbf", "#3475aa", "#1b5c91", "#0a4475")
@@ -73,11 +97,23 @@ _SHAPES = {
     "halo": "paint-order:stroke;stroke-width:3;stroke-linejoin:round",
     "rule": "stroke-width:1.6;fill:none",
     "strong": "font-weight:bold",
+    "measured": "stroke-width:3;stroke-linejoin:round;fill-opacity:.6;stroke-opacity:.6",
+    "predicted": "stroke-width:.8;stroke-linejoin:round;fill-opacity:.8",
+    "residual": "stroke-width:1;stroke-linejoin:round",
+    "first": "stroke-width:1.4;fill:none;stroke-linejoin:round",
+    "second": "stroke-width:1.4;fill:none;stroke-linejoin:round;stroke-dasharray:6 2",
+    "cloud": "fill-opacity:.45",
+    "body": "fill-opacity:.3;stroke-width:1.2",
 }
 
 
 def style() -> str:
     """The sheet as an SVG element; who prefers dark gets it."""
+    return f"<style>{sheet()}</style>"
+
+
+def sheet() -> str:
+    """The sheet as CSS, for a page that holds many drawings."""
 
     def rules(rows: Iterable[tuple[str, str]]) -> str:
         # Everything below one class: a style inside an SVG would otherwise reach the page around it.
@@ -88,4 +124,4 @@ def style() -> str:
 
     light = rules([*_SHAPES.items(), *_LIGHT.items(), *steps(_LIGHT_STEPS)])
     dark = rules([*_DARK.items(), *steps(_DARK_STEPS)])
-    return f"<style>{light}@media (prefers-color-scheme:dark){{{dark}}}</style>"
+    return f"{light}@media (prefers-color-scheme:dark){{{dark}}}"

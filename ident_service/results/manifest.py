@@ -80,9 +80,16 @@ def file_sha256(path: Path) -> str:
 
 def write_manifest(folder: Path) -> None:
     """Name and SHA-256 of every file in the folder, for verification on another machine."""
-    files = {}
-    for path in sorted(folder.iterdir()):
-        if path.is_file() and path.name != MANIFEST and not path.name.startswith("."):
-            files[path.name] = file_sha256(path)
-    manifest = {"format": "ident-run", "version": 1, "software": f"ident-service {__version__}", "files": files}
+    manifest = {
+        "format": "ident-run",
+        "version": 1,
+        "software": f"ident-service {__version__}",
+        "files": hashes(folder),
+    }
     write_atomically(folder / MANIFEST, json.dumps(manifest, indent=1) + "\n")
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    """Name to SHA-256 of every file in a folder but its manifest and hidden ones."""
+    paths = [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")]
+    return {path.name: file_sha256(path) for path in paths if path.name != MANIFEST}

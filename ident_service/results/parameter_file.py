@@ -9,12 +9,9 @@ import json
 import subprocess
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import cache
-from importlib.resources import files
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
-import jsonschema
 import numpy as np
 
 from ident_service import __version__
@@ -28,6 +25,9 @@ from ident_service.model.chain import Array
 from ident_service.model.expressions import parse_expression
 from ident_service.model.layout import INERTIAL, TERM_SYMBOLS
 from ident_service.results.files import write_atomically
+from ident_service.results.information_document import information_document
+from ident_service.results.schemas import require_schema
+from ident_service.results.strict_json import strict_json
 
 MAX_BYTES = 64 * 2**20
 
@@ -49,12 +49,6 @@ class ParameterFile:
     content: dict[str, Any]
 
 
-@cache
-def _validator() -> jsonschema.Draft202012Validator:
-    schema = json.loads(files("ident_service.results").joinpath("parameters.schema.json").read_text(encoding="utf-8"))
-    return jsonschema.Draft202012Validator(schema)
-
-
 def read_parameters(path: Path, names: tuple[str, ...] | None = None) -> ParameterFile:
     """Read a parameter file.
 
@@ -72,12 +66,10 @@ def read_parameters(path: Path, names: tuple[str, ...] | None = None) -> Paramet
     if path.stat().st_size > MAX_BYTES:
         raise ParameterError(f"{path}: larger than {MAX_BYTES} bytes")
     try:
-        content = json.loads(
-            path.read_text(encoding="utf-8"), parse_constant=_refuse, parse_float=_finite, parse_int=_finite_whole
-        )
+        content = strict_json(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise ParameterError(f"{path}: not JSON: {error}") from None
-    _validate(content, str(path))
+    require_schema(content, "parameters", path, "a parameter file")
     table = content["base_parameters"]
     expressions, values = tuple(table["expressions"]), np.array(table["values"], dtype=float)
     for key, column in table.items():
@@ -118,6 +110,7 @@ def parameters_document(estimate: Estimate) -> dict[str, Any]:
             "expressions": list(base.expressions),
             "units": list(base.units),
             "values": estimate.beta.tolist(),
+            "unconstrained_values": estimate.fit.beta.tolist(),
             "standard_deviations": _perhaps(estimate.standard_deviations),
             "white_standard_deviations": _perhaps(estimate.white_standard_deviations),
             "covariance": [_perhaps(row) for row in estimate.covariance],
@@ -140,9 +133,11 @@ def parameters_document(estimate: Estimate) -> dict[str, Any]:
         "torque_scales": estimate.prepared.torque_scales.tolist(),
         "fit": {
             "samples": estimate.samples,
+            "blocks": len(estimate.fitted.blocks),
             "condition_number": estimate.fit.condition_number if np.isfinite(estimate.fit.condition_number) else None,
             **_errors(own.identification, model.chain.names),
         },
+        "information": information_document(estimate.prepared.equations.total),
         "validation": [
             {"recording": s.recording, "sha256": s.sha256, **_errors(s.error, model.chain.names)}
             for s in own.validation
@@ -164,31 +159,8 @@ def write_parameters(path: Path, document: dict[str, Any]) -> None:
         ParameterError: the document does not fit the schema.
         UsageError: the file cannot be written.
     """
-    _validate(document, str(path))
+    require_schema(document, "parameters", path, "a parameter file")
     write_atomically(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
-
-
-def _validate(content: Any, where: str) -> None:
-    mistakes = sorted(_validator().iter_errors(content), key=lambda mistake: mistake.json_path)
-    if mistakes:
-        listed = "; ".join(f"{mistake.json_path}: {mistake.message[:200]}" for mistake in mistakes[:10])
-        raise ParameterError(f"{where}: not a parameter file: {listed}")
-
-
-def _refuse(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is not a number that JSON knows")
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    if not np.isfinite(value):
-        raise ValueError(f"{text[:40]} is too large for a double")
-    return value
-
-
-def _finite_whole(text: str) -> int:
-    _finite(text)
-    return int(text)
 
 
 def _names_in(expressions: tuple[str, ...]) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from drivers.arm import Arm
 from drivers.clock import Clock
+from ident_service.config.limits import motion_limits
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import ArmError, UsageError
 from ident_service.estimation.equations import equations
@@ -21,12 +22,16 @@ from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.urdf import urdf_text
 from ident_service.motion.controls import StopWhen
 from ident_service.motion.factory import make_arm
+from ident_service.motion.plans import Excite
 from ident_service.motion.run import RunReport, run
 from ident_service.motion.states import State
+from ident_service.record.kept import KeptRecording
 from ident_service.record.open import open_recording
 from ident_service.record.recorder_process import RecorderProcess
 from ident_service.results.files import appearing_folder, write_atomically
+from ident_service.results.report_files import write_report
 from ident_service.results.run_folder import write_manifest, write_results
+from ident_service.service.identification import recording_quality
 from ident_service.service.score import Score, score, true_parameters
 from sim_backend.arm import SimulatedArm, Truth
 from sim_backend.remote_arm import RemoteArm
@@ -90,6 +95,17 @@ def record_motion(
         return run(arm, model, motion, recorder, StopWhen(stop_requested))
 
 
+def require_clear_from_home(model: ArmModel, motion: Excitation) -> None:
+    """See whether an arm that stands at home may be led along a motion and back.
+
+    Raises:
+        MotionRefused: it would leave limits, or come too near to something.
+    """
+    limits, plan = motion_limits(model.config), Excite(motion)
+    plan.require_possible(model, limits)
+    plan.legs(model, limits.home, limits)
+
+
 def simulate(
     config: ArmConfig,
     folder: Path,
@@ -124,6 +140,8 @@ def simulate(
         raise UsageError(f"{config.name} has no simulated driver; use a description that has one")
     first = excitation(model, "identification") if motion is None else replace(motion, name="identification")
     motions = [first, excitation(model, "validation")]
+    for planned in motions[1:]:  # the first is looked at when it begins; nothing shall have moved in vain
+        require_clear_from_home(model, planned)
     reports, observed = [], list[Truth]()
     with appearing_folder(folder) as staging:
         paths = [staging / f"{planned.name}.mcap" for planned in motions]
@@ -140,11 +158,14 @@ def simulate(
             reports.append(report)
             write_atomically(staging / f"{planned.name}.excitation.json", planned.to_json() + "\n")
         tell("identifying")
-        recordings = [open_recording(path, model.chain.names) for path in paths]
+        recordings = [KeptRecording(open_recording(path, model.chain.names)) for path in paths]
         estimate = identify(model, recordings[:1], recordings[1:], set_name=set_name)
         scored = score(estimate, truth, observed, equations(recordings[1], model, estimate.base))
         write_results(staging, estimate)
         write_atomically(staging / "score.json", json.dumps(score_document(scored), indent=1) + "\n")
+        seen = [(one.path.name, recording_quality(one, model).warnings()) for one in recordings]
+        warnings = [f"{name}: {line}" for name, lines in seen for line in lines]
+        write_report(staging, estimate, recordings[:1], recordings[1:], warnings)
         write_manifest(staging)
     return Commissioning(folder, estimate, (reports[0], reports[1]), scored)
 

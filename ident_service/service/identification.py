@@ -19,11 +19,13 @@ from ident_service.estimation.feasible.feasible_set import SetName
 from ident_service.estimation.identify import Estimate, identify
 from ident_service.estimation.proof.sdpa import bpfc_sdpa, bpft_sdpa, fbpe_sdpa
 from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.record.kept import KeptRecording
 from ident_service.record.open import open_recording
 from ident_service.record.part import TrimmedRecording
 from ident_service.record.quality import Quality, quality
 from ident_service.record.recording import Recording
 from ident_service.results.files import appearing_folder, write_atomically
+from ident_service.results.report_files import write_report
 from ident_service.results.run_folder import MANIFEST, write_manifest, write_results
 
 
@@ -94,9 +96,9 @@ def identify_files(request: Request, folder: Path, tell: Callable[[str], None] =
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"{folder}: is a file, not a folder")
     model = arm_model(_config(request))
-    recordings = [_open(path, model) for path in request.recordings]
-    validation = [_open(path, model) for path in request.validation]
-    found = [(recording, _quality(recording, model)) for recording in [*recordings, *validation]]
+    recordings = [open_for(path, model) for path in request.recordings]
+    validation = [open_for(path, model) for path in request.validation]
+    found = [(recording, recording_quality(recording, model)) for recording in [*recordings, *validation]]
     warnings = tuple(f"{recording.path}: {line}" for recording, seen in found for line in seen.warnings())
     estimate = identify(model, recordings, validation, method=request.method, set_name=request.set_name)
     more: dict[str, Any] = {"recording_quality": [_quality_document(recording, seen) for recording, seen in found]}
@@ -110,6 +112,7 @@ def identify_files(request: Request, folder: Path, tell: Callable[[str], None] =
         files = write_results(staging, estimate, more)
         if request.sdpa:
             files += _write_sdpa(staging, estimate)
+        files += write_report(staging, estimate, recordings, validation, warnings)
         write_manifest(staging)
     return Identified(estimate, (*files, MANIFEST), warnings)
 
@@ -132,16 +135,24 @@ def _config(request: Request) -> ArmConfig:
     return config.model_copy(update={"identification": options.model_copy(update=changes)})
 
 
-def _open(path: Path, model: ArmModel) -> Recording:
+def open_for(path: Path, model: ArmModel) -> Recording:
+    """A recording as its arm's description says it is to be read; FILE@2:1.5 leaves out 2 s and 1.5 s.
+
+    Raises:
+        UsageError: no such file.
+        RecordingError: it does not fit the arm.
+    """
     start, end = 0.0, 0.0
     if not path.exists() and (match := _TRIMMED.match(str(path))):
         path, start, end = Path(match["path"]), float(match["start"]), float(match["end"])
     form, gears = model.config.recording, model.config.transmission
-    recording = open_recording(path, model.chain.names, fmt=form, transmission=gears)
+    # Quality, friction, equations and evidence each read it.
+    recording = KeptRecording(open_recording(path, model.chain.names, fmt=form, transmission=gears))
     return TrimmedRecording(recording, start, end) if start or end else recording
 
 
-def _quality(recording: Recording, model: ArmModel) -> Quality:
+def recording_quality(recording: Recording, model: ArmModel) -> Quality:
+    """What a recording is worth, held against the arm's torque limits."""
     joints = [model.config.joints.get(name) for name in model.chain.names]
     limits = np.array([np.nan if joint is None or joint.torque is None else joint.torque for joint in joints])
     return quality(recording, model.config.recording, limits)

@@ -85,10 +85,10 @@ def correct_file(
         file.values, file.base, conditions, _covariance(path, file) if metric == "covariance" else None
     )
     content = deepcopy(file.content)
-    for stale in ("fit", "validation"):
+    for stale in ("fit", "information", "validation"):
         content.pop(stale, None)
     table = content["base_parameters"]
-    for stale in ("standard_deviations", "white_standard_deviations", "covariance", "verdicts"):
+    for stale in ("unconstrained_values", "standard_deviations", "white_standard_deviations", "covariance", "verdicts"):
         table.pop(stale, None)
     table["values"] = result.beta.tolist()
     content["method"] = "correction"

@@ -15,7 +15,7 @@ from drivers.arm import Arm
 from drivers.status import TRIPPED, AxisStatus
 from ident_service.config.limits import MotionLimits, motion_limits
 from ident_service.config.schema import ArmConfig
-from ident_service.errors import DriverError, MotionRefused
+from ident_service.errors import DriverError, MotionRefused, PositionUnknown
 from ident_service.motion.control_file import mover
 from ident_service.motion.factory import make_arm
 from ident_service.motion.fault_file import Remembered
@@ -39,6 +39,7 @@ class Recovery:
         mover: process that moves the arm, or None.
         seen: at the arm, after a reset if there was one; None where it could not be looked at.
         unreachable: why not, or empty.
+        zero_lost: why the arm does not know where it stands, or empty; nothing else is then seen of it.
         reset: axes whose drives were reset just now.
         tripped: what drives still say, by axis.
         outside: joints outside their position limits, in words.
@@ -51,6 +52,7 @@ class Recovery:
     mover: int | None
     seen: Watched | None
     unreachable: str
+    zero_lost: str
     reset: tuple[str, ...]
     tripped: dict[str, str]
     outside: tuple[str, ...]
@@ -79,9 +81,9 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None) -> Recovery:
             f"`ident stop {config.name}` brings it to rest; process {pid} moves it.",
             f"`ident recover {config.name}` again, when it stands.",
         )
-        return Recovery(config.name, faults, pid, None, "", (), {}, (), stop_first, False)
+        return Recovery(config.name, faults, pid, None, "", "", (), {}, (), stop_first, False)
     arm = make_arm(config) if arm is None else arm
-    seen, unreachable, refusal = None, "", ""
+    seen, unreachable, zero_lost, refusal = None, "", "", ""
     reset: tuple[str, ...] = ()
     try:
         seen = watch(arm, LOOK)
@@ -89,14 +91,16 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None) -> Recovery:
             refusal = _reset(arm)
             seen = watch(arm, LOOK)
             reset = tuple(name for name in latched if name not in _tripped(seen))
+    except PositionUnknown as error:
+        seen, zero_lost = None, str(error)
     except DriverError as error:
         unreachable = str(error)
     tripped = {} if seen is None else _tripped(seen)
     out = [] if seen is None else outside(seen.position, limits, seen.joint_names)
-    before = _before(config.name, faults, seen, unreachable, tripped, refusal, limits)
+    before = _before(config.name, faults, seen, unreachable, zero_lost, tripped, refusal, limits)
     usable = not before
     steps = (*before, _at_last(config.name, seen, limits, bool(out)))
-    return Recovery(config.name, faults, None, seen, unreachable, reset, tripped, tuple(out), steps, usable)
+    return Recovery(config.name, faults, None, seen, unreachable, zero_lost, reset, tripped, tuple(out), steps, usable)
 
 
 def _tripped(seen: Watched) -> dict[str, str]:
@@ -126,6 +130,7 @@ def _before(
     faults: tuple[Remembered, ...],
     seen: Watched | None,
     unreachable: str,
+    zero_lost: str,
     tripped: dict[str, str],
     refusal: str,
     limits: MotionLimits,
@@ -134,6 +139,8 @@ def _before(
     steps = [f"`ident ack {name} {one.code}`, when you know why it came: {one.cause}." for one in faults]
     if unreachable:
         steps.append(f"Check power, cables, emergency stop, and that no other program has the arm: {unreachable}.")
+    if zero_lost:
+        steps.append(f"Zero it: {zero_lost}.")
     if seen is None:
         return [_SUPPORT, *steps, f"`ident recover {name}` again."]
     silent = [joint for joint, q in zip(seen.joint_names, seen.position, strict=True) if not np.isfinite(q)]

@@ -19,14 +19,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ident_service.errors import ArmError, ArmFault, DriverError, IdentError, MotionRefused, UsageError
+from ident_service.errors import (
+    ArmError,
+    ArmFault,
+    DriverError,
+    IdentError,
+    MotionRefused,
+    PositionUnknown,
+    UsageError,
+)
 from ident_service.motion.control_file import ControlFile
 from ident_service.motion.fault_file import CONTROLS, UNFINISHED, FaultFile
 
 _RENEW_SHARE = 0.25  # of the lease
 _LAST_WORDS = 30.0  # s for a process that was told to stop
 _KINDS: dict[str, type[IdentError]] = {
-    kind.__name__: kind for kind in (MotionRefused, DriverError, UsageError, ArmError)
+    kind.__name__: kind for kind in (MotionRefused, PositionUnknown, DriverError, UsageError, ArmError)
 }
 
 

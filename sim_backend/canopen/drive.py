@@ -336,6 +336,10 @@ class CanopenDrive:
 
     def _written(self, key: int) -> None:
         index = key >> 8
+        # Process data and the history of errors are no configuration (CiA 301, 7.5.2.21).
+        if index not in (0x1003, 0x1020) and not self.objects.entries[key].mappable:
+            self.objects.put(0x1020, 0, 1)
+            self.objects.put(0x1020, 0, 2)
         if index in _PDO_PARAMETERS or index == 0x1005:
             self._configure()
         elif index == 0x1016:

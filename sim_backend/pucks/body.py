@@ -16,6 +16,7 @@ from math import ceil
 import numpy as np
 
 from drivers.arm import Vector
+from ident_service.errors import DriverError
 from sim_backend.machine import Truth
 from sim_backend.plant import Plant
 from sim_backend.pucks.gears import Gears
@@ -108,6 +109,21 @@ class Body:
             self.plant.rest()
             self._seen = None
             self.supported = True
+
+    def lead(self, position: Vector, now_ns: int) -> None:
+        """Whoever holds the arm puts it somewhere else, at rest.
+
+        Args:
+            position: of the joints [rad or m], shape (joints,).
+            now_ns: when.
+
+        Raises:
+            DriverError: nobody holds it.
+        """
+        if not self.supported:
+            raise DriverError("nobody holds the arm: its drives have it, or it sinks")
+        self.advance(now_ns)
+        self.plant.place(position)
 
     def catch_up(self, now_ns: int) -> None:
         """Move the plant after a silence of more than a step, before what ends the silence has any effect."""

@@ -53,7 +53,7 @@ class LockStepArm:
         self.emulator = build_emulator(config, faults)
         assert isinstance(driver, CanopenDriver)  # noqa: S101 or there would be no emulator
         self.clock = VirtualClock() if clock is None else clock
-        self._wires = [Wire(bus.bitrate) for bus in driver.buses]
+        self._wires = [Wire(bus.bitrate, bus.data_bitrate) for bus in driver.buses]
         self._heard: list[deque[Frame]] = [deque() for _ in driver.buses]
         self._open: set[int] = set()
         self._now_ns = self.clock.now_ns()
@@ -86,7 +86,8 @@ class LockStepArm:
         """A frame of the host's; see `LockStepLink.send`."""
         self._run(self.clock.now_ns())
         self._require_bus(bus)
-        self._wires[bus].occupy(self._now_ns, len(frame.data))
+        frame = self._wires[bus].as_sent(frame)
+        self._wires[bus].occupy(self._now_ns, frame)
         self._carry(self.emulator.receive(bus, frame, self._now_ns))
 
     def receive(self, bus: int, deadline_ns: int) -> Frame | None:
@@ -141,7 +142,7 @@ class LockStepArm:
 
     def _deliver(self, bus: int, sent: Sent, now_ns: int) -> None:
         if bus in self._open:
-            self._heard[bus].append(sent.frame._replace(stamp_ns=now_ns))
+            self._heard[bus].append(self._wires[bus].as_sent(sent.frame)._replace(stamp_ns=now_ns))
         if sent.drive is not None:
             self._carry(self.emulator.receive(bus, sent.frame, now_ns, sent.drive))
 

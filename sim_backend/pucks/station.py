@@ -33,6 +33,7 @@ class Station:
             DriverError: an interface that cannot be had; none stays open then.
         """
         self._buses: list[can.BusABC] = []
+        self._fd = [bus.data_bitrate is not None for bus in buses]
         self._heard: queue.SimpleQueue[tuple[int, can.Message]] = queue.SimpleQueue()
         self._closing = False
         self.unsent = 0
@@ -75,6 +76,8 @@ class Station:
                         is_extended_id=frame.extended,
                         is_remote_frame=frame.remote,
                         is_error_frame=frame.error,
+                        is_fd=self._fd[number] and not frame.remote,
+                        bitrate_switch=self._fd[number] and not frame.remote,
                     )
                 )
             except (can.CanError, OSError):
@@ -116,8 +119,11 @@ class Station:
 
 
 def _opened(bus: CanBus) -> can.BusABC:
+    options: dict[str, Any] = dict(bus.options)
+    if bus.data_bitrate is not None:
+        options |= {"fd": True, "data_bitrate": bus.data_bitrate}
     name = _NAMES.get(bus.interface, bus.interface)
-    return can.Bus(interface=name, channel=bus.channel, bitrate=bus.bitrate, **bus.options)  # type: ignore[arg-type]
+    return can.Bus(interface=name, channel=bus.channel, bitrate=bus.bitrate, **options)
 
 
 def _frame(message: can.Message) -> Frame:
@@ -127,4 +133,5 @@ def _frame(message: can.Message) -> Frame:
         message.is_remote_frame,
         message.is_error_frame,
         message.is_extended_id,
+        fd=message.is_fd,
     )

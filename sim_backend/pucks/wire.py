@@ -1,7 +1,7 @@
 """An emulated bus in virtual time: one frame after another, the lowest identifier first, each for as long as it takes.
 
-A frame is as long as the standard says without stuff bits, 47 + 8 n bits with its space (FIELDBUS.md 2.1); remote
-frames have no data. Nodes have priority mailboxes: of what one drive wants to send, the
+A frame is as long as the standard says without stuff bits, with its space (`drivers/canopen/bits.py`), on a bus of CAN
+FD that of CAN FD; remote frames have no data. Nodes have priority mailboxes: of what one drive wants to send, the
 lowest identifier goes first, too.
 
 Boundary: order and times of what drives send to the host; what a frame does is `lock_step.py`.
@@ -9,29 +9,41 @@ Boundary: order and times of what drives send to the host; what a frame does is 
 
 from __future__ import annotations
 
+from drivers.canopen.bits import unstuffed
+from drivers.canopen.frame import Frame
 from sim_backend.pucks.injection import Sent
 
-_OVERHEAD_BITS = 47
+_CLASSIC = 8  # bytes of a classic frame, at most
 
 
 class Wire:
     """One bus."""
 
-    def __init__(self, bitrate: int) -> None:
-        """An idle bus of this bitrate [1/s]."""
-        self._bitrate = bitrate
+    def __init__(self, bitrate: int, data_bitrate: int | None = None) -> None:
+        """An idle bus of these bit rates [1/s]; None for one without CAN FD."""
+        self._rates, self.fd = (bitrate, data_bitrate), data_bitrate is not None
+        self._durations: dict[tuple[int, bool], int] = {}
         self._free_ns = 0
         self._waiting: list[tuple[int, int, Sent]] = []
         self._count = 0
         self._found: tuple[int, tuple[int, int, Sent]] | None = None  # who is next, while it is known
 
-    def duration_ns(self, size: int) -> int:
-        """How long a frame of this many bytes takes [ns]."""
-        return (_OVERHEAD_BITS + 8 * size) * 1_000_000_000 // self._bitrate
+    def as_sent(self, frame: Frame) -> Frame:
+        """A frame as it is on this bus."""
+        return frame._replace(fd=True) if self.fd and not (frame.remote or frame.error) else frame
 
-    def occupy(self, now_ns: int, size: int) -> None:
+    def duration_ns(self, frame: Frame) -> int:
+        """How long a frame takes [ns]."""
+        # A length that only CAN FD has takes its bits on any bus: tests send such frames, no controller does.
+        kind = len(frame.data), len(frame.data) > _CLASSIC or (self.fd and not (frame.remote or frame.error))
+        if (known := self._durations.get(kind)) is None:
+            bits, (bitrate, data_bitrate) = unstuffed(kind[0], fd=kind[1]), self._rates
+            known = self._durations[kind] = round(1e9 * bits.seconds(bitrate, data_bitrate or bitrate))
+        return known
+
+    def occupy(self, now_ns: int, frame: Frame) -> None:
         """A frame of the host's goes out as soon as the wire is free."""
-        self._free_ns = max(self._free_ns, now_ns) + self.duration_ns(size)
+        self._free_ns = max(self._free_ns, now_ns) + self.duration_ns(frame)
         self._found = None
 
     def put(self, sent: Sent) -> None:
@@ -63,5 +75,5 @@ class Wire:
         winner = min(
             (item for item in self._waiting if item[0] <= start), key=lambda item: (item[2].frame.identifier, item[1])
         )
-        self._found = start + self.duration_ns(len(winner[2].frame.data)), winner
+        self._found = start + self.duration_ns(winner[2].frame), winner
         return self._found

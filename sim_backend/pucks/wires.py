@@ -1,7 +1,8 @@
 """The drives' side of wires of our own (`ident_wire`), which this process hosts while the drives have power.
 
 Hosting them here saves a hop: the drives' frames reach the host in one packet, without a third process. A wire keeps
-the pace of its bit rate where the description says `options: {pace: true}`.
+the pace of its bit rates where the description says `options: {pace: true}`. Where it says `data_bitrate`, all data
+frames of drives are CAN FD's.
 
 Boundary: wires; nothing of drives.
 """
@@ -17,7 +18,6 @@ from drivers.canopen.frame import Frame
 from drivers.canopen.wire.host import LocalPort
 from drivers.canopen.wire.hub import Wire
 from ident_service.config.canopen import CanBus
-from ident_service.errors import DriverError
 
 INTERFACE = "ident_wire"
 
@@ -44,10 +44,8 @@ class Wires:
         self._heard: deque[tuple[int, Frame]] = deque()
         try:
             for bus in buses:
-                fd, pace = bus.data_bitrate is not None, bool(bus.options.get("pace", False))
-                if fd and pace:
-                    raise DriverError(f"{INTERFACE} {bus.channel}: keeps no pace with CAN FD")
-                self._wires.append(Wire(bus.channel, bus.bitrate if pace else 0, fd=fd).__enter__())
+                bitrate = bus.bitrate if bus.options.get("pace", False) else 0
+                self._wires.append(Wire(bus.channel, bitrate, bus.data_bitrate).__enter__())
                 self._ports.append(LocalPort(self._wires[-1], "drives"))
         except BaseException:
             self.close()

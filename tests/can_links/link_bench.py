@@ -54,7 +54,8 @@ def frames(draw: st.DrawFn, *, fd: bool = False, errors: bool = False) -> Frame:
     identifier = draw(st.integers(0, 0x1FFF_FFFF if extended else 0x7FF))
     size = draw(st.sampled_from(sorted(FD_LENGTHS) if fd else range(9)))
     data = b"" if kind == "remote" else draw(st.binary(min_size=size, max_size=size))
-    return Frame(identifier, data, kind == "remote", extended=extended)
+    is_fd = fd and kind == "data" and (size > 8 or draw(st.booleans()))
+    return Frame(identifier, data, kind == "remote", extended=extended, fd=is_fd)
 
 
 def arm_on_bus(**bus: Any) -> ArmConfig:

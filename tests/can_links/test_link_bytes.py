@@ -27,7 +27,7 @@ def test_a_classic_frame_survives_the_kernels_structure(frame: Frame) -> None:
 def test_a_data_frame_of_fd_survives_too_and_a_remote_one_stays_classic(frame: Frame) -> None:
     data = to_kernel(frame, fd=True)
     assert len(data) == (16 if frame.remote else 72)
-    assert from_kernel(data) == frame
+    assert from_kernel(data) == frame._replace(fd=not frame.remote)
 
 
 def test_the_structure_is_that_of_linux_can_h() -> None:
@@ -107,10 +107,11 @@ def test_noise_is_frames_that_exist_or_one_error(data: bytes) -> None:
     st.text(max_size=20),
     st.booleans(),
     st.lists(st.tuples(st.integers(0, 0x7FF), st.integers(0, 0x7FF)), max_size=16),
+    st.booleans(),
 )
-def test_a_greeting_survives(label: str, own: bool, filters: list[tuple[int, int]]) -> None:
-    found = packets.unpack_hello(packets.pack_hello(packets.Hello(label, own, tuple(filters))))
-    assert (found.own, found.filters) == (own, tuple(filters))
+def test_a_greeting_survives(label: str, own: bool, filters: list[tuple[int, int]], fd: bool) -> None:
+    found = packets.unpack_hello(packets.pack_hello(packets.Hello(label, own, tuple(filters), fd)))
+    assert (found.own, found.filters, found.fd) == (own, tuple(filters), fd)
     assert label.rstrip("\0").startswith(found.label)
 
 
@@ -122,7 +123,7 @@ def test_noise_is_no_greeting(data: bytes) -> None:
         packets.unpack_welcome(data)
 
 
-@pytest.mark.parametrize("welcome", [packets.Welcome(), packets.Welcome(packets.CROWDED, 1_000_000, True)])
+@pytest.mark.parametrize("welcome", [packets.Welcome(), packets.Welcome(packets.CROWDED, 1_000_000, True, 5_000_000)])
 def test_an_answer_survives(welcome: packets.Welcome) -> None:
     assert packets.unpack_welcome(packets.pack_welcome(welcome)) == welcome
 

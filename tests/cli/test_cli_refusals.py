@@ -245,7 +245,8 @@ def test_identify_adds_to_an_existing_folder(place: Path, quick: Commissioned, i
     (folder / "report.txt").write_text("old")
     words = identify(place, quick, quick.folder / "identification.mcap")
     assert ident(*words).code == 0
-    names = ["identified.urdf", "manifest.json", "mine", "parameters.json", "report.txt"]
+    names = ["arm.json", "evidence.json", "identified.urdf", "manifest.json", "mine", "parameters.json"]
+    names += ["report.html", "report.txt"]
     assert left_over(place) == ["out", *(f"out/{name}" for name in names)]
     assert (folder / "mine").read_text() == "keep"
     assert (folder / "report.txt").read_text() != "old"

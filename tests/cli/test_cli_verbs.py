@@ -20,11 +20,13 @@ from ident_service.results.parameter_file import read_parameters
 
 RUN_FILES = [
     "arm.json",
+    "evidence.json",
     "identification.excitation.json",
     "identification.mcap",
     "identified.urdf",
     "manifest.json",
     "parameters.json",
+    "report.html",
     "report.txt",
     "score.json",
     "validation.excitation.json",
@@ -100,8 +102,10 @@ def test_identify_in_words(quick: Commissioned, ident: Ident, tmp_path: Path) ->
     ended = ident("identify", recording, "--arm", quick.arm, "--validate", unseen, "--out", out)
     assert ended.code == 0
     assert ended.err == ""
-    assert f"files: {out}\n  parameters.json\n  identified.urdf\n  report.txt\n" in ended.out
-    assert left_over(out) == ["identified.urdf", "manifest.json", "parameters.json", "report.txt"]
+    assert f"files: {out}\n  parameters.json\n  arm.json\n  identified.urdf\n  report.txt\n" in ended.out
+    assert "  evidence.json\n  report.html\n" in ended.out
+    made = ["evidence.json", "identified.urdf", "manifest.json", "parameters.json", "report.html", "report.txt"]
+    assert left_over(out) == ["arm.json", *made]
     # The same recordings give the same numbers as the whole job did.
     one, other = (read_parameters(folder / "parameters.json").values for folder in (out, quick.folder))
     np.testing.assert_allclose(one, other, rtol=1e-9)

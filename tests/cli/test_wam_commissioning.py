@@ -14,6 +14,7 @@ import pytest
 from cli.conftest import run_main
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from report.pages import sections
 
 from ident_service.config.load import load_arm
 from ident_service.config.simulation import SimulatedDriver
@@ -25,6 +26,8 @@ from ident_service.motion.factory import make_arm
 from ident_service.motion.states import State
 from ident_service.record.open import open_recording
 from ident_service.results.parameter_file import read_parameters
+from ident_service.results.report_files import read_evidence_of
+from ident_service.results.run_folder import read_results
 from ident_service.service.commission import record_motion
 from ident_service.service.score import true_parameters
 
@@ -156,3 +159,17 @@ def test_no_identified_parameter_is_off_by_more_than_four_deviations(seed: int, 
 @pytest.mark.parametrize("seed", range(1, 11))
 def test_no_identified_parameter_is_off_over_ten_seeds(seed: int, tmp_path: Path) -> None:
     assert worst_deviation(seed, tmp_path) <= 4.0
+
+
+@pytest.mark.slow
+def test_the_report_of_two_minutes_at_1_khz_is_small_and_whole(wam_run: WamRun) -> None:
+    page = (wam_run.folder / "report.html").read_text(encoding="utf-8")
+    assert len(page.encode()) < 3_000_000
+    assert (wam_run.folder / "evidence.json").stat().st_size < 3_000_000
+    found = sections(page)
+    counts = {name: len(found[name].all("figure")) for name in ("torque", "residual", "friction", "bodies", "timing")}
+    assert counts == {"torque": 14, "residual": 7, "friction": 7, "bodies": 2, "timing": 2}
+    assert len(found["parameters"].one("tbody").all("tr")) == 69
+    evidence = read_evidence_of(read_results(wam_run.folder))
+    assert [one.source for one in evidence.timing] == ["cycle", "cycle"]
+    assert all(one.time[-1] - one.time[0] > 55.0 for one in evidence.recordings)

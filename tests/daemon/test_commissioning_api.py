@@ -73,6 +73,18 @@ def test_from_an_upload_to_accepted_parameters_and_back(daemon: Asked, arm: str,
         (4, 2, "owner"),
     ]
     assert daemon.get(f"/api/v1/arms/{ARM}").json()["accepted"] == acts[-1]
+    page = daemon.get(f"/api/v1/runs/{runs[0]}/report.html")
+    assert page.status_code == 200
+    assert page.text.lstrip().lower().startswith("<!doctype html")
+    assert "sandbox" in page.headers["content-security-policy"]
+    for asked in (
+        {"kind": "report", "run": runs[0]},
+        {"kind": "export", "run": runs[0], "formats": ["urdf", "csv"]},
+        {"kind": "compare", "run": runs[0], "other": runs[1]},
+    ):
+        made = daemon.follow(daemon.begin(asked)["id"])
+        assert made["state"] == "done", made
+    assert (state / "reports" / f"{runs[0]}.html").is_file()
     proven = daemon.follow(daemon.begin({"kind": "verify", "run": runs[0]})["id"])
     assert proven["state"] == "done", proven
     assert [line["what"] for line in daemon.get("/api/v1/audit?most=500").json()].count("accepted") == 2

@@ -1,109 +1,18 @@
-"""What every Arm keeps to, whatever stands behind it.
-
-A backend joins by a function in BACKENDS that builds a two-joint arm in virtual time, not yet open, with an eye on the
-true state of what moves, and with the faults injected that it is given.
-"""
+"""What every Arm keeps to, whatever stands behind it; `contract_bench.py` has the backends."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
+from contract_bench import BACKENDS, PERIOD_NS, canopen, relative_config
 
-from drivers.arm import Arm, StopKind
+from drivers.arm import StopKind
 from drivers.status import TRIPPED, AxisStatus
-from ident_service.config.schema import ArmConfig
-from ident_service.errors import DriverError
+from ident_service.errors import DriverError, PositionUnknown
 
-PERIOD_NS = 2_000_000
 LIMIT = np.array([10.0, 5.0])
 NONE = np.zeros(2)
 STATUS_CYCLES = 60  # more than a drive may wait with its status report
-
-
-@dataclass(frozen=True)
-class Bench:
-    """An arm of two weightless, frictionless joints of 1 kg m^2 and 1 kg, and the truth about it."""
-
-    arm: Arm
-    velocity: Callable[[], np.ndarray]
-    position: Callable[[], np.ndarray]
-    enabled: Callable[[], None] = lambda: None
-
-
-def bench_config(**driver: Any) -> ArmConfig:
-    truth = {"m1": 0.5, "Lxx1": 0.1, "Lyy1": 0.1, "Lzz1": 1.0, "m2": 1.0}
-    options = {"encoder_resolution": 1e-4, "torque_resolution": [0.25, 0.0]} | driver
-    return ArmConfig.model_validate(
-        {
-            "format": "ident-arm",
-            "version": 1,
-            "name": "bench",
-            # The second joint slides along the first one's axis, so that neither moves the other.
-            "kinematics": {"dh": {"convention": "standard", "joints": {"turn": {}, "slide": {"type": "prismatic"}}}},
-            "gravity": (0.0, 0.0, 0.0),
-            "joints": {"turn": {"torque": 10.0, "home": 0.5}, "slide": {"torque": 5.0, "position": (0.1, 1.0)}},
-            "control": {"rate": 500.0},
-            "driver": {"kind": "simulated", "truth": truth, **options},
-        }
-    )
-
-
-def simulated(**driver: Any) -> Bench:
-    from sim_backend.arm import from_config
-
-    arm = from_config(bench_config(**driver))
-    return Bench(arm, lambda: arm.plant.velocity, lambda: arm.plant.position)
-
-
-def separate(**driver: Any) -> Bench:
-    from sim_backend.arm import from_config
-
-    arm = from_config(bench_config(process="separate", **driver))
-    return Bench(arm, lambda: arm.truth.velocity, lambda: arm.truth.position)
-
-
-def canopen_config(**driver: Any) -> ArmConfig:
-    """The bench behind two drives with gears of 1, on a bus in virtual time; a thousandth is 1 mN m or 1 mN."""
-    eds = (Path(__file__).parents[2] / "configs" / "puck.eds").read_text()
-    drive = {"counts": 65536, "rated_torque": 1.0, "max_speed": 6000.0}
-    section = {
-        "kind": "canopen",
-        "eds": {"name": "puck.eds", "text": eds},
-        "buses": [{"interface": "lock_step", "channel": "bench"}],
-        "drives": [drive | {"node": 1, "max_torque": 10.0}, drive | {"node": 2, "max_torque": 5.0}],
-        "emulation": {"truth": bench_config().model_dump(mode="json")["driver"]["truth"]},
-    }
-    content = bench_config().model_dump(mode="json", exclude={"driver"}) | {
-        "transmission": {"ratios": [1.0, 1.0], "drive_terms": "joints"},
-        "driver": section | driver,
-    }
-    return ArmConfig.model_validate(content)
-
-
-def canopen(faults: Sequence[dict[str, Any]] = ()) -> Bench:
-    """Two emulated drives; opening takes cycles too, so that faults are counted from the end of enabling here."""
-    from drivers.canopen.arm import CanopenArm
-    from ident_service.config.simulation import SimulatedFault
-    from sim_backend.machine import Truth
-    from sim_backend.pucks.faults import configured
-    from sim_backend.pucks.lock_step import LockStepArm
-
-    config = canopen_config()
-    behind = LockStepArm(config)
-    truths: list[Truth] = []
-    behind.emulator.observer = truths.append
-    arm = CanopenArm(config, lambda _: [behind.link(0)])
-    wanted = [SimulatedFault.model_validate(fault) for fault in faults]
-    strike = configured(wanted, ("turn", "slide"), PERIOD_NS * 1e-9)
-    return Bench(arm, lambda: truths[-1].velocity, lambda: truths[-1].position, lambda: behind.inject(*strike))
-
-
-BACKENDS: dict[str, Callable[..., Bench]] = {"canopen": canopen, "separate": separate, "simulated": simulated}
 
 
 @pytest.fixture(params=sorted(BACKENDS))
@@ -404,3 +313,31 @@ def test_leaving_closes_whatever_happened(bench):
     bench.arm.open()
     with pytest.raises(DriverError):
         bench.arm.exchange(NONE)
+
+
+def test_what_zeroing_says_does_not_depend_on_the_arm_being_open(bench, request):
+    needs_it = request.node.callspec.params["bench"] == "relative"
+    if needs_it:
+        assert len(bench.arm.zero()) == 2
+    else:
+        with pytest.raises(DriverError, match=r"zero|absolute"):
+            bench.arm.zero()
+    with bench.arm as arm:
+        before = arm.exchange(None).position
+        with pytest.raises(DriverError):
+            arm.zero()
+        with pytest.raises(DriverError):
+            arm.look().zero()
+        after = arm.exchange(None)
+        np.testing.assert_array_equal(after.position, before)
+        np.testing.assert_array_equal(after.torque, 0.0)
+
+
+def test_a_position_is_told_only_by_an_arm_that_knows_it():
+    bench = canopen(config=relative_config())
+    for act in (bench.arm.open, bench.arm.look().open):
+        with pytest.raises(PositionUnknown):
+            act()
+    bench.arm.zero()
+    with bench.arm as arm:
+        np.testing.assert_allclose(arm.exchange(None).position, [0.5, 0.1], atol=2e-4)

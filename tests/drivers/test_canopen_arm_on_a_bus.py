@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 
-from test_arm_contract import canopen_config
+from contract_bench import canopen_config
 
 from drivers.canopen.arm import CanopenArm
 from drivers.status import AxisStatus

@@ -10,7 +10,7 @@ from typing import Any
 import can
 import numpy as np
 import pytest
-from test_arm_contract import bench_config
+from contract_bench import bench_config
 from test_canopen_looking import Bench
 
 from drivers.arm import Arm, Sample, StopKind

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_arm_contract import canopen_config
+from contract_bench import canopen_config
 
 from drivers.arm import Arm, StopKind
 from drivers.canopen.arm import CanopenArm

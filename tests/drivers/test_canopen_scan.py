@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from test_arm_contract import canopen_config
+from contract_bench import canopen_config
 from test_canopen_looking import Bench, Tap
 
 from drivers.arm import StopKind

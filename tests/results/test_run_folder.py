@@ -14,8 +14,8 @@ from helpers.random_arms import bodies_of, reference_model
 
 from ident_service.errors import ConfigError, ModelError, ParameterError, UsageError
 from ident_service.estimation.identify import Estimate
-from ident_service.results import exports
-from ident_service.results.exports import write_urdf
+from ident_service.results.export import urdf_file
+from ident_service.results.export.urdf_file import write_urdf
 from ident_service.results.parameter_file import read_parameters
 from ident_service.results.run_folder import read_results, write_manifest, write_results
 from ident_service.results.summary import parameter_table, summary
@@ -59,7 +59,7 @@ def test_a_urdf_that_says_something_else_is_not_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, feasible_estimate: Estimate
 ) -> None:
     assert feasible_estimate.delta is not None
-    honest = exports.urdf_text
+    honest = urdf_file.urdf_text
 
     def careless(*arguments: object) -> str:
         model, delta = arguments
@@ -67,8 +67,10 @@ def test_a_urdf_that_says_something_else_is_not_written(
         changed[9] *= 1.0001  # mass of the first link
         return honest(model, changed)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(exports, "urdf_text", careless)
-    with pytest.raises(ModelError, match="differs from the parameters; it was not written"):
+    monkeypatch.setattr(urdf_file, "urdf_text", careless)
+    with pytest.raises(
+        ModelError, match=r"differs from the parameters: torques are up to .* apart; it was not written"
+    ):
         write_urdf(tmp_path / "a.urdf", feasible_estimate.model, feasible_estimate.delta)
     assert list(tmp_path.iterdir()) == []
 

@@ -1,4 +1,4 @@
-"""Run a wire alone until interrupted: `python -m drivers.canopen.wire NAME [--bitrate N] [--fd]`."""
+"""Run a wire alone until interrupted: `python -m drivers.canopen.wire NAME [--bitrate N] [--fd [--data-bitrate N]]`."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m drivers.canopen.wire", description=__doc__)
     parser.add_argument("name", help="what ends connect to: a name, or the path of a socket file")
     parser.add_argument("--bitrate", type=int, default=0, help="pace to keep [bit/s]; 0: none")
+    parser.add_argument("--data-bitrate", type=int, help="pace of CAN FD's data [bit/s]; with --bitrate and --fd")
     parser.add_argument("--fd", action="store_true", help="carry CAN FD frames")
     options = parser.parse_args(arguments)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        with Wire(options.name, options.bitrate, fd=options.fd) as wire:
+        with Wire(options.name, options.bitrate, options.data_bitrate, fd=options.fd) as wire:
             print("ready", flush=True)
             while True:
                 wire.poll(time.monotonic_ns() + 1_000_000_000)

@@ -36,6 +36,7 @@ class IdentWireBus(can.BusABC):
         pace: bool = False,
         bitrate: int = 1_000_000,
         fd: bool = False,
+        data_bitrate: int | None = None,
         **kwargs: Any,
     ) -> None:
         """Connect.
@@ -48,6 +49,7 @@ class IdentWireBus(can.BusABC):
             pace: whether a wire that is hosted here keeps `bitrate`.
             bitrate: of a wire that is hosted here [bit/s].
             fd: whether a wire that is hosted here carries CAN FD.
+            data_bitrate: of a wire that is hosted here, for its pace of CAN FD's data [bit/s].
             kwargs: ignored, as python-can's own interfaces do.
 
         Raises:
@@ -57,7 +59,8 @@ class IdentWireBus(can.BusABC):
         self.channel, self.channel_info = channel, f"ident_wire channel {channel!r}"
         try:
             if host:
-                thread = WireThread(Wire(channel, bitrate if pace else 0, fd=fd))
+                rates = (bitrate, data_bitrate if fd else None) if pace else (0, None)
+                thread = WireThread(Wire(channel, *rates, fd=fd))
                 self._thread = thread.__enter__()
             self._connection = Connection(channel, Hello("python-can", own=receive_own_messages))
         except DriverError as error:
@@ -76,9 +79,9 @@ class IdentWireBus(can.BusABC):
             can.CanOperationError: the wire is gone, or takes no more.
         """
         data = b"" if msg.is_remote_frame else bytes(msg.data)
-        if msg.is_error_frame or (len(data) > 8 and self._can_protocol is not can.CanProtocol.CAN_FD):
+        if msg.is_error_frame or (msg.is_fd and self._can_protocol is not can.CanProtocol.CAN_FD):
             raise can.CanOperationError(f"a frame that this wire does not carry: {msg}")
-        frame = Frame(msg.arbitration_id, data, msg.is_remote_frame, extended=msg.is_extended_id)
+        frame = Frame(msg.arbitration_id, data, msg.is_remote_frame, extended=msg.is_extended_id, fd=msg.is_fd)
         try:
             self._connection.send((frame,))
         except BusError as error:
@@ -101,7 +104,8 @@ class IdentWireBus(can.BusABC):
             is_extended_id=frame.extended,
             is_remote_frame=frame.remote,
             is_error_frame=frame.error,
-            is_fd=len(frame.data) > 8,
+            is_fd=frame.fd,
+            bitrate_switch=frame.fd,
             data=None if frame.remote else frame.data,
             channel=self.channel,
             is_rx=not own,

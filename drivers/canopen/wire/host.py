@@ -37,7 +37,7 @@ class LocalPort:
             label: who this is, for people.
         """
         self.clock = RealClock()
-        self.port = Port(label)
+        self.port = Port(label, fd=wire.fd)
         self._wire = wire
         wire.medium.add(self.port)
         self._waiting: list[Frame] = []
@@ -56,6 +56,7 @@ class LocalPort:
         now = time.monotonic_ns()
         for frame in frames:
             check_sendable(frame, fd=self._wire.fd)
+            frame = self._as_sent(frame)
             if self.port.counters.state == "off":
                 raise BusError("off", f"ident_wire {self._wire.name}", self._wire.bitrate)
             if not self._wire.medium.offer(self.port, frame, now):
@@ -66,11 +67,14 @@ class LocalPort:
         """As `send_all`, but raises nothing: how many frames were taken, from the first on."""
         now, taken = time.monotonic_ns(), 0
         for frame in frames:
-            if self.port.counters.state == "off" or not self._wire.medium.offer(self.port, frame, now):
+            if self.port.counters.state == "off" or not self._wire.medium.offer(self.port, self._as_sent(frame), now):
                 break
             taken += 1
         self._wire.turn(now)
         return taken
+
+    def _as_sent(self, frame: Frame) -> Frame:
+        return frame._replace(fd=True) if self._wire.fd and not frame.remote else frame
 
     def receive(self, deadline_ns: int) -> Frame | None:
         """The next frame, None when there is none until the deadline [ns of the clock].

@@ -28,6 +28,7 @@ from ident_service.errors import DriverError
 
 MOST_ENDS: Final = 32
 ERROR_BITS: Final = 20  # flag and delimiter of an error, and the interframe space; superposed flags make it up to 26
+BEFORE_FDF: Final = 15  # start, identifier, RRS, IDE, and the bit that a classic controller takes for an error
 _SELECT_LIMIT: Final = 1024  # descriptors that select, whose timeout alone is finer than milliseconds, can watch
 
 
@@ -52,6 +53,7 @@ class Wire:
         self,
         name: str,
         bitrate: int = 0,
+        data_bitrate: int | None = None,
         *,
         fd: bool = False,
         duration_ns: Callable[[Frame], int] | None = None,
@@ -61,20 +63,22 @@ class Wire:
         Args:
             name: channel that ends connect to: a name, or the path of a socket file.
             bitrate: pace to keep [bit/s]; 0: none.
-            fd: whether frames may be CAN FD's.
-            duration_ns: how long a frame occupies the wire, instead of its classic bits at the bit rate.
+            data_bitrate: of the data of CAN FD's frames [bit/s]; None: the wire has none, but for `fd`.
+            fd: whether frames may be CAN FD's although there is no pace.
+            duration_ns: how long a frame occupies the wire, instead of its bits at these rates.
 
         Raises:
-            DriverError: a pace for CAN FD without `duration_ns`.
+            DriverError: a pace for CAN FD without its data bit rate.
         """
-        if fd and bitrate and duration_ns is None:
-            raise DriverError(f"ident_wire {name}: the pace of CAN FD needs duration_ns")
-        self.name, self.bitrate, self.fd = name, bitrate, fd
+        self.fd = fd or data_bitrate is not None
+        if self.fd and bitrate and duration_ns is None and data_bitrate is None:
+            raise DriverError(f"ident_wire {name}: the pace of CAN FD needs its data bit rate")
+        self.name, self.bitrate, self.data_bitrate = name, bitrate, data_bitrate
         error_ns = 0
         if bitrate:
-            duration_ns = duration_ns or (lambda frame: exact(frame).nominal * 1_000_000_000 // bitrate)
+            duration_ns = duration_ns or _pace(bitrate, data_bitrate)
             error_ns = ERROR_BITS * 1_000_000_000 // bitrate
-        self.medium = Medium(duration_ns, error_ns)
+        self.medium = Medium(duration_ns, error_ns, fd=self.fd)
         self.lock = RLock()
         self.expelled = 0
         self._ends: dict[int, _End] = {}
@@ -190,7 +194,7 @@ class Wire:
                 self._greet(end, packets.unpack_hello(data))
                 return
             for frame, _ in packets.unpack_frames(data):
-                if frame.error or (len(frame.data) > 8 and not self.fd):
+                if frame.error:
                     raise DriverError("a frame that no controller sends")
                 # The queue had room for a whole packet.
                 self.medium.offer(end.port, frame, now)
@@ -205,12 +209,14 @@ class Wire:
         if not self._answer(end, packets.CROWDED if crowded else packets.ACCEPTED) or crowded:
             self._drop(end)
             return
-        end.port = Port(hello.label, address.peer_pid(end.socket), own=hello.own, filters=hello.filters)
+        end.port = Port(hello.label, address.peer_pid(end.socket), own=hello.own, filters=hello.filters, fd=hello.fd)
         self.medium.add(end.port)
 
     def _answer(self, end: _End, answer: int) -> bool:
         try:
-            end.socket.send(packets.pack_welcome(packets.Welcome(answer, self.bitrate, self.fd)))
+            end.socket.send(
+                packets.pack_welcome(packets.Welcome(answer, self.bitrate, self.fd, self.data_bitrate or 0))
+            )
         except OSError:
             return False
         return True
@@ -234,3 +240,16 @@ class Wire:
         end.socket.close()
         if end.port is not None:
             self.medium.remove(end.port)
+
+
+def _pace(bitrate: int, data_bitrate: int | None) -> Callable[[Frame], int]:
+    """How long frames occupy a wire of these bit rates [ns]."""
+
+    def duration_ns(frame: Frame) -> int:
+        if not frame.fd:
+            return exact(frame).nominal * 1_000_000_000 // bitrate
+        if data_bitrate is None:  # it is destroyed there
+            return BEFORE_FDF * 1_000_000_000 // bitrate
+        return round(1e9 * exact(frame, fd=True).seconds(bitrate, data_bitrate))
+
+    return duration_ns

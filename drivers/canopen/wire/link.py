@@ -40,7 +40,8 @@ def from_config(config: ArmConfig, bus_number: int) -> WireLink:
     bus = config.driver.buses[bus_number]
     if unknown := sorted(set(bus.options) - {"pace"}):
         raise DriverError(f"driver.buses.{bus_number}.options: ident_wire has only pace, found {', '.join(unknown)}")
-    return WireLink(Connection(bus.channel, packets.Hello("driver", filters=HEARD)))
+    fd = bus.data_bitrate is not None
+    return WireLink(Connection(bus.channel, packets.Hello("driver", filters=HEARD, fd=fd)), fd=fd)
 
 
 class Connection:
@@ -135,10 +136,16 @@ class Connection:
 class WireLink:
     """A Link on a connection; the thread that opened it is its only user."""
 
-    def __init__(self, connection: Connection) -> None:
-        """Take a connection over."""
+    def __init__(self, connection: Connection, *, fd: bool | None = None) -> None:
+        """Take a connection over.
+
+        Args:
+            connection: greeted.
+            fd: whether data frames are sent as CAN FD's; by default where the wire carries them.
+        """
         self.clock = RealClock()
         self._connection = connection
+        self._fd = connection.welcome.fd if fd is None else fd
         self._waiting: deque[Frame] = deque()
         self._watch = BusOffWatch()
 
@@ -154,9 +161,12 @@ class WireLink:
     def send_all(self, frames: Sequence[Frame]) -> None:
         """Hand several over in one system call, in their order; raises as `send` does, and then nothing is sent."""
         for frame in frames:
-            check_sendable(frame, fd=self._connection.welcome.fd)
+            check_sendable(frame, fd=self._fd)
         if self._watch.off:
-            raise BusError("off", self._connection.name, remedy="bus-off was injected; restart the port on its wire")
+            remedy = "bus-off: some ends know CAN FD (data_bitrate) and some do not, or errors were injected"
+            raise BusError("off", self._connection.name, remedy=remedy)
+        if self._fd:
+            frames = [frame if frame.remote else frame._replace(fd=True) for frame in frames]
         self._connection.send(frames)
 
     def receive(self, deadline_ns: int) -> Frame | None:

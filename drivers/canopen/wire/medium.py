@@ -4,6 +4,9 @@ Whenever the wire is free, the first frame of every port's queue contends; the o
 dominant bit where others have a recessive one wins (ISO 11898-1). A port's own frames keep their order, as in the
 kernel's queue of an interface. With a pace each frame occupies the wire for its bits and is heard at its end.
 
+A CAN FD frame on a wire that is classic, or with a classic controller on it, is destroyed each time: to that controller
+its bit FDF is a broken frame. Its sender goes on trying until it is off the bus.
+
 Boundary: pure, on any clock; so the pace is exact in virtual time, however late its host may be.
 """
 
@@ -38,10 +41,19 @@ class Port:
         pid: its process.
         counters: its error counters.
         inbox: what it heard and has not taken yet, and whether it was its own.
+        fd: whether its controller knows CAN FD; one that does not destroys such frames of others.
         lost: frames that found its inbox full.
     """
 
-    def __init__(self, label: str, pid: int = 0, *, own: bool = False, filters: Iterable[tuple[int, int]] = ()) -> None:
+    def __init__(
+        self,
+        label: str,
+        pid: int = 0,
+        *,
+        own: bool = False,
+        filters: Iterable[tuple[int, int]] = (),
+        fd: bool = True,
+    ) -> None:
         """Make an end that is not on any wire yet.
 
         Args:
@@ -49,8 +61,9 @@ class Port:
             pid: of the process behind it.
             own: whether it hears its own frames.
             filters: identifier and mask, any of which lets a standard frame pass; none lets all frames pass.
+            fd: whether its controller knows CAN FD.
         """
-        self.label, self.pid, self.own = label, pid, own
+        self.label, self.pid, self.own, self.fd = label, pid, own, fd
         self.counters = ErrorCounters()
         self.pending: deque[tuple[int, Frame]] = deque()
         self.inbox: list[tuple[Frame, bool]] = []
@@ -95,16 +108,19 @@ class Medium:
         collisions: frames that met one with the same arbitration field from another port: two nodes with one number.
     """
 
-    def __init__(self, duration_ns: Callable[[Frame], int] | None = None, error_ns: int = 0) -> None:
+    def __init__(
+        self, duration_ns: Callable[[Frame], int] | None = None, error_ns: int = 0, *, fd: bool = True
+    ) -> None:
         """Make an empty wire.
 
         Args:
             duration_ns: how long a frame occupies the wire; None: not at all, and all that waits contends at once.
             error_ns: how long an error frame does.
+            fd: whether the wire itself carries CAN FD.
         """
         self.ports: list[Port] = []
         self.sent = self.destroyed = self.collisions = 0
-        self._duration_ns, self._error_ns = duration_ns, error_ns
+        self._duration_ns, self._error_ns, self._fd = duration_ns, error_ns, fd
         self._to_destroy: dict[Port | None, int] = {}
         self._current: tuple[Port, Frame, int] | None = None
         self._free_ns = 0
@@ -186,6 +202,9 @@ class Medium:
                 self._to_destroy[key] -= 1
                 self._destroyed(sender, frame, end)
                 return
+        if frame.fd and not (self._fd and all(port.fd or port.counters.state == "off" for port in self.ports)):
+            self._destroyed(sender, frame, end)
+            return
         self.sent += 1
         heard = frame._replace(stamp_ns=end)
         self._note(sender, sender.counters.sent(end))

@@ -1,0 +1,54 @@
+"""Verbs that hold results against each other, or against a recording: `compare`, `payload`.
+
+Boundary: words to calls, results to words; the work is `service/comparison.py` and `service/payload.py`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ident_service.cli.answer import DONE, VERDICT_NO, Answer, state_folder
+from ident_service.cli.words import Verbs
+
+
+def add(verbs: Verbs) -> None:
+    """Register `compare` and `payload`."""
+    sub = verbs.add("compare", _compare, "has the arm changed? (exit code 3: yes, or it cannot be said)")
+    sub.add_argument("reference", type=Path, metavar="A", help="folder of results, or parameters.json: the reference")
+    sub.add_argument("others", type=Path, nargs="+", metavar="B", help="what is compared with it")
+    sub.add_argument("--out", type=Path, metavar="PATH", help="FILE.json, or a folder for JSON, text and page")
+
+    sub = verbs.add("payload", _payload, "what does an identified arm carry? (exit code 3: nothing, or no real body)")
+    sub.add_argument("run", type=Path, metavar="RUN", help="folder of results of the arm without the load")
+    sub.add_argument("recordings", nargs="+", type=Path, metavar="RECORDING", help="with the load; FILE@2:1.5 as usual")
+    sub.add_argument("--refit-offsets", action="store_true", help="torque offsets may differ from the arm's")
+    sub.add_argument(
+        "--out", type=Path, metavar="DIR", help="where results go (default: a new folder below the state folder)"
+    )
+
+
+def _compare(arguments: argparse.Namespace) -> Answer:
+    from ident_service.results.comparison.document import comparison_document
+    from ident_service.results.comparison.text import comparison_text
+    from ident_service.service.comparison import compare_files
+
+    comparison, files = compare_files([arguments.reference, *arguments.others], arguments.out)
+    text = comparison_text(comparison) + "".join(f"file: {path}\n" for path in files)
+    document = comparison_document(comparison) | {"files": [str(path) for path in files]}
+    return (DONE if comparison.verdict == "unchanged" else VERDICT_NO), text, document
+
+
+def _payload(arguments: argparse.Namespace) -> Answer:
+    from ident_service.results.comparison.text import comparison_text
+    from ident_service.service.commission import new_run_folder
+    from ident_service.service.payload import payload_files
+
+    folder = arguments.out or new_run_folder(state_folder(arguments), arguments.run.resolve().name, "payloads")
+    found = payload_files(arguments.run, arguments.recordings, folder, refit_offsets=arguments.refit_offsets)
+    text = found.text
+    if found.comparison is not None:
+        text += "\n" + comparison_text(found.comparison)
+    text += f"files: {folder}\n" + "".join(f"  {name}\n" for name in found.files)
+    code = DONE if found.payload.verdict in ("added", "removed") else VERDICT_NO
+    return code, text, found.document | {"folder": str(folder), "files": list(found.files)}

@@ -1,0 +1,350 @@
+"""Has an arm changed between two identifications? The statistics of the difference of two parameter sets.
+
+With d the difference of the base parameters and S = S_1 + S_2 the sum of their covariances,
+
+    T^2 = d^T S^-1 d
+
+is chi-square distributed over rank(S) directions when nothing has changed and S is known. S comes from the blocks of
+two recordings, of which there are not many more than parameters, and T^2 then is larger than chi-square. It follows
+
+    (nu - r + 1) / (nu r) T^2  ~  F(r, nu - r + 1)
+
+with r directions and nu the degrees of freedom of a sum of two estimated covariances (Krishnamoorthy and Yu 2004, eq.
+"modified Nel and van der Merwe"; Welch's for r = 1). Directions of the correlation matrix are left out where nothing
+was seen, where no variance was estimated because blocks are fewer than parameters, and, the best known first, until
+nu - r + 1 >= r: beyond, the inverse of S is noise.
+
+The same test is made of every effect: friction of a joint, drive inertia of a joint, first moments of a link, inertia
+of a link. The joint test and all effects together are one family, controlled by Holm's method.
+
+Constrained estimates: their covariance here is that of the unconstrained fit. Projection into a convex set moves two
+estimates closer together, not apart, so such a test is on the careful side. Where a file has its unconstrained values,
+those are compared, to which the covariance belongs.
+
+Boundary: pure computation, no I/O. What a change may mean is `drift_causes.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+import scipy.stats
+
+from ident_service.errors import ParameterError
+from ident_service.model.chain import Array
+from ident_service.model.information import Information
+from ident_service.model.layout import INERTIAL, TERM_SYMBOLS
+
+Kind = Literal["friction", "drive inertia", "first moments", "inertia"]
+Word = Literal["unchanged", "changed", "impossible"]
+
+# One false alarm in a hundred comparisons, over all tests of a comparison together: an arm that is compared every week
+# cries wolf once in two years. Changes that matter lie ten and more deviations away.
+ALPHA = 0.01
+# Of a joint's torque on the motion (root mean square). Drives' torque constants are seldom known to better than 1 %.
+RELEVANT_TORQUE = 0.01
+# Of what the parameters leave unexplained (root mean square). Noise averages out of parameters, and their covariance
+# says how well; model error does neither, and shows in the residual alone.
+RELEVANT_RESIDUAL = 0.25
+
+_NO_VARIANCE = 1e-10  # of an eigenvalue of the correlation matrix, against the largest
+_ROUNDING = 8.0 * np.finfo(float).eps
+_KINDS: dict[str, Kind] = {
+    **dict.fromkeys(INERTIAL[:6], "inertia"),
+    **dict.fromkeys(INERTIAL[6:], "first moments"),
+    **dict.fromkeys(TERM_SYMBOLS.values(), "friction"),
+    TERM_SYMBOLS["drive_inertia"]: "drive inertia",
+}
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What a recorded motion makes of base parameters.
+
+    Attributes:
+        responses: per joint a matrix whose product with a difference of parameters has as its length the root mean
+            square of the change of torque [N m or N], shape (rows, base).
+        torque: root mean square of each joint's measured torque [N m or N], shape (joints,).
+        residual: and of what the identified parameters leave unexplained of it, shape (joints,).
+    """
+
+    responses: tuple[Array, ...]
+    torque: Array
+    residual: Array
+
+    @classmethod
+    def of(cls, information: Information, beta: Array, places: Sequence[int] | None = None) -> Motion:
+        """From the equations of a recording.
+
+        Args:
+            information: the equations.
+            beta: all base parameters of the one who was identified from them, SI units, shape (base,).
+            places: which of them the responses are about, in their order; all when None.
+        """
+        wanted = np.arange(information.base) if places is None else np.array(places, dtype=np.intp)
+        rows = np.sqrt(np.maximum(information.rows, 1))
+        responses = []
+        for count, support, factor in zip(rows, information.supports, information.factors, strict=True):
+            full = np.zeros((len(factor), information.base))
+            full[:, support] = factor[:, :-1] / count
+            responses.append(full[:, wanted])
+        torque, residual = information.squared_torques(), information.squared_residuals(beta)
+        return cls(tuple(responses), np.sqrt(torque) / rows, np.sqrt(residual) / rows)
+
+    def change(self, difference: Array) -> Array:
+        """Root mean square of each joint's change of torque [N m or N], shape (joints,)."""
+        return np.array([float(np.linalg.norm(response @ difference)) for response in self.responses])
+
+
+@dataclass(frozen=True)
+class Identified:
+    """What one identification says of the base parameters that two have in common.
+
+    Attributes:
+        leading: the link parameter that each base parameter is named after, `fv2` for example.
+        values: unconstrained where known, SI units, shape (base,).
+        covariance: of them, infinite on the diagonal where nothing was seen, shape (base, base).
+        blocks: stretches of time that the covariance comes from; None where it is known exactly.
+        motion: of the recordings that were fitted to; None where nobody kept it.
+    """
+
+    leading: tuple[str, ...]
+    values: Array
+    covariance: Array
+    blocks: int | None = None
+    motion: Motion | None = None
+
+    def __post_init__(self) -> None:
+        size = len(self.leading)
+        if self.values.shape != (size,) or self.covariance.shape != (size, size):
+            raise ParameterError(f"{self.values.shape=} and {self.covariance.shape=} but {size} parameters")
+        if self.blocks is not None and self.blocks < 2:
+            raise ParameterError(f"a covariance from {self.blocks} blocks says nothing")
+
+
+@dataclass(frozen=True)
+class Test:
+    """A test that some parameters have not changed.
+
+    Attributes:
+        statistic: T^2, the squared length of the difference in deviations.
+        directions: r, how many independent directions it has.
+        degrees: nu of the covariances; infinite where they are known.
+        p: how often a larger statistic comes about when nothing has changed.
+        left_out: directions in which nothing could be tested.
+    """
+
+    statistic: float
+    directions: int
+    degrees: float
+    p: float
+    left_out: int
+
+    @property
+    def sigma(self) -> float:
+        """Length of the difference in deviations; |z| of a single parameter."""
+        return float(np.sqrt(self.statistic))
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One effect that may have changed.
+
+    Attributes:
+        kind: what it is.
+        number: of the joint or link, from 1.
+        places: which parameters it has.
+        test: that they have not changed.
+        p: of the test, after Holm.
+        joint: the one whose torque changes most for its size, from 0; None where no motion is known.
+        torque_share: of that joint's torque, by which its prediction changes (root mean squares); None likewise.
+        residual_share: of that joint's residual; None likewise.
+        changed: whether it is significant, and large enough to matter where that can be said.
+    """
+
+    kind: Kind
+    number: int
+    places: tuple[int, ...]
+    test: Test
+    p: float
+    joint: int | None
+    torque_share: float | None
+    residual_share: float | None
+    changed: bool
+
+
+@dataclass(frozen=True)
+class Drift:
+    """The difference of two identifications.
+
+    Attributes:
+        difference: second less first, shape (base,).
+        deviations: its standard deviations, infinite where either saw nothing, shape (base,).
+        z: difference in deviations, 0 where nothing was seen, shape (base,).
+        p: of each parameter alone, after Holm over the parameters, shape (base,).
+        joint: the test of all parameters together.
+        joint_p: of that test, after Holm over it and the effects.
+        torque_share: per joint, of its torque, by which the prediction changes, shape (joints,); None without a motion.
+        residual_share: per joint, of its residual, likewise.
+        effects: all of them, in the order of the parameters.
+        verdict: in one word.
+    """
+
+    difference: Array
+    deviations: Array
+    z: Array
+    p: Array
+    joint: Test
+    joint_p: float
+    torque_share: Array | None
+    residual_share: Array | None
+    effects: tuple[Effect, ...]
+    verdict: Literal["unchanged", "changed"]
+
+    @cached_property
+    def changes(self) -> tuple[Effect, ...]:
+        """The effects that have changed, the largest change of torque first."""
+        found = [effect for effect in self.effects if effect.changed]
+        return tuple(sorted(found, key=lambda effect: (-(effect.residual_share or 0.0), effect.p)))
+
+
+def drift(first: Identified, second: Identified) -> Drift:
+    """Compare two identifications of the same base parameters.
+
+    Args:
+        first: the reference, the accepted one for example.
+        second: the later one; torques are those of its motion, or of the first one's where it has none.
+
+    Raises:
+        ParameterError: the two are about different parameters, or one has other shapes than its parameters.
+    """
+    if first.leading != second.leading:
+        raise ParameterError("the two sets are about different base parameters")
+    difference = second.values - first.values
+    total = np.diag(first.covariance) + np.diag(second.covariance)
+    seen = np.isfinite(total)
+    # Values are printed with rounding; what is known exactly is known to that.
+    rounding = _ROUNDING * (np.abs(first.values) + np.abs(second.values)) + np.finfo(float).tiny
+    deviations = np.where(seen, np.maximum(np.sqrt(np.where(seen, total, 0.0)), rounding), np.inf)
+    singles = [difference_test(first, second, (place,)) for place in range(len(difference))]
+    joint = difference_test(first, second, tuple(range(len(difference))))
+    groups = _groups(first.leading)
+    tests = [difference_test(first, second, places) for places in groups.values()]
+    corrected = holm([joint.p, *(test.p for test in tests)])
+    effects = []
+    for ((kind, number), places), test, p in zip(groups.items(), tests, corrected[1:], strict=True):
+        only = np.zeros(len(difference))
+        only[list(places)] = difference[list(places)]
+        shares = torque_shares(first, second, np.where(seen, only, 0.0))
+        worst = None if shares is None else int(np.argmax(shares[0]))
+        torque, residual = (None, None) if shares is None else (float(shares[0][worst]), float(shares[1][worst]))
+        changed = p < ALPHA and relevant(shares)
+        effects.append(Effect(kind, number, places, test, p, worst, torque, residual, changed))
+    whole = torque_shares(first, second, np.where(seen, difference, 0.0))
+    drifted = any(effect.changed for effect in effects) or (corrected[0] < ALPHA and relevant(whole))
+    return Drift(
+        difference=difference,
+        deviations=deviations,
+        z=np.where(seen, difference / deviations, 0.0),
+        p=np.array(holm([test.p for test in singles])),
+        joint=joint,
+        joint_p=corrected[0],
+        torque_share=None if whole is None else whole[0],
+        residual_share=None if whole is None else whole[1],
+        effects=tuple(effects),
+        verdict="changed" if drifted else "unchanged",
+    )
+
+
+def holm(p: Sequence[float]) -> list[float]:
+    """Probabilities adjusted for their number (Holm 1979), in the order they came."""
+    order = np.argsort(p, kind="stable")
+    adjusted = np.empty(len(p))
+    adjusted[order] = np.maximum.accumulate(np.arange(len(p), 0, -1) * np.asarray(p, dtype=float)[order])
+    return [float(value) for value in np.minimum(adjusted, 1.0)]
+
+
+def torque_shares(first: Identified, second: Identified, difference: Array) -> tuple[Array, Array] | None:
+    """What a difference of parameters does to the predicted torques, on the later motion that is known.
+
+    Returns:
+        Per joint, root mean square of the change over that of the torque, and over that of what the parameters
+        identified from it leave unexplained; each of shape (joints,). None where no motion is known.
+    """
+    motion = second.motion or first.motion
+    if motion is None:
+        return None
+    change, tiny = motion.change(difference), np.finfo(float).tiny
+    return change / np.maximum(motion.torque, tiny), change / np.maximum(motion.residual, tiny)
+
+
+def relevant(shares: tuple[Array, Array] | None) -> bool:
+    """Whether some joint's torque changes by enough of itself and of what is unexplained anyway."""
+    if shares is None:
+        return True
+    return bool(np.any((shares[0] >= RELEVANT_TORQUE) & (shares[1] >= RELEVANT_RESIDUAL)))
+
+
+def _groups(leading: Sequence[str]) -> dict[tuple[Kind, int], tuple[int, ...]]:
+    groups: dict[tuple[Kind, int], list[int]] = {}
+    for place, name in enumerate(leading):
+        symbol = name.rstrip("0123456789")
+        groups.setdefault((_KINDS.get(symbol, "friction"), int(name[len(symbol) :])), []).append(place)
+    return {key: tuple(places) for key, places in groups.items()}
+
+
+def difference_test(first: Identified, second: Identified, places: Sequence[int]) -> Test:
+    """Test that these parameters are the same in both.
+
+    Args:
+        first: one set.
+        second: the other.
+        places: which parameters, from 0.
+    """
+    chosen = np.array(places, dtype=np.intp)
+    seen = chosen[[np.isfinite(first.covariance[k, k] + second.covariance[k, k]) for k in places]]
+    d = second.values[seen] - first.values[seen]
+    parts = [one.covariance[np.ix_(seen, seen)] for one in (first, second)]
+    blocks = [one.blocks for one in (first, second)]
+    rounding = _ROUNDING * (np.abs(first.values[seen]) + np.abs(second.values[seen])) + np.finfo(float).tiny
+    if len(seen) == 0:
+        return Test(0.0, 0, np.inf, 1.0, len(places))
+    S = parts[0] + parts[1]
+    scale = np.maximum(np.sqrt(np.diag(S)), rounding)
+    exact = np.diag(S) <= rounding**2
+    correlation = S / np.outer(scale, scale)
+    correlation[exact, exact] = 1.0
+    values, vectors = np.linalg.eigh(correlation)
+    # Largest variance first: what is left out is what the blocks cannot tell from exactly known.
+    values, vectors = values[::-1], vectors[:, ::-1]
+    rank = int(np.sum(values > _NO_VARIANCE * values[0]))
+    whitening = (vectors[:, :rank] / np.sqrt(values[:rank])).T / scale
+    z = whitening @ d
+    for r in range(rank, 0, -1):
+        degrees = _degrees([whitening[:r] @ part @ whitening[:r].T for part in parts], blocks)
+        if degrees - r + 1.0 >= r or r == 1:
+            break
+    statistic = float(z[:r] @ z[:r])
+    return Test(statistic, r, degrees, probability(statistic, r, degrees), len(places) - r)
+
+
+def probability(statistic: float, directions: int, degrees: float) -> float:
+    """How often a larger T^2 comes about by chance, with `degrees` of freedom of its covariances."""
+    if np.isinf(degrees):
+        return float(scipy.stats.chi2.sf(statistic, directions))
+    below = max(degrees - directions + 1.0, 1.0)
+    return float(scipy.stats.f.sf(statistic * below / (degrees * directions), directions, below))
+
+
+def _degrees(parts: Sequence[Array], blocks: Sequence[int | None]) -> float:
+    """Degrees of freedom of a sum of covariances, each in the coordinates in which the sum is 1."""
+    below = 0.0
+    for part, count in zip(parts, blocks, strict=True):
+        if count is not None:
+            below += float(np.sum(part * part.T) + np.trace(part) ** 2) / (count - 1)
+    r = len(parts[0])
+    return (r + r**2) / below if below > 0.0 else float("inf")

@@ -1,0 +1,347 @@
+"""Tool or load of an arm that is already identified: ten parameters of a body that moves with the last link.
+
+A body x in the frame of the last link adds K_x x to the base parameters beta of the arm, with K_x the ten columns of K
+(eq. 38) of that link. On a second recording
+
+    omega - W beta = W K_x x + noise
+
+is least squares for x; joints are weighted by their residuals. What W K_x cannot tell apart is grouped as base
+parameters are; what the motion does not show (inertia where it is slow) has infinite variance and is left out. The
+covariance of x has two parts: noise, from blocks of scores as in `doubt.py`, and the arm's own doubt, which on this
+motion looks like a payload: x depends on beta by -G = -(K_x^T W^T W K_x)^-1 K_x^T W^T W, so G cov(beta) G^T.
+
+A body that was added has a pseudo-inertia >= 0, one that was taken off has the negative of one. Of both sets the point
+nearest to x in the metric of its covariance is sought, and told by its distance (`drift.probability`) and by the torque
+that lies between: too far from both means that no single body explains the recording, as when one tool was exchanged
+for another.
+
+Boundary: pure computation, no I/O.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ident_service.errors import ParameterError, SolverError
+from ident_service.estimation.doubt import Verdict, block_covariance, verdicts
+from ident_service.estimation.drift import (
+    ALPHA,
+    Identified,
+    Motion,
+    Test,
+    difference_test,
+    probability,
+    relevant,
+    torque_shares,
+)
+from ident_service.estimation.equations import Equations
+from ident_service.estimation.feasible.conic import ConicProblem
+from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
+from ident_service.estimation.feasible.nearest import nearest
+from ident_service.estimation.feasible.posing import EPSILON, Lift, constrain
+from ident_service.estimation.least_squares import LeastSquares, TorqueError, torque_error, weighted_least_squares
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.base import BaseParameters, grouping
+from ident_service.model.chain import Array
+from ident_service.model.information import Information, triangle
+from ident_service.model.layout import INERTIAL
+from ident_service.model.threads import one_blas_thread
+
+Word = Literal["none", "added", "removed", "infeasible"]
+
+_NO_VARIANCE = 1e-10  # of an eigenvalue of the correlations, against the largest
+_FELT = 1e-9  # of the arm's doubt in a parameter, below which a payload does not depend on it
+
+
+@dataclass(frozen=True)
+class KnownArm:
+    """An arm that has been identified.
+
+    Attributes:
+        model: with its friction's shape and delay as numbers.
+        base: grouping of its parameters.
+        beta: base parameters in SI units, shape (base,).
+        covariance: of them, infinite on the diagonal where nothing was seen, shape (base, base).
+        blocks: that the covariance comes from; None where it is known exactly.
+    """
+
+    model: ArmModel
+    base: BaseParameters
+    beta: Array
+    covariance: Array
+    blocks: int | None = None
+
+    def __post_init__(self) -> None:
+        size = self.base.size
+        if self.beta.shape != (size,) or self.covariance.shape != (size, size):
+            raise ParameterError(f"{self.beta.shape=} and {self.covariance.shape=} but {size} base parameters")
+        if self.base.names != self.model.layout.names:
+            raise ParameterError("the parameters are about other links or joint terms than the arm has")
+
+
+@dataclass(frozen=True)
+class Body:
+    """The body nearest to an estimate among those that were added, or among those that were taken off.
+
+    Attributes:
+        delta: its ten parameters in the last link's frame (eq. 13), positive mass, and the offsets, shape (names,).
+        b: what it adds to the arm in base parameters of the payload: minus itself if taken off, shape (payload,).
+        p: how often an estimate lies farther away by chance.
+        torque_share: per joint, of its torque, by which it predicts otherwise than the estimate, shape (joints,).
+        explains: whether it lies near enough, in deviations or in torque.
+        margin: smallest eigenvalue of its pseudo-inertia.
+    """
+
+    delta: Array
+    b: Array
+    p: float
+    torque_share: Array
+    explains: bool
+    margin: float
+
+
+@dataclass(frozen=True)
+class Payload:
+    """What a second recording says of a body on, or missing from, the last link.
+
+    Attributes:
+        base: grouping of the ten parameters in the last link's frame, and of the offsets if they were refitted.
+        T: what these add to the arm's base parameters, shape (base of the arm, payload).
+        fit: the unconstrained least squares; `fit.beta` is b.
+        noise: its covariance from this recording alone, shape (payload, payload).
+        G: what b depends on the arm's beta by, with the sign turned, shape (payload, base of the arm).
+        covariance: of b, the arm's doubt included, infinite on the diagonal where nothing was seen.
+        standard_deviations: its diagonal's root, shape (payload,).
+        verdicts: one per base parameter of the payload.
+        blocks: of time, that `noise` comes from.
+        test: that there is no payload.
+        torque_share: per joint, what the payload changes of its torque (root mean squares), shape (joints,).
+        verdict: in one word.
+        body: that was added or taken off; None otherwise.
+        without: torque error of the arm as it was identified, on this recording.
+        fitted: torque error with the body, or with the unconstrained estimate where no body explains it.
+    """
+
+    base: BaseParameters
+    T: Array
+    fit: LeastSquares
+    noise: Array
+    G: Array
+    covariance: Array
+    standard_deviations: Array
+    verdicts: tuple[Verdict, ...]
+    blocks: int
+    test: Test
+    torque_share: Array
+    verdict: Word
+    body: Body | None
+    without: TorqueError
+    fitted: TorqueError
+
+
+@one_blas_thread()
+def identify_payload(arm: KnownArm, recorded: Equations, *, refit_offsets: bool = False) -> Payload:
+    """Identify what an arm carries from a recording with it.
+
+    Args:
+        arm: as it was identified, with another load or none.
+        recorded: equations of the second recording in the arm's base parameters, from `fit.gather`.
+        refit_offsets: whether the offset of every joint may differ too, as after a restart that zeroed the torques.
+
+    Raises:
+        ModelError: the weights of the joints do not settle.
+        ParameterError: the arm has no such offsets.
+        SolverError: the solver stopped without an optimum.
+    """
+    base, T, own = _columns(arm, refit_offsets)
+    reduced = _reduced(recorded, arm.beta, T)
+    fit = weighted_least_squares(reduced.total)
+    noise = block_covariance(reduced, fit)
+    G = _dependence(recorded.total, T, fit)
+    covariance, doubt = _with_doubt(arm, noise, G)
+    total = recorded.total
+    seen = np.isfinite(np.diag(covariance))
+
+    responses = Motion.of(reduced.total, fit.beta)
+    measured = np.sqrt(total.squared_torques() / np.maximum(total.rows, 1))
+    motion = Motion(responses.responses, measured, responses.residual)
+    leading = tuple(base.names[column] for column in base.base)
+    arm_side = Identified(leading, np.zeros(base.size), doubt, arm.blocks)
+    blocks = len(reduced.blocks)
+    new_side = Identified(leading, fit.beta, noise, blocks, motion)
+    test = difference_test(arm_side, new_side, own)
+    only = np.zeros(base.size)
+    only[own] = np.where(seen, fit.beta, 0.0)[own]
+    shares = torque_shares(arm_side, new_side, only)
+
+    found: dict[Word, Body] = {}
+    word: Word = "none"
+    if test.p < ALPHA and relevant(shares):
+        conditions = feasible_set("pseudo_inertia", base.names)
+        whole = difference_test(arm_side, new_side, range(base.size))
+        signs: dict[Word, float] = {"added": 1.0, "removed": -1.0}
+        for kind, sign in signs.items():
+            found[kind] = _body(fit.beta, covariance, base, conditions, sign, whole, (arm_side, new_side))
+        best = max(found, key=lambda kind: (found[kind].explains, found[kind].p))
+        word = best if found[best].explains else "infeasible"
+    body = found.get(word)
+    moved = np.zeros(base.size) if word == "none" else fit.beta if body is None else body.b
+    everything = recorded.everything
+    deviations = np.sqrt(np.diag(covariance))
+    return Payload(
+        base=base,
+        T=T,
+        fit=fit,
+        noise=noise,
+        G=G,
+        covariance=covariance,
+        standard_deviations=deviations,
+        verdicts=verdicts(fit.beta, deviations, base.units),
+        blocks=blocks,
+        test=test,
+        torque_share=motion.change(only) / np.maximum(measured, np.finfo(float).tiny),
+        verdict=word,
+        body=body,
+        without=torque_error(everything, arm.beta),
+        fitted=torque_error(everything, arm.beta + T @ moved),
+    )
+
+
+def loaded_covariance(arm: KnownArm, payload: Payload) -> Array:
+    """Covariance of the base parameters of the arm with its payload, shape (base, base)."""
+    unseen = ~np.isfinite(np.diag(arm.covariance))
+    M = np.eye(arm.base.size) - payload.T @ payload.G
+    known = np.where(unseen[:, None] | unseen[None, :], 0.0, arm.covariance)
+    blind = ~np.isfinite(np.diag(payload.covariance))
+    noise = np.where(blind[:, None] | blind[None, :], 0.0, payload.noise)
+    covariance = M @ known @ M.T + payload.T @ noise @ payload.T.T
+    lost = unseen | np.any(np.abs(payload.T[:, blind]) > 0.0, axis=1)
+    covariance[lost, :] = covariance[:, lost] = 0.0
+    covariance[lost, lost] = np.inf
+    return np.asarray(covariance)
+
+
+def _columns(arm: KnownArm, refit_offsets: bool) -> tuple[BaseParameters, Array, list[int]]:
+    """Grouping of what may move, what it adds to beta, and which of the groups are the body's own."""
+    layout = arm.model.layout
+    columns = list(range(*layout.inertial(layout.joints - 1).indices(layout.size)))
+    if refit_offsets:
+        offsets = layout.term_columns("offset")
+        if not len(offsets):
+            raise ParameterError(f"{arm.model.config.name}: has no offsets to refit; its terms lack `offset`")
+        columns += offsets.tolist()
+    names, units = (tuple(table[column] for column in columns) for table in (layout.names, layout.units))
+    base = grouping(arm.base.K[:, columns], names, units)
+    T = arm.base.K[:, columns][:, base.base]
+    return base, T, [place for place, column in enumerate(base.base) if column < len(INERTIAL)]
+
+
+def _reduced(recorded: Equations, beta: Array, T: Array) -> Equations:
+    """The same equations with the arm's torques taken off and the payload's parameters as unknowns."""
+
+    def one(information: Information) -> Information:
+        factors = []
+        for support, factor in zip(information.supports, information.factors, strict=True):
+            rest = factor[:, -1] - factor[:, :-1] @ beta[support]
+            factors.append(triangle(np.column_stack([factor[:, :-1] @ T[support], rest])))
+        supports = tuple(np.arange(T.shape[1]) for _ in factors)
+        return Information(supports, tuple(factors), information.rows.copy(), T.shape[1])
+
+    left_out = None if recorded.left_out is None else one(recorded.left_out)
+    return Equations(tuple(one(block) for block in recorded.blocks), recorded.samples, left_out)
+
+
+def _dependence(information: Information, T: Array, fit: LeastSquares) -> Array:
+    """G, shape (payload, base of the arm)."""
+    normal = np.zeros((T.shape[1], len(T)))
+    for weight, support, factor in zip(fit.weights, information.supports, information.factors, strict=True):
+        W = factor[:, :-1]
+        normal[:, support] += weight**2 * (W @ T[support]).T @ W
+    return np.asarray(fit.inverse @ fit.inverse.T @ normal)
+
+
+def _with_doubt(arm: KnownArm, noise: Array, G: Array) -> tuple[Array, Array]:
+    """Covariance of the payload, and the part of it that is the arm's doubt."""
+    unseen = ~np.isfinite(np.diag(arm.covariance))
+    known = np.where(unseen[:, None] | unseen[None, :], 0.0, arm.covariance)
+    doubt = G @ known @ G.T
+    size = np.maximum(np.abs(G).max(axis=1, initial=0.0), np.finfo(float).tiny)
+    lost = np.any(np.abs(G[:, unseen]) > _FELT * size[:, None], axis=1)
+    doubt[lost, lost] = np.inf
+    return noise + doubt, doubt
+
+
+def _body(
+    b: Array,
+    covariance: Array,
+    base: BaseParameters,
+    conditions: FeasibleSet,
+    sign: float,
+    whole: Test,
+    sides: tuple[Identified, Identified],
+) -> Body:
+    metric = _metric(covariance)
+    # Offsets turn with the body, and back again.
+    found = nearest(metric, sign * metric @ b, sign * b, base, conditions, "payload")
+    p = probability(found.objective**2, max(whole.directions, 1), whole.degrees)
+    moved = sign * found.beta
+    rest = np.where(np.isfinite(np.diag(covariance)), b - moved, 0.0)
+    shares = torque_shares(*sides, rest)
+    explains = p >= ALPHA or not relevant(shares)
+    delta = _smallest(found.delta, base, conditions)
+    share = np.zeros(0) if shares is None else shares[0]
+    return Body(delta, moved, p, share, explains, conditions.margin(delta)[0])
+
+
+def _smallest(delta: Array, base: BaseParameters, conditions: FeasibleSet) -> Array:
+    """The body of the same base parameters with the least tr(P) = m + tr(L) / 2: what no motion shows stays small."""
+    if not len(base.dependent):
+        return delta
+    lift = Lift(base)
+    fixed = lift.of_beta @ (base.K @ delta)
+    problem = ConicProblem(len(base.dependent))
+    for block in conditions.blocks:
+        # Half the inset that the nearest body has, so that there is room.
+        inside = block.f + block.F @ fixed - 0.5 * EPSILON * block.identity()
+        constrain(problem, block, block.times(lift.of_dependent), inside)
+    trace = np.array([0.5 if name[:3] in ("Lxx", "Lyy", "Lzz") else float(name[0] == "m") for name in base.names])
+    try:
+        solution = problem.minimise(trace @ lift.of_dependent, "smallest payload")
+    except SolverError:
+        return delta
+    smallest = np.asarray(fixed + lift.of_dependent @ solution.x)
+    return smallest if conditions.margin(smallest)[0] > 0.0 else delta
+
+
+def _metric(covariance: Array) -> Array:
+    """Rows whose product with a difference has its length in deviations; what was not seen counts nothing."""
+    seen = np.flatnonzero(np.isfinite(np.diag(covariance)))
+    part = covariance[np.ix_(seen, seen)]
+    scale = np.sqrt(np.maximum(np.diag(part), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(part / np.outer(scale, scale))
+    kept = values > _NO_VARIANCE * values[-1]
+    metric = np.zeros((int(kept.sum()), len(covariance)))
+    metric[:, seen] = (vectors[:, kept] / np.sqrt(values[kept])).T / scale
+    return metric
+
+
+def center_of_mass(payload: Payload) -> tuple[Array, Array] | None:
+    """Centre of mass in the last link's frame and its standard deviations [m], each of shape (3,).
+
+    Unconstrained, so that the deviations belong to it; None where mass or a first moment is not shown on its own.
+    """
+    places = {payload.base.names[column]: place for place, column in enumerate(payload.base.base)}
+    last = payload.base.names[0][3:]
+    wanted = [f"{symbol}{last}" for symbol in ("lx", "ly", "lz", "m")]
+    alone = [name for name in wanted if name in places and np.count_nonzero(payload.base.K[places[name]]) == 1]
+    if len(alone) < 4:
+        return None
+    at = [places[name] for name in wanted]
+    if not np.all(np.isfinite(payload.standard_deviations[at])):
+        return None
+    x, mass = payload.fit.beta[at], payload.fit.beta[at[3]]
+    J = np.column_stack([np.eye(3), -x[:3] / mass]) / mass
+    return x[:3] / mass, np.sqrt(np.diag(J @ payload.covariance[np.ix_(at, at)] @ J.T))

@@ -1,0 +1,125 @@
+"""An identified arm as a pinocchio model with friction, and what pinocchio reads of one in a file.
+
+Pinocchio's algorithms know armature and leave friction alone, though a model can carry it as numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+import pinocchio as pin
+
+from ident_service.config.quantities import TextFile
+from ident_service.config.schema import Joint
+from ident_service.errors import ModelError
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.chain import Array
+from ident_service.model.drives import WrittenArm, joint_drives
+from ident_service.model.rigid_body import mjcf_model, pinocchio_model, read_mjcf, read_urdf, urdf_model
+
+
+class DynamicModel:
+    """An arm with known parameters.
+
+    Attributes:
+        model: for pinocchio's own algorithms: one position and one velocity per joint, gravity, armature, and damping,
+            dry friction and limits as far as they are known. Where drives move several joints, no joint has an
+            armature, damping or friction of its own, and only the methods here know these terms.
+        arm: the mechanism and its configuration.
+        delta: link parameters, shape (arm.layout.size,).
+    """
+
+    model: pin.Model
+    arm: ArmModel
+    delta: Array
+
+    def __init__(self, arm: ArmModel, delta: Array) -> None:
+        """Build the model.
+
+        Raises:
+            ModelError: `delta` does not fit the arm, or a link has no positive mass.
+        """
+        if delta.shape != (arm.layout.size,):
+            raise ModelError(f"{delta.shape=} but the arm has {arm.layout.size} parameters")
+        chain, layout = arm.chain, arm.layout
+        links_only = np.array(delta, dtype=float)
+        links_only[layout.term_columns("drive_inertia")] = 0.0
+        self.arm, self.delta = arm, delta
+        self.model = pinocchio_model(replace(chain, coupling=np.eye(chain.joints)), layout, links_only)
+        self.model.name = arm.config.name
+        drives = joint_drives(chain, layout, delta)
+        self.model.armature = drives.armature
+        self.model.damping = drives.damping
+        _set_dry_friction(self.model, drives.friction)
+        _set_limits(self.model, arm)
+        self._data = self.model.createData()
+        inertia = layout.term_values("drive_inertia", delta)
+        # What armatures do not say: zero where every joint has its own drive.
+        self._shared = chain.coupling.T @ (inertia[:, None] * chain.coupling) - np.diag(drives.armature)
+
+    def friction(self, velocity: Array) -> Array:
+        """Torque that friction takes, offsets included; dry friction has the sign of the velocity, none at rest.
+
+        Args:
+            velocity: [rad/s or m/s], shape (..., joints).
+
+        Returns:
+            [N m or N], shape (..., joints).
+        """
+        coupling, layout = self.arm.chain.coupling, self.arm.layout
+        rate = np.asarray(velocity, dtype=float) @ coupling.T
+        fv, fc, fo = (layout.term_values(term, self.delta) for term in ("viscous", "coulomb", "offset"))
+        fq, fa = (layout.term_values(term, self.delta) for term in ("quadratic", "viscous_asymmetry"))
+        taken = fv * rate + fc * np.sign(rate) + fo + fq * rate * np.abs(rate) + fa * np.abs(rate)
+        if "stribeck" in layout.terms:
+            bell = np.exp(-((rate / np.array(layout.stribeck_velocity)) ** 2))
+            taken = taken + layout.term_values("stribeck", self.delta) * np.sign(rate) * bell
+        return np.asarray(taken @ coupling)
+
+    def inverse_dynamics(self, position: Array, velocity: Array, acceleration: Array) -> Array:
+        """Torque of a motion: links, drives and friction; what the regressor predicts (eq. 29).
+
+        Args:
+            position: [rad or m], shape (joints,).
+            velocity: [rad/s or m/s], shape (joints,).
+            acceleration: [rad/s^2 or m/s^2], shape (joints,).
+
+        Returns:
+            [N m or N], shape (joints,).
+        """
+        rigid = pin.rnea(self.model, self._data, position, velocity, acceleration)
+        return np.asarray(rigid + self._shared @ acceleration + self.friction(velocity))
+
+
+def _set_dry_friction(model: pin.Model, friction: Array) -> None:
+    if hasattr(model, "upperDryFrictionLimit"):
+        model.lowerDryFrictionLimit, model.upperDryFrictionLimit = -friction, friction
+    else:
+        model.friction = friction
+
+
+def _set_limits(model: pin.Model, arm: ArmModel) -> None:
+    joints = [arm.config.joints.get(name, Joint()) for name in arm.chain.names]
+    ranges = [joint.position or (-np.inf, np.inf) for joint in joints]
+    model.lowerPositionLimit, model.upperPositionLimit = np.array(ranges).T
+    speed = np.array([joint.velocity or np.inf for joint in joints])
+    torque = np.array([joint.torque or np.inf for joint in joints])
+    if hasattr(model, "upperVelocityLimit"):
+        model.lowerVelocityLimit, model.upperVelocityLimit = -speed, speed
+        model.lowerEffortLimit, model.upperEffortLimit = -torque, torque
+    else:
+        model.velocityLimit, model.effortLimit = speed, torque
+
+
+def read_back(file: TextFile, kind: Literal["urdf", "mjcf"], gravity: tuple[float, float, float]) -> WrittenArm:
+    """Read a file that was written, for comparison.
+
+    Raises:
+        ModelError: it cannot be read.
+    """
+    model = urdf_model(file) if kind == "urdf" else mjcf_model(file)
+    chain, bodies = (read_urdf if kind == "urdf" else read_mjcf)(file, gravity)
+    dry = model.upperDryFrictionLimit if hasattr(model, "upperDryFrictionLimit") else model.friction
+    return WrittenArm(chain, bodies, np.array(model.armature), np.array(model.damping), np.array(dry))

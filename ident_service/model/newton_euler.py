@@ -1,0 +1,234 @@
+"""Inverse dynamics, gravity and mass matrix as formulas of joint states and parameters, by recursion.
+
+Newton-Euler outwards and inwards with the ten parameters of eq. 13 per link: with w, e and a the angular velocity,
+angular acceleration and linear acceleration of the link frame's origin (gravity as an upward acceleration of the base),
+
+    f = m a + e x l + w x (w x l)          n = L e + w x (L w) + l x a
+
+(`regressor.py`). Nothing is divided, so that masses may be zero and inertias indefinite: with the base columns at the
+values of the base parameters and every other column at zero, `K delta = beta` holds, and so do all torques (eq. 37).
+The mass matrix is that of composite bodies, whose ten parameters simply add up.
+
+Boundary: formulas on a tape (`tape.py`); who runs or prints them is elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from ident_service.config.schema import JointTerm
+from ident_service.model.chain import WORLD, Array, Chain
+from ident_service.model.layout import INERTIAL, Layout
+from ident_service.model.tape import Symbol, Tape, Value
+from ident_service.model.vectors import ZERO, Rotation, Vector, add, constant, cross, dot, rotate, scaled, turned
+
+Parameters = Mapping[int, Value]
+"""Values of columns of delta; columns that are not there are zero."""
+
+
+@dataclass(frozen=True)
+class _Body:
+    """L (symmetric, rows), first moment l and m of eq. 13 about the origin of some frame."""
+
+    L: Rotation
+    first: Vector
+    m: Value
+
+
+def rigid_torque(
+    tape: Tape, chain: Chain, layout: Layout, parameters: Parameters, q: Sequence[Symbol], *rates: Sequence[Value]
+) -> list[Value]:
+    """Torque of the links: M(q) ddq + c(q, dq) + g(q) without drives.
+
+    Args:
+        tape: to write on.
+        chain: the mechanism.
+        layout: order of the parameters.
+        parameters: of the links.
+        q: joint positions.
+        rates: dq and ddq; without them those of a standing arm, which leaves gravity.
+    """
+    n = chain.joints
+    dq, ddq = rates or ([0.0] * n, [0.0] * n)
+    steps = [_Step(tape, chain, k, q) for k in range(n)]
+    motion: list[tuple[Vector, Vector, Vector]] = []
+    base: tuple[Vector, Vector, Vector] = (ZERO, ZERO, [-float(g) for g in chain.gravity])
+    for k, step in enumerate(steps):
+        motion.append(step.outwards(base if step.parent == WORLD else motion[step.parent], dq[k], ddq[k]))
+    force, moment = [list(ZERO) for _ in range(n)], [list(ZERO) for _ in range(n)]
+    torque: list[Value] = [0.0] * n
+    for k in range(n - 1, -1, -1):
+        f, m = _link_wrench(chain, k, motion[k], _link_body(layout, parameters, k))
+        force[k], moment[k] = add(force[k], f), add(moment[k], m)
+        torque[k] = steps[k].felt(force[k], moment[k])
+        if (parent := chain.parents[k]) != WORLD:
+            f, m = steps[k].inwards(force[k], moment[k])
+            force[parent], moment[parent] = add(force[parent], f), add(moment[parent], m)
+    return torque
+
+
+def mass_matrix(
+    tape: Tape, chain: Chain, layout: Layout, parameters: Parameters, q: Sequence[Symbol]
+) -> list[list[Value]]:
+    """M(q), drive inertia included: composite bodies, whose weight every joint on the way to the base feels."""
+    n = chain.joints
+    steps = [_Step(tape, chain, k, q) for k in range(n)]
+    composite = [
+        _seen_from(
+            _link_body(layout, parameters, k), _rows(chain.link_rotation[k]), constant(chain.link_translation[k])
+        )
+        for k in range(n)
+    ]
+    M: list[list[Value]] = [[0.0] * n for _ in range(n)]
+    for k in range(n - 1, -1, -1):
+        step, body = steps[k], composite[k]
+        if step.revolute:
+            force, moment = cross(step.axis, body.first), rotate(body.L, step.axis)
+        else:
+            force, moment = scaled(step.axis, body.m), cross(body.first, step.axis)
+        at = k
+        M[k][k] = step.felt(force, moment)
+        while (parent := chain.parents[at]) != WORLD:
+            force, moment = steps[at].inwards(force, moment)
+            at = parent
+            M[at][k] = M[k][at] = steps[at].felt(force, moment)
+        if (parent := chain.parents[k]) != WORLD:
+            composite[parent] = _sum(composite[parent], _seen_from(body, _transposed(step.rotation), step.arm))
+    for drive, column in enumerate(layout.term_columns("drive_inertia")):
+        inertia = parameters.get(int(column), 0.0)
+        share = constant(chain.coupling[drive])
+        for i in range(n):
+            for j in range(n):
+                M[i][j] = M[i][j] + inertia * (share[i] * share[j])
+    return M
+
+
+def drive_torque(chain: Chain, layout: Layout, parameters: Parameters, ddq: Sequence[Value]) -> list[Value]:
+    """What accelerating the drives takes, in the rows of the joints they move."""
+    torque: list[Value] = [0.0] * chain.joints
+    for drive, column in enumerate(layout.term_columns("drive_inertia")):
+        share = constant(chain.coupling[drive])
+        taken = parameters.get(int(column), 0.0) * _weighted(share, ddq)
+        torque = [t + s * taken for t, s in zip(torque, share, strict=True)]
+    return torque
+
+
+def friction_torque(
+    tape: Tape, chain: Chain, layout: Layout, parameters: Parameters, dq: Sequence[Symbol]
+) -> list[Value]:
+    """What friction takes (`layout.py`), the direction of motion being the sign of the drive's velocity."""
+    torque: list[Value] = [0.0] * chain.joints
+    columns = {term: layout.term_columns(term) for term in layout.terms}
+    for drive in range(chain.joints):
+        share = constant(chain.coupling[drive])
+        rate = _weighted(share, dq)
+        taken: Value = 0.0
+        for term, places in columns.items():
+            if term != "drive_inertia" and (column := int(places[drive])) in parameters:
+                taken = taken + parameters[column] * _shape(tape, layout, term, drive, rate)
+        torque = [t + s * taken for t, s in zip(torque, share, strict=True)]
+    return torque
+
+
+def _shape(tape: Tape, layout: Layout, term: JointTerm, drive: int, rate: Value) -> Value:
+    """What a friction parameter is multiplied by."""
+    if not isinstance(rate, Symbol):
+        return 1.0 if term == "offset" else 0.0  # a drive that moves no joint
+    if term == "offset":
+        return 1.0
+    if term == "viscous":
+        return rate
+    if term == "coulomb":
+        return tape.apply("sign", rate)
+    if term == "stribeck":
+        ratio = rate * (1.0 / layout.stribeck_velocity[drive])
+        bell = -(ratio * ratio)
+        return tape.apply("sign", rate) * (tape.apply("exp", bell) if isinstance(bell, Symbol) else 1.0)
+    return rate * tape.apply("abs", rate) if term == "quadratic" else tape.apply("abs", rate)
+
+
+class _Step:
+    """From a parent's joint frame to a joint's: `arm` in the parent's frame, then `rotation` into the joint's."""
+
+    def __init__(self, tape: Tape, chain: Chain, k: int, q: Sequence[Symbol]) -> None:
+        self.parent = chain.parents[k]
+        self.revolute = chain.revolute[k]
+        self.axis = constant(chain.axes[k])
+        self.arm = constant(chain.translation[k])
+        if self.revolute:
+            cosine, sine = tape.apply("cos", q[k]), tape.apply("sin", q[k])
+            self.rotation = turned(chain.rotation[k], chain.axes[k], cosine, sine)
+        else:
+            self.rotation = _rows(chain.rotation[k].T)
+            self.arm = add(self.arm, scaled(constant(chain.rotation[k] @ chain.axes[k]), q[k]))
+
+    def outwards(
+        self, motion: tuple[Vector, Vector, Vector], rate: Value, acceleration: Value
+    ) -> tuple[Vector, Vector, Vector]:
+        """Motion w, e, a of the joint frame's origin from that of the parent's."""
+        w, e, a = motion
+        a = rotate(self.rotation, add(a, add(cross(e, self.arm), cross(w, cross(w, self.arm)))))
+        w, e = rotate(self.rotation, w), rotate(self.rotation, e)
+        speed, along = scaled(self.axis, rate), scaled(self.axis, acceleration)
+        if self.revolute:
+            return add(w, speed), add(add(e, along), cross(w, speed)), a
+        return w, e, add(add(a, along), scaled(cross(w, speed), 2.0))
+
+    def inwards(self, force: Vector, moment: Vector) -> tuple[Vector, Vector]:
+        """A force and moment about this joint's origin, in the parent's frame about the parent's."""
+        back = _transposed(self.rotation)
+        force = rotate(back, force)
+        return force, add(rotate(back, moment), cross(self.arm, force))
+
+    def felt(self, force: Vector, moment: Vector) -> Value:
+        """The share of a force and moment that the joint has to give."""
+        return dot(self.axis, moment if self.revolute else force)
+
+
+def _link_body(layout: Layout, parameters: Parameters, link: int) -> _Body:
+    first = layout.inertial(link).start
+    xx, xy, xz, yy, yz, zz, x, y, z, m = (parameters.get(first + k, 0.0) for k in range(len(INERTIAL)))
+    return _Body([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], [x, y, z], m)
+
+
+def _link_wrench(chain: Chain, link: int, motion: tuple[Vector, Vector, Vector], body: _Body) -> tuple[Vector, Vector]:
+    """What moving a link takes: force, and moment about the joint frame's origin, in the joint frame."""
+    w, e, a = motion
+    arm, out = constant(chain.link_translation[link]), _rows(chain.link_rotation[link].T)
+    a = rotate(out, add(a, add(cross(e, arm), cross(w, cross(w, arm)))))
+    w, e = rotate(out, w), rotate(out, e)
+    force = add(scaled(a, body.m), add(cross(e, body.first), cross(w, cross(w, body.first))))
+    moment = add(add(rotate(body.L, e), cross(w, rotate(body.L, w))), cross(body.first, a))
+    back = _rows(chain.link_rotation[link])
+    force = rotate(back, force)
+    return force, add(rotate(back, moment), cross(arm, force))
+
+
+def _seen_from(body: _Body, rotation: Rotation, arm: Vector) -> _Body:
+    """The same body about the origin that its own lies `arm` away from, turned by `rotation` (Steiner, eq. 8)."""
+    first = rotate(rotation, body.first)
+    half = _transposed([rotate(rotation, row) for row in body.L])  # R L, since L is symmetric
+    L = [rotate(rotation, row) for row in half]
+    twice = dot(arm, first) * 2.0 + body.m * dot(arm, arm)
+    for i in range(3):
+        for j in range(i, 3):
+            moved = L[i][j] - (arm[i] * first[j] + first[i] * arm[j]) - body.m * (arm[i] * arm[j])
+            L[i][j] = L[j][i] = moved + twice if i == j else moved
+    return _Body(L, add(first, scaled(arm, body.m)), body.m)
+
+
+def _rows(matrix: Array) -> Rotation:
+    return [constant(row) for row in matrix]
+
+
+def _transposed(rotation: Rotation) -> Rotation:
+    return [list(column) for column in zip(*rotation, strict=True)]
+
+
+def _sum(a: _Body, b: _Body) -> _Body:
+    return _Body([add(x, y) for x, y in zip(a.L, b.L, strict=True)], add(a.first, b.first), a.m + b.m)
+
+
+def _weighted(share: Vector, values: Sequence[Value]) -> Value:
+    return sum((c * x for c, x in zip(share, values, strict=True)), 0.0)

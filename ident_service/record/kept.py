@@ -1,0 +1,61 @@
+"""A recording whose samples stay in memory once they have been read, so that decoding is paid for once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from ident_service.record.recording import BLOCK_SAMPLES, Block, Matrix, Recording, Stamps, cut, join
+
+MAX_BYTES: Final = 128 << 20  # a quarter of an hour of seven joints at 1 kHz
+
+
+class KeptRecording:
+    """Another recording behind the same protocol; one that is larger than a bound is read from its file every time."""
+
+    def __init__(self, whole: Recording, max_bytes: int = MAX_BYTES) -> None:
+        """Stand before `whole`, and keep at most `max_bytes` of its samples."""
+        self.path: Path = whole.path
+        self.sha256 = whole.sha256
+        self.joint_names = whole.joint_names
+        self.joints = whole.joints
+        self.torque_held = whole.torque_held
+        self._whole, self._max_bytes = whole, max_bytes
+        self._kept: Block | None = None
+
+    @property
+    def torn(self) -> bool:
+        """True when the file ended in the middle of a record and was read up to there."""
+        return self._whole.torn
+
+    @torn.setter
+    def torn(self, torn: bool) -> None:
+        self._whole.torn = torn
+
+    def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
+        """Read the samples in order; see `Recording.blocks`. Nobody may write into a block."""
+        if self._kept is not None:
+            for start in range(0, len(self._kept.stamp_ns), samples):
+                yield cut(self._kept, start, start + samples)
+            return
+        blocks: list[Block] | None = []
+        size = 0
+        for block in self._whole.blocks(samples):
+            for array in _arrays(block):
+                array.setflags(write=False)
+                size += array.nbytes
+            if blocks is not None and size <= self._max_bytes:
+                blocks.append(block)
+            else:
+                blocks = None
+            yield block
+        if blocks:
+            self._kept = join(blocks)
+            for array in _arrays(self._kept):
+                array.setflags(write=False)
+
+
+def _arrays(block: Block) -> list[Matrix | Stamps]:
+    arrays: list[Matrix | Stamps] = [block.stamp_ns, block.position, block.torque]
+    return arrays if block.velocity is None else [*arrays, block.velocity]

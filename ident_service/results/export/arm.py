@@ -1,0 +1,128 @@
+"""What an export is made from: the arm, its base parameters, and one body that has them where there is one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from ident_service.config.schema import ArmConfig
+from ident_service.errors import ModelError, ParameterError
+from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.model.base import BaseParameters, base_from_expressions
+from ident_service.model.chain import Array
+from ident_service.model.regressor import joint_regressor
+from ident_service.results.export.check import AGREEMENT, disagreement, random_states
+from ident_service.results.parameter_file import ParameterFile
+from ident_service.results.run_folder import PARAMETERS, Results, read_results
+
+
+@dataclass(frozen=True)
+class IdentifiedArm:
+    """An arm with its identified parameters.
+
+    Attributes:
+        model: the arm, with what the recordings said of its friction's shape.
+        base: the grouping of the parameters, columns in the order of `model.layout`.
+        beta: base parameters [SI], shape (base,).
+        delta: link parameters of a body that has them [SI], shape (layout.size,); None where no body has.
+        sigma: standard deviations of the base parameters, None where unknown.
+        verdicts: one word per base parameter, empty where unknown.
+        source: SHA-256 of the parameter file.
+    """
+
+    model: ArmModel
+    base: BaseParameters
+    beta: Array
+    delta: Array | None
+    sigma: tuple[float | None, ...]
+    verdicts: tuple[str, ...]
+    source: str
+
+    @cached_property
+    def base_delta(self) -> Array:
+        """Link parameters with the base parameters and nothing but base columns, shape (layout.size,).
+
+        No body has them, and all torques are theirs (eq. 37).
+        """
+        delta = np.zeros(self.model.layout.size)
+        delta[self.base.base] = np.linalg.solve(self.base.K[:, self.base.base], self.beta)
+        return delta
+
+    def body(self) -> Array:
+        """Link parameters that a body has, shape (layout.size,).
+
+        Raises:
+            ModelError: no body has these base parameters.
+        """
+        if self.delta is None:
+            raise ModelError(
+                f"{self.model.config.name}: no body has these parameters, so there are no link inertias to export; "
+                "csv, json and c take base parameters, and `ident correct` gives the nearest ones that a body has"
+            )
+        return self.delta
+
+
+def identified_arm(config: ArmConfig, parameters: ParameterFile, source: str, where: Path) -> IdentifiedArm:
+    """Put an arm and a parameter file together.
+
+    Args:
+        config: the arm, its friction's shape as identified.
+        parameters: of that arm.
+        source: SHA-256 of the parameter file.
+        where: the parameter file, for errors.
+
+    Raises:
+        ModelError: the mechanism cannot be represented.
+        ParameterError: the parameters are not this arm's, or the link values do not have the base values.
+    """
+    model = arm_model(config)
+    names, table = model.layout.names, parameters.content["base_parameters"]
+    try:
+        base = base_from_expressions(tuple(table["expressions"]), names)
+    except ParameterError as error:
+        raise ParameterError(f"{where}: not parameters of {config.name}: {error}") from None
+    base = replace(base, units=tuple(model.layout.units[column] for column in base.base))
+    H = joint_regressor(model.chain, model.layout, *random_states(model.chain.joints))
+    grouped = np.linalg.solve(base.K[:, base.base], base.K)
+    if disagreement(np.einsum("jbs,bp->jps", H[:, base.base], grouped), H) > AGREEMENT:
+        raise ParameterError(
+            f"{where}: its expressions do not group the parameters of {config.name} as its motion does"
+        )
+    sigma, verdicts = table.get("standard_deviations"), table.get("verdicts")
+    return IdentifiedArm(
+        model=model,
+        base=base,
+        beta=parameters.values,
+        delta=_link_values(parameters, base, where),
+        sigma=tuple(sigma or [None] * base.size),
+        verdicts=tuple(verdicts or [""] * base.size),
+        source=source,
+    )
+
+
+def read_identified(folder: Path) -> IdentifiedArm:
+    """The arm of a folder of results, every file in it found to be what its manifest names.
+
+    Raises:
+        UsageError: no such folder, or nothing was identified in it.
+        ParameterError: its files are torn, changed, foreign, or do not belong together.
+        ConfigError, ModelError: the arm in it cannot be used.
+    """
+    results: Results = read_results(folder)
+    return identified_arm(results.config, results.parameters, results.sha256[PARAMETERS], folder / PARAMETERS)
+
+
+def _link_values(parameters: ParameterFile, base: BaseParameters, where: Path) -> Array | None:
+    table = parameters.content.get("link_parameters")
+    if table is None:
+        return None
+    named = dict(zip(table["names"], table["values"], strict=False))
+    if len(table["names"]) != len(table["values"]) or set(named) != set(base.names):
+        raise ParameterError(f"{where}: its link parameters are not those of the arm")
+    delta = np.array([float(named[name]) for name in base.names])
+    if np.abs(base.K @ delta - parameters.values).max() > AGREEMENT * np.abs(parameters.values).max():
+        raise ParameterError(f"{where}: its link parameters do not have the values of its base parameters")
+    return delta

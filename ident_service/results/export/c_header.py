@@ -1,0 +1,226 @@
+"""A C99 header with the arm's dynamics in base parameters: nothing but <math.h>, no memory, no state, C++ too.
+
+The formulas are those of `model/newton_euler.py`, printed one operation a line, with a zero for every link parameter
+that is no base column. What is written is read back as text and run.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from ident_service import __version__
+from ident_service.config.schema import JointTerm
+from ident_service.errors import ModelError
+from ident_service.model.chain import Array
+from ident_service.model.newton_euler import drive_torque, friction_torque, mass_matrix, rigid_torque
+from ident_service.model.tape import Symbol, Tape, Value
+from ident_service.results.export.arm import IdentifiedArm
+from ident_service.results.export.c_code import c_lines, run_c_lines
+from ident_service.results.export.check import AGREEMENT, disagreement, random_states, torque, with_terms
+from ident_service.results.export.words import identifier, plain, unique
+
+_PARAMETER = re.compile(r"^    (-?[\d.e+-]+),? /\* \d+ ")
+_DRIVES: tuple[JointTerm, ...] = ("drive_inertia",)
+_Formulas = Callable[[Tape, dict[int, Value], dict[str, list[Symbol]]], list[Value]]
+
+
+def c_prefix(arm: IdentifiedArm) -> str:
+    """What every name in the header begins with."""
+    return identifier(arm.model.config.name)
+
+
+def c_header(arm: IdentifiedArm) -> str:
+    """The header, read back and found to have the torques and the mass matrix of the base parameters.
+
+    Raises:
+        ModelError: what is read back differs.
+    """
+    text = _written(arm)
+    _check(arm, text)
+    return text
+
+
+def _written(arm: IdentifiedArm) -> str:
+    name, model = c_prefix(arm), arm.model
+    guard, n, nb = f"{name}_dynamics_H".upper(), model.chain.joints, arm.base.size
+    joints = unique(identifier(f"{name}_joint_{joint}") for joint in model.chain.names)
+    parts = [
+        _preface(arm, name),
+        f"#ifndef {guard}\n#define {guard}\n\n#include <math.h>\n",
+        f"#define {name}_JOINTS {n}\n#define {name}_BASE_PARAMETERS {nb}\n",
+        "/* Places of the joints in every array. */\nenum {\n"
+        + ",\n".join(
+            f"    {joint} = {k} /* {plain(own)}, {'rad' if turns else 'm'} */"
+            for k, (joint, own, turns) in enumerate(zip(joints, model.chain.names, model.chain.revolute, strict=True))
+        )
+        + "\n};\n",
+        _parameters(arm, name),
+        *(_function(arm, name, *what) for what in _functions(arm)),
+        _INVERSE_DYNAMICS.replace("NAME", name),
+        f"#endif /* {guard} */\n",
+    ]
+    return "\n".join(parts)
+
+
+def _preface(arm: IdentifiedArm, name: str) -> str:
+    gravity = ", ".join(repr(float(g)) for g in arm.model.chain.gravity)
+    terms = ", ".join(arm.model.layout.terms).replace("_", " ") or "none"
+    return f"""\
+/* Dynamics of the arm {plain(arm.model.config.name)} in identified base parameters.
+ *
+ * SI units: rad or m, rad/s or m/s, rad/s^2 or m/s^2, N m or N, kg, s. Torque and force are on the joint's side,
+ * positive along the joint's axis. Gravity ({gravity}) m/s^2 in the base frame is part of the formulas.
+ * Joint terms: {terms}. Dry friction has the sign of the velocity and is zero at rest.
+ *
+ *   {name}_inverse_dynamics(q, dq, ddq, tau)  tau = M(q) ddq + c(q, dq) + g(q) + friction(dq)
+ *   {name}_rigid_dynamics(q, dq, ddq, tau)    the same without friction, drive inertia included
+ *   {name}_friction(dq, tau)                  friction and torque offsets
+ *   {name}_gravity(q, tau)                    g(q)
+ *   {name}_mass_matrix(q, M)                  M(q) by rows, all of it, drive inertia included
+ *
+ * The offset of a sliding joint, if no motion tells it from gravity, is part of g(q), which {name}_friction then lacks.
+ * Every array has {name}_JOINTS entries, M their square; results may overwrite arguments. No memory is allocated,
+ * nothing global is written, only <math.h> is used; C99 and C++.
+ *
+ * Made by ident-service {__version__} from parameters with SHA-256
+ * {arm.source}.
+ */
+"""
+
+
+def _parameters(arm: IdentifiedArm, name: str) -> str:
+    count = arm.base.size
+    lines = []
+    for k, (expression, unit, value) in enumerate(zip(arm.base.expressions, arm.base.units, arm.beta, strict=True)):
+        sigma = "" if (deviation := arm.sigma[k]) is None else f", standard deviation {deviation:.2g}"
+        comma = "," if k + 1 < count else ""
+        said = f"{k} {plain(expression)} [{unit}]{sigma}"
+        lines.append(f"    {float(value)!r}{comma} /* {said} */")
+    body = "\n".join(lines)
+    return (
+        "/* Base parameters: each the value of the sum of link parameters beside it; of the link parameters in a sum,\n"
+        " * the formulas use the one that comes first. */\n"
+        f"static const double {name}_base_parameters[{name}_BASE_PARAMETERS] = {{\n{body}\n}};\n"
+    )
+
+
+def _functions(arm: IdentifiedArm) -> list[tuple[str, tuple[str, ...], str, _Formulas]]:
+    chain, layout, n = arm.model.chain, arm.model.layout, arm.model.chain.joints
+
+    def rigid(tape: Tape, p: dict[int, Value], s: dict[str, list[Symbol]]) -> list[Value]:
+        links = rigid_torque(tape, chain, layout, p, s["q"], s["dq"], s["ddq"])
+        drives = drive_torque(chain, layout, p, s["ddq"])
+        return [a + b for a, b in zip(links, drives, strict=True)]
+
+    def friction(tape: Tape, p: dict[int, Value], s: dict[str, list[Symbol]]) -> list[Value]:
+        return friction_torque(tape, chain, layout, p, s["dq"])
+
+    def gravity(tape: Tape, p: dict[int, Value], s: dict[str, list[Symbol]]) -> list[Value]:
+        return rigid_torque(tape, chain, layout, p, s["q"])
+
+    def mass(tape: Tape, p: dict[int, Value], s: dict[str, list[Symbol]]) -> list[Value]:
+        M = mass_matrix(tape, chain, layout, p, s["q"])
+        return [M[i][j] for i in range(n) for j in range(n)]
+
+    return [
+        ("rigid_dynamics", ("q", "dq", "ddq"), "tau", rigid),
+        ("friction", ("dq",), "tau", friction),
+        ("gravity", ("q",), "tau", gravity),
+        ("mass_matrix", ("q",), "M", mass),
+    ]
+
+
+def _function(
+    arm: IdentifiedArm, name: str, what: str, arguments: tuple[str, ...], result: str, formulas: _Formulas
+) -> str:
+    tape, n = Tape(), arm.model.chain.joints
+    states = {argument: [tape.input() for _ in range(n)] for argument in arguments}
+    inputs = {symbol.index: f"{key}[{k}]" for key, symbols in states.items() for k, symbol in enumerate(symbols)}
+    parameters: dict[int, Value] = {}
+    if not np.array_equal(arm.base.K[:, arm.base.base], np.eye(arm.base.size)):
+        raise ModelError(f"{arm.model.config.name}: base parameters that do not begin with their own link parameter")
+    for k, column in enumerate(arm.base.base):
+        symbol = tape.input()
+        parameters[int(column)], inputs[symbol.index] = symbol, f"p[{k}]"
+    values = formulas(tape, parameters, states)
+    lines = c_lines(tape, inputs, [(f"{result}[{k}]", value) for k, value in enumerate(values)])
+    taken = ", ".join(f"const double {argument}[]" for argument in arguments)
+    unused = "".join(f"    (void){argument};\n" for argument in arguments)
+    return (
+        f"static inline void {name}_{what}({taken}, double {result}[])\n{{\n"
+        f"    const double *const p = {name}_base_parameters;\n{unused}    (void)p;\n" + "\n".join(lines) + "\n}\n"
+    )
+
+
+_INVERSE_DYNAMICS = """\
+static inline void NAME_inverse_dynamics(const double q[], const double dq[], const double ddq[], double tau[])
+{
+    double friction[NAME_JOINTS];
+    int k;
+    NAME_friction(dq, friction);
+    NAME_rigid_dynamics(q, dq, ddq, tau);
+    for (k = 0; k < NAME_JOINTS; ++k) {
+        tau[k] += friction[k];
+    }
+}
+"""
+
+
+def read_c_header(text: str, name: str, function: str, states: dict[str, Array]) -> Array:
+    """Run one function of a header from its text.
+
+    Args:
+        text: the header.
+        name: what its names begin with.
+        function: `rigid_dynamics`, `friction`, `gravity` or `mass_matrix`.
+        states: `q`, `dq` and `ddq`, each of shape (joints, samples).
+
+    Returns:
+        What it writes, shape (values, samples).
+
+    Raises:
+        ModelError: no such function, or lines that are not generated code.
+    """
+    lines = text.splitlines()
+    try:
+        at = lines.index(f"static const double {name}_base_parameters[{name}_BASE_PARAMETERS] = {{")
+        begin = next(k for k, line in enumerate(lines) if line.startswith(f"static inline void {name}_{function}("))
+        numbers, body = lines[at + 1 : lines.index("};", at)], lines[begin + 2 : lines.index("}", begin)]
+    except (ValueError, StopIteration):
+        raise ModelError(f"not a header of {name} with {function}") from None
+    found = [_PARAMETER.match(line) for line in numbers]
+    samples = next(iter(states.values())).shape[1]
+    p = np.array([[float(match.group(1)) if match else np.nan] * samples for match in found])
+    code = [line for line in body if not line.startswith(("    (void)", "    const double *const p"))]
+    (result,) = run_c_lines(code, {**states, "p": p}).values()
+    return result
+
+
+def _check(arm: IdentifiedArm, text: str) -> None:
+    q, dq, ddq = random_states(arm.model.chain.joints)
+    model, still, n = arm.model, np.zeros_like(q), arm.model.chain.joints
+    delta = arm.base_delta if arm.delta is None else arm.delta
+    states = {"q": q.T, "dq": dq.T, "ddq": ddq.T}
+
+    def run(function: str, at: dict[str, Array] = states) -> Array:
+        return read_c_header(text, c_prefix(arm), function, at).T
+
+    links = with_terms(model, delta, _DRIVES)
+    g = torque(model, links, (q, still, still))
+    M = np.array([torque(model, links, (q, still, still + unit)) - g for unit in np.eye(n)]).transpose(1, 2, 0)
+    pairs: Sequence[tuple[str, Array, Array]] = (
+        ("inverse dynamics", run("rigid_dynamics") + run("friction"), torque(model, delta, (q, dq, ddq))),
+        # Where offsets are grouped with masses, only the sum is the same.
+        ("gravity", run("gravity") + run("friction", {"dq": still.T}), torque(model, delta, (q, still, still))),
+        ("mass matrix", run("mass_matrix"), M.reshape(len(q), n * n)),
+    )
+    for what, found, meant in pairs:
+        if np.abs(meant).max() == 0.0 == np.abs(found).max():
+            continue
+        if not disagreement(found, meant) <= AGREEMENT:
+            raise ModelError(
+                f"{arm.model.config.name}: {what} read back from the C header differs from the parameters'"
+            )

@@ -1,0 +1,63 @@
+"""URDF: the arm's own file with identified values where a URDF describes it, a generated one elsewhere.
+
+URDF has a place for viscous and dry friction of a joint, none for gravity, drive inertia or any other term.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ident_service.config.quantities import TextFile
+from ident_service.config.schema import JointTerm
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.chain import Array
+from ident_service.model.urdf import urdf_text
+from ident_service.results.export.check import carried, gravity_of, left_out, require_same_torques
+from ident_service.results.export.original_urdf import original_urdf
+from ident_service.results.files import write_atomically
+
+_TERMS: tuple[JointTerm, ...] = ("viscous", "coulomb")
+
+
+def urdf_export(model: ArmModel, delta: Array, name: str) -> tuple[str, tuple[str, ...], tuple[str, ...]]:
+    """The identified URDF, after pinocchio has read the same torques out of it.
+
+    Args:
+        model: the arm.
+        delta: link parameters, shape (layout.size,).
+        name: of the file, for errors.
+
+    Returns:
+        The text, what it does not carry, and notes.
+
+    Raises:
+        ModelError: a link has no positive mass, or the file does not say what it should.
+    """
+    from ident_service.model.dynamic_model import read_back
+
+    has = carried(model, delta, _TERMS)
+    notes: tuple[str, ...] = ()
+    if model.config.kinematics.urdf is not None:
+        text, notes = original_urdf(model, delta, has)
+    else:
+        text = urdf_text(model, delta)
+    written = read_back(TextFile(name=name, text=text), "urdf", gravity_of(model))
+    require_same_torques(model, delta, written, has, name)
+    gravity = "gravity" if model.chain.gravity.any() else ""
+    return text, tuple(filter(None, (gravity, *left_out(model, delta, has)))), notes
+
+
+def write_urdf(path: Path, model: ArmModel, delta: Array) -> None:
+    """Write the identified URDF, after pinocchio has read the same torques out of it.
+
+    Args:
+        path: the file.
+        model: the arm.
+        delta: link parameters, shape (layout.size,).
+
+    Raises:
+        ModelError: a link has no positive mass, or the file does not say what it should.
+        UsageError: the file cannot be written.
+    """
+    text, _, _ = urdf_export(model, delta, str(path))
+    write_atomically(path, text)

@@ -1,0 +1,138 @@
+"""The tables of a report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ident_service.estimation.doubt import Verdict
+from ident_service.results.drawing import number
+from ident_service.results.evidence.evidence import Condition, Evidence
+from ident_service.results.evidence.making import CAD
+from ident_service.results.parameter_file import ParameterFile
+from ident_service.results.report.markup import Cell, table
+
+_NOTHING = Cell("\u2014")
+_MARKS: dict[Verdict, str] = {"identified": "", "weak": "weak", "unidentified": "bad"}
+
+
+def parameter_table(evidence: Evidence, parameters: ParameterFile) -> str:
+    """Every base parameter: CAD, unconstrained, constrained, deviation, verdict, bound."""
+    content = parameters.content["base_parameters"]
+    size = len(parameters.values)
+    deviations = content.get("standard_deviations", [None] * size)
+    verdicts, units = content.get("verdicts", [""] * size), content.get("units", [""] * size)
+    first = evidence.estimates[0]
+    columns = [
+        first.values if first.name == CAD else None,
+        evidence.estimates[evidence.unconstrained].values,
+        evidence.estimates[evidence.constrained].values,
+    ]
+    names = [CAD, *(evidence.estimates[k].name for k in (evidence.unconstrained, evidence.constrained))]
+    if evidence.chosen not in (evidence.unconstrained, evidence.constrained):
+        names.append("chosen")
+        columns.append(parameters.values)
+    heads = ["no.", "base parameter", "unit", *names, "\u03c3", "verdict", "bound"]
+    rows = []
+    for k, expression in enumerate(content["expressions"]):
+        cells = [Cell(str(k + 1)), Cell(expression, kind="expression"), Cell(units[k], kind="unit")]
+        cells += [_NOTHING if column is None else _number(float(column[k])) for column in columns]
+        cells.append(Cell("not seen", kind="bad") if deviations[k] is None else _number(deviations[k], 2))
+        bounds = "; ".join(evidence.bounds[k])
+        cells += [Cell(verdicts[k], kind=_MARKS.get(verdicts[k], "")), Cell(bounds) if bounds else _NOTHING]
+        rows.append(cells)
+    return table("Base parameters, \u03c3 being the standard deviation", heads, rows, kind="parameters")
+
+
+def error_table(evidence: Evidence) -> str:
+    """Every estimate: feasible or not, and its torque error on every recording."""
+    unseen = [one.name for one in evidence.recordings if one.role == "validation"]
+    rows = []
+    for place, one in enumerate(evidence.estimates):
+        if one.identification is None:
+            continue
+        mark = " (chosen)" if place == evidence.chosen else ""
+        feasible = _NOTHING
+        if one.margin is not None:
+            feasible = Cell("yes") if one.margin > 0.0 else Cell("NO", kind="bad")
+        margin = _NOTHING if one.margin is None else _number(one.margin, 3)
+        whole, moving = (one.identification, *one.validation), (one.moving, *one.moving_validation)
+        errors = [_number(error, 4) for pair in zip(whole, moving, strict=True) for error in pair]
+        rows.append([Cell(one.name + mark), feasible, margin, *errors])
+    # Every estimate was held against the arm's own set, whatever set it was fitted in.
+    kind = evidence.estimates[evidence.constrained].name.split()[-1]
+    heads = ["estimate", f"feasible ({kind})", "margin"]
+    heads += [f"{name} {rows_of} [%]" for name in ("fitted", *unseen) for rows_of in ("all rows", "moving")]
+    return table("Relative torque error (eq. 84) of every estimate, on all rows and away from standstill", heads, rows)
+
+
+def joint_table(evidence: Evidence, parameters: ParameterFile) -> str:
+    """Torque error per joint, of the chosen estimate, on every recording."""
+    columns: list[tuple[str, list[Mapping[str, Any]]]] = []
+    if "fit" in parameters.content:
+        columns.append(("fitted", parameters.content["fit"]["per_joint"]))
+    columns += [(one["recording"], one["per_joint"]) for one in parameters.content.get("validation", [])]
+    heads = ["joint", *(f"{name} {what}" for name, _ in columns for what in ("[%]", "rms"))]
+    rows = []
+    for k, name in enumerate(evidence.joints):
+        cells = [Cell(name)]
+        for _, joints in columns:
+            unit = "N m" if evidence.revolute[k] else "N"
+            rms = joints[k]["rms"]
+            cells += [_number(joints[k]["relative_error_percent"], 3), Cell(f"{number(rms)} {unit}", rms)]
+        rows.append(cells)
+    return table("Torque error of the chosen estimate, joint by joint", heads, rows)
+
+
+def margin_table(evidence: Evidence) -> str:
+    """Per link the condition that leaves the least room, and the least of those that are about several links."""
+    rows = []
+    for link, name in enumerate(evidence.joints):
+        own = [one for one in evidence.conditions if one.links == (link,)]
+        rows.append([Cell(name), *_tightest(own)])
+    if several := [one for one in evidence.conditions if len(one.links) != 1]:
+        rows.append([Cell("several links"), *_tightest(several)])
+    heads = ["link", "least room in", "smallest eigenvalue", "in reference units"]
+    return table("Room inside the feasible set, link by link", heads, rows)
+
+
+def _tightest(conditions: list[Condition]) -> list[Cell]:
+    if not conditions:
+        return [Cell("no condition"), _NOTHING, _NOTHING]
+    least = min(conditions, key=lambda one: one.scaled)
+    kind = "bad" if least.scaled <= 0.0 else ""
+    return [Cell(least.name), Cell(number(least.margin), least.margin, kind), Cell(number(least.scaled), least.scaled)]
+
+
+def axis_table(evidence: Evidence) -> str:
+    """Per joint, how often it did not answer; empty where no recording knows."""
+    known = [one for one in evidence.timing if one.invalid]
+    if not known:
+        return ""
+    heads = ["joint", *(f"{one.recording}: {what}" for one in known for what in ("no answer", "oldest position"))]
+    rows = []
+    for k, name in enumerate(evidence.joints):
+        cells = [Cell(name)]
+        for one in known:
+            cells += [Cell(f"{one.invalid[k]} cycles", one.invalid[k]), Cell(f"{one.oldest[k]} cycles", one.oldest[k])]
+        rows.append(cells)
+    return table("Axes that did not answer", heads, rows)
+
+
+def file_table(evidence: Evidence, parameters: ParameterFile, sha256: Mapping[str, str]) -> str:
+    """What was used and made, with hashes."""
+    rows = [[Cell(f"{one.role} recording {one.name}"), Cell(one.sha256, kind="hash")] for one in evidence.recordings]
+    used = {one.sha256 for one in evidence.recordings}
+    if arm := parameters.content.get("arm"):
+        rows.append([Cell(f"arm {arm['name']}, as it was identified"), Cell(arm["sha256"], kind="hash")])
+    rows += [[Cell(name), Cell(digest, kind="hash")] for name, digest in sha256.items() if digest not in used]
+    return table("Files", ["what", "SHA-256"], rows)
+
+
+def _number(value: float | None, digits: int = 5) -> Cell:
+    if value is None:
+        return _NOTHING
+    words = number(value, digits)
+    return Cell(words, float(value)) if np.isfinite(value) else _NOTHING

@@ -1,0 +1,71 @@
+"""How evenly a recording's samples were taken, as a histogram."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ident_service.results.drawing import Axes, Canvas, number
+from ident_service.results.drawing_chart import draw_frame
+from ident_service.results.evidence.evidence import Evidence, Timing
+from ident_service.results.report.figure import LEFT, RIGHT, WIDTH, Figure
+
+_TOP, _HEIGHT, _BOTTOM = 28.0, 150.0, 40.0
+
+
+def timing_figures(evidence: Evidence) -> list[Figure]:
+    """One figure per recording."""
+    return [_figure(number, timing) for number, timing in enumerate(evidence.timing, 1)]
+
+
+def _figure(place: int, timing: Timing) -> Figure:
+    scale, unit = (1e3, "ms") if timing.edges[-1] >= 1e-3 else (1e6, "\u00b5s")
+    canvas = Canvas(WIDTH, _TOP + _HEIGHT + _BOTTOM)
+    low, high = scale * float(timing.edges[0]), scale * float(timing.edges[-1])
+    logs = np.log10(np.maximum(timing.counts, 0.5))
+    axes = Axes(LEFT, _TOP, WIDTH - LEFT - RIGHT, _HEIGHT, low, high, np.log10(0.5), max(float(logs.max()), 1.0) + 0.1)
+    late = timing.source == "cycle"
+    what = "how late a cycle began" if late else "how far a step is from the usual one"
+    draw_frame(canvas, axes, x=f"{what} [{unit}]", y="cycles" if late else "steps", y_log=True)
+    bottom = _TOP + _HEIGHT
+    for count, log, begin, end in zip(timing.counts, logs, timing.edges[:-1], timing.edges[1:], strict=True):
+        if count:
+            x, right, y = float(axes.x(scale * begin)), float(axes.x(scale * end)), float(axes.y(log))
+            canvas.rectangle("good", x + 0.5, y, max(right - x - 1.0, 1.0), bottom - y)
+    words = timing_words(timing)
+    return Figure(
+        slug=f"timing-{place}",
+        title=f"Timing of {timing.recording}",
+        description=words,
+        caption=(
+            f"{words} Good: one narrow heap at the left, within a few percent of the period "
+            f"({number(scale / timing.rate)} {unit}). Bad: a tail as long as the period, or a second heap."
+        ),
+        canvas=canvas,
+    )
+
+
+def timing_words(timing: Timing) -> str:
+    """What a recording's timing comes down to."""
+    worst = f"{number(1e3 * timing.largest)} ms"
+    words = f"{timing.recording}: {timing.samples} samples at {number(timing.rate, 5)} Hz; "
+    if timing.source == "cycle":
+        words += f"the latest cycle began {worst} late"
+        words += f", the longest computed {number(1e3 * timing.compute)} ms." if timing.compute is not None else "."
+    else:
+        words += (
+            f"the most uneven step is {worst} off. The recording has no account of its cycles, so this is from its "
+        )
+        words += "stamps, and what was lost on the bus or did not answer is not known."
+    if timing.gap_count:
+        start, length = timing.gaps[0]
+        count = "one gap" if timing.gap_count == 1 else f"{timing.gap_count} gaps"
+        words += (
+            f" {count[0].upper()}{count[1:]}, the longest {number(length)} s, {number(start, 4)} s after the start."
+        )
+    else:
+        words += " No gaps."
+    if timing.lost is not None:
+        words += f" Frames lost: {timing.lost}."
+    if timing.invalid and not any(timing.invalid):
+        words += " Every axis answered in every cycle."
+    return words

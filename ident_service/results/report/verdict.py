@@ -1,0 +1,121 @@
+"""The verdict in one paragraph: every word of it follows from a number."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ident_service.estimation.doubt import IDENTIFIED_BELOW, WEAK_BELOW
+from ident_service.results.drawing import number
+from ident_service.results.evidence.evidence import Evidence
+from ident_service.results.parameter_file import ParameterFile
+
+_MUCH_WORSE = 1.5  # times the error on what was fitted to
+_NAMED = 5
+_PROOFS = {"witness": True, "dual": True, "undecided": False}
+
+
+def verdict(evidence: Evidence, parameters: ParameterFile) -> list[str]:
+    """Sentences: could a body have it, is that proven, how well it predicts, what is not known, what to do next."""
+    return [
+        *_feasibility(evidence, parameters),
+        _prediction(evidence),
+        _knowledge(parameters),
+        _next(evidence, parameters),
+    ]
+
+
+def _feasibility(evidence: Evidence, parameters: ParameterFile) -> list[str]:
+    found = parameters.content.get("feasibility")
+    if found is None:
+        return ["Whether a real body could have these parameters was not tested."]
+    margin, kind = number(found["margin"]), found.get("certificate", {}).get("kind", "")
+    proven = _PROOFS.get(kind, False)
+    tight = _list(found.get("tight", []))
+    if parameters.feasible_set == "none":
+        how = "They were not held in any feasible set."
+    else:
+        how = f"They were held in the feasible set {parameters.feasible_set}."
+    if found["margin"] > 0.0:
+        words = f"A real body could have these parameters (margin {margin})"
+        sentences = [words + (", which is proven in exact arithmetic." if proven and found["feasible"] else ".")]
+        if not (proven and found["feasible"]):
+            sentences.append("That is not proven in exact arithmetic: they lie too close to the boundary.")
+        if tight:
+            sentences.append(f"The data pull against: {tight}.")
+        return [*sentences, how]
+    words = f"No real body has these parameters (margin {margin})"
+    sentences = [words + (", which is proven in exact arithmetic." if proven else ", though this is not proven.")]
+    if tight:
+        sentences.append(f"What contradicts them: {tight}.")
+    return [*sentences, how]
+
+
+def _prediction(evidence: Evidence) -> str:
+    own = evidence.estimates[evidence.chosen]
+    fitted = "" if own.identification is None else _error(own.identification, own.moving)
+    unseen = [one.name for one in evidence.recordings if one.role == "validation"]
+    if not own.validation:
+        known = f" On what it was fitted to its torque error is {fitted}." if fitted else ""
+        return f"It was judged on no recording that it had not seen, so how well it predicts is not known.{known}"
+    moving = own.moving_validation or (None,) * len(own.validation)
+    errors = ", ".join(
+        f"{_error(error, alone)} on {name}" for name, error, alone in zip(unseen, own.validation, moving, strict=True)
+    )
+    words = f"On what it never saw its torque error is {errors}, against {fitted} on what it was fitted to"
+    if _worse(evidence):
+        return f"{words}: it predicts other motions markedly worse than its own."
+    return f"{words}: it predicts other motions about as well as its own."
+
+
+def _error(whole: float, moving: float | None) -> str:
+    return f"{number(whole)} %" + ("" if moving is None else f" ({number(moving)} % away from standstill)")
+
+
+def _worse(evidence: Evidence) -> bool:
+    """Whether it predicts unseen motions markedly worse than its own; judged where friction is known, if told."""
+    own = evidence.estimates[evidence.chosen]
+    if own.moving is not None and own.moving_validation:
+        return max(own.moving_validation) > _MUCH_WORSE * own.moving
+    return own.identification is not None and max(own.validation, default=0.0) > _MUCH_WORSE * own.identification
+
+
+def _knowledge(parameters: ParameterFile) -> str:
+    table = parameters.content["base_parameters"]
+    verdicts = table.get("verdicts")
+    if verdicts is None:
+        return "How sure its parameters are is not known."
+    counts = {word: verdicts.count(word) for word in ("identified", "weak", "unidentified")}
+    words = f"Of {len(verdicts)} base parameters {counts['identified']} are identified to {100 * IDENTIFIED_BELOW:g} %"
+    words += f", {counts['weak']} are weak (to {100 * WEAK_BELOW:g} %) and {counts['unidentified']} unidentified"
+    unknown = [table["expressions"][k] for k, word in enumerate(verdicts) if word == "unidentified"]
+    if not unknown:
+        return words + "."
+    return f"{words}: {_list(unknown)}."
+
+
+def _next(evidence: Evidence, parameters: ParameterFile) -> str:
+    """What a person should do now, the most urgent thing first."""
+    steps = []
+    found = parameters.content.get("feasibility")
+    if found is not None and found["margin"] <= 0.0:
+        steps.append("identify within a feasible set, and look first for wrong signs, units or joint directions")
+    if evidence.warnings:
+        steps.append("mend what the warnings name and record again")
+    own = evidence.estimates[evidence.chosen]
+    if not own.validation:
+        steps.append("record a second motion and give it with --validate")
+    elif _worse(evidence):
+        steps.append("look below at which joint's residual follows the motion, and identify from a richer one")
+    if "unidentified" in parameters.content["base_parameters"].get("verdicts", []):
+        steps.append(
+            "where the unidentified parameters matter, design a motion that teaches them (ident design --after)"
+        )
+    if not steps:
+        return "Next: nothing stands against using it."
+    return "Next: " + "; ".join(steps) + "."
+
+
+def _list(names: Sequence[str]) -> str:
+    shown = [name if len(name) <= 60 else name[:57] + "..." for name in names[:_NAMED]]
+    more = len(names) - len(shown)
+    return "; ".join(shown) + (f"; and {more} more" if more > 0 else "")

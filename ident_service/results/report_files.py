@@ -1,0 +1,103 @@
+"""Evidence and report beside the parameters they belong to: written with them, and made again from a folder."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from ident_service.errors import ParameterError, UsageError
+from ident_service.estimation.identify import Estimate
+from ident_service.record.recording import Recording
+from ident_service.results.evidence.evidence import Evidence
+from ident_service.results.evidence.file import EVIDENCE, read_evidence, write_evidence
+from ident_service.results.evidence.making import gather_evidence
+from ident_service.results.files import write_atomically
+from ident_service.results.parameter_file import read_parameters
+from ident_service.results.report.page import report_html
+from ident_service.results.run_folder import MANIFEST, PARAMETERS, Results, hashes, read_results, write_manifest
+
+REPORT_PAGE = "report.html"
+
+
+def write_report(
+    folder: Path,
+    estimate: Estimate,
+    recordings: Sequence[Recording],
+    validation: Sequence[Recording],
+    warnings: Sequence[str],
+) -> list[str]:
+    """Write evidence and report into a folder that has the other files of the estimate, before its manifest.
+
+    Args:
+        folder: where `write_results` has written.
+        estimate: made from `recordings`, judged on `validation`.
+        recordings: those fitted to.
+        validation: those that were not.
+        warnings: what is wrong with the recordings, in words.
+
+    Returns:
+        The names of the files.
+
+    Raises:
+        RecordingError: a recording can no longer be read.
+        UsageError: the folder cannot be written.
+    """
+    digest = hashlib.sha256((folder / PARAMETERS).read_bytes()).hexdigest()
+    evidence = gather_evidence(estimate, recordings, validation, digest, warnings)
+    write_evidence(folder / EVIDENCE, evidence)
+    parameters = read_parameters(folder / PARAMETERS)
+    page = report_html(read_evidence(folder / EVIDENCE), parameters, estimate.model.config, _others(hashes(folder)))
+    write_atomically(folder / REPORT_PAGE, page)
+    return [EVIDENCE, REPORT_PAGE]
+
+
+def read_evidence_of(results: Results) -> Evidence:
+    """The evidence of a folder that has been read.
+
+    Raises:
+        UsageError: there is none.
+        ParameterError: it is torn, foreign or of another version, or of other parameters.
+    """
+    if EVIDENCE not in results.sha256:
+        raise UsageError(
+            f"{results.folder}: {EVIDENCE} is not among its files; identify again from the recordings to have it"
+        )
+    evidence = read_evidence(results.folder / EVIDENCE)
+    if evidence.parameters_sha256 != results.sha256[PARAMETERS]:
+        raise ParameterError(f"{results.folder / EVIDENCE}: belongs to another {PARAMETERS}; identify again")
+    size = len(results.parameters.values)
+    if any(len(one.values) != size for one in evidence.estimates):
+        raise ParameterError(f"{results.folder / EVIDENCE}: is not about the {size} parameters of {PARAMETERS}")
+    return evidence
+
+
+def make_report(folder: Path, out: Path | None = None) -> Path:
+    """Make the report of a folder of results again.
+
+    Args:
+        folder: made by `ident identify` or `ident simulate`.
+        out: where the page goes; into the folder, whose manifest then names it, when None.
+
+    Returns:
+        The page.
+
+    Raises:
+        UsageError, ParameterError, ConfigError: the folder is not what its manifest names, or has no evidence.
+    """
+    results = read_results(folder)
+    if out is not None and out.is_dir():
+        raise UsageError(f"{out}: is a folder; give the name of a file")
+    if out is not None and out.name in {*results.sha256, MANIFEST} - {REPORT_PAGE} and out.parent.samefile(folder):
+        raise UsageError(f"{out}: is one of the results; give another name")
+    page = report_html(read_evidence_of(results), results.parameters, results.config, _others(results.sha256))
+    path = folder / REPORT_PAGE if out is None else out
+    write_atomically(path, page)
+    if path.name == REPORT_PAGE and path.parent.samefile(folder):
+        write_manifest(folder)
+    return path
+
+
+def _others(sha256: Mapping[str, str]) -> dict[str, str]:
+    """Hashes of what the page can name: not its own."""
+    return {name: digest for name, digest in sha256.items() if name != REPORT_PAGE}

@@ -1,0 +1,106 @@
+"""Zeroing an arm whose encoders count from where they were when power came: a person says that it stands at its home.
+
+What a person must do is lead the arm there and compare it with the posture that is told; nobody else can. Everything
+that a program can tell stands against it first: whoever moves the arm, another host, powered drives, an arm that moves.
+Boundary: nothing here moves or energises an arm; what drives keep is the driver's (`Arm.zero`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import degrees
+from pathlib import Path
+
+from drivers.arm import Arm
+from ident_service.config.canopen import CanopenDriver
+from ident_service.config.schema import ArmConfig
+from ident_service.errors import MotionRefused, UsageError
+from ident_service.model.arm_model import arm_model
+from ident_service.motion.control_file import ControlFile
+from ident_service.motion.factory import make_arm
+from ident_service.motion.fault_file import Remembered
+from ident_service.record.files import require_writable
+from ident_service.service.arm_state import control_path, fault_file, ticket_path
+
+
+@dataclass(frozen=True)
+class JointPosture:
+    """One joint of the posture: its name, position [rad or m], and the unit of that."""
+
+    joint: str
+    position: float
+    unit: str
+
+    def __str__(self) -> str:
+        """For people."""
+        turned = f" ({degrees(self.position):.1f} degrees)" if self.unit == "rad" else ""
+        return f"{self.joint} at {self.position:g} {self.unit}{turned}"
+
+
+@dataclass(frozen=True)
+class Zeroed:
+    """What was done.
+
+    Attributes:
+        arm: name.
+        posture: that the arm stands in, of all joints.
+        drives: what each says of itself.
+        faults: that nobody has acknowledged; zeroing neither needs that nor changes it.
+        ticket_removed: whether there was a preflight ticket, which was about another zero.
+    """
+
+    arm: str
+    posture: tuple[JointPosture, ...]
+    drives: tuple[str, ...]
+    faults: tuple[Remembered, ...]
+    ticket_removed: bool
+
+
+def home_posture(config: ArmConfig) -> tuple[JointPosture, ...]:
+    """The posture in which an arm is zeroed.
+
+    Raises:
+        UsageError: its description does not say `zero: at_home`, or has no home of every joint.
+    """
+    if not isinstance(config.driver, CanopenDriver) or config.driver.zero != "at_home":
+        raise UsageError(
+            f"{config.name}: has no zero to be set: only drives with `driver: {{zero: at_home}}`, whose encoders count "
+            "from where they were when power came, need one"
+        )
+    chain = arm_model(config).chain
+    found = []
+    for name, revolute in zip(chain.names, chain.revolute, strict=True):
+        joint = config.joints.get(name)
+        if joint is None or joint.home is None:
+            raise UsageError(f"{config.name}: joints.{name}.home is missing: the posture in which the arm is zeroed")
+        found.append(JointPosture(name, joint.home, "rad" if revolute else "m"))
+    return tuple(found)
+
+
+def take_home(config: ArmConfig, state: Path, confirm: Callable[[str], str], arm: Arm | None = None) -> Zeroed:
+    """Have an arm's drives keep where they stand as its home, when a person has said so.
+
+    Args:
+        config: of the arm.
+        state: the state folder.
+        confirm: asks a person, who has seen the posture, for the arm's name.
+        arm: not open; the configured one when None.
+
+    Raises:
+        UsageError: as `home_posture`.
+        MotionRefused: nobody confirmed it; nothing has changed.
+        DriverError: a process moves the arm, or as `Arm.zero`.
+    """
+    posture = home_posture(config)
+    ticket = ticket_path(state, config.name)
+    require_writable(ticket.parent)
+    with ControlFile.take(control_path(state, config.name), None):
+        typed = confirm(f"type the arm's name, {config.name}, if it stands in this posture and at rest:")
+        if typed.strip() != config.name:
+            raise MotionRefused(f"{config.name}: not zeroed: the arm's name was not typed; nothing has changed")
+        drives = (make_arm(config) if arm is None else arm).zero()
+    existed = ticket.exists()
+    # It names the zero that it was made with, so that it would be refused anyway; this only says so earlier.
+    ticket.unlink(missing_ok=True)
+    return Zeroed(config.name, posture, drives, fault_file(state, config.name).remembered(), existed)

@@ -1,0 +1,124 @@
+"""`ident report` and `ident figures`: from a folder of results, verified, to files."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+from cli.conftest import Commissioned, Ident, left_over
+
+from ident_service.results.run_folder import read_results, write_manifest
+
+
+@pytest.fixture
+def folder(quick: Commissioned, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(quick.folder, tmp_path / "run"))
+
+
+def test_report_makes_the_page_that_simulate_made(folder: Path, ident: Ident) -> None:
+    first = (folder / "report.html").read_bytes()
+    (folder / "report.html").unlink()
+    write_manifest(folder)
+    ended = ident("report", folder)
+    assert (ended.code, ended.err) == (0, "")
+    assert ended.out == f"{folder / 'report.html'}: {len(first) / 1e6:.2f} MB\n"
+    assert (folder / "report.html").read_bytes() == first
+    # The manifest names it again.
+    assert "report.html" in read_results(folder).sha256
+
+
+def test_report_elsewhere_leaves_the_folder_alone(folder: Path, ident: Ident, tmp_path: Path) -> None:
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    document = ident("report", folder, "--out", tmp_path / "page.html", "--json").json
+    assert document["file"] == str(tmp_path / "page.html")
+    assert document["bytes"] == (tmp_path / "page.html").stat().st_size
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert (tmp_path / "page.html").read_bytes() == before["report.html"]
+
+
+def test_timing_is_the_loop_s_own_account(folder: Path) -> None:
+    content = json.loads((folder / "evidence.json").read_text())
+    assert [one["source"] for one in content["timing"]] == ["cycle", "cycle"]
+    assert content["timing"][0]["invalid"] == [0, 0]
+    assert content["timing"][0]["rate"] == pytest.approx(1000.0)
+
+
+def test_a_folder_without_evidence_says_what_to_do(folder: Path, ident: Ident) -> None:
+    (folder / "evidence.json").unlink()
+    write_manifest(folder)
+    for words in (("report", folder), ("figures", folder, "--out", folder.parent / "figures")):
+        ended = ident(*words)
+        assert ended.code == 2
+        assert ended.err == (
+            f"ident: {folder}: evidence.json is not among its files; identify again from the recordings to have it\n"
+        )
+    assert not (folder.parent / "figures").exists()
+
+
+def test_a_changed_file_is_refused(folder: Path, ident: Ident) -> None:
+    path = folder / "evidence.json"
+    path.write_bytes(path.read_bytes()[:-100])
+    ended = ident("report", folder)
+    assert ended.code == 1
+    assert "evidence.json: not what the manifest names" in ended.err
+
+
+def test_a_page_does_not_go_over_a_result(folder: Path, ident: Ident, tmp_path: Path) -> None:
+    for name, reason in (("parameters.json", "is one of the results"), ("manifest.json", "is one of the results")):
+        ended = ident("report", folder, "--out", folder / name)
+        assert ended.code == 2
+        assert reason in ended.err
+    assert "is a folder" in ident("report", folder, "--out", tmp_path).err
+    read_results(folder)
+
+
+@pytest.mark.parametrize("form", ["svg", "png"])
+def test_figures(folder: Path, ident: Ident, tmp_path: Path, form: str) -> None:
+    if form == "png":
+        pytest.importorskip("resvg_py")
+    out = tmp_path / "figures"
+    ended = ident("figures", folder, "--format", form, "--out", out, "--json")
+    assert ended.code == 0, ended.err
+    assert sorted(ended.json["files"]) == left_over(out)
+    assert len(ended.json["files"]) == 4 + 2 + 2 + 2 + 2 + 2
+    start = b"<svg xmlns=" if form == "svg" else b"\x89PNG\r\n\x1a\n"
+    assert all(path.read_bytes().startswith(start) for path in out.iterdir())
+
+
+def test_letters_are_in_a_png(folder: Path, ident: Ident, tmp_path: Path) -> None:
+    resvg = pytest.importorskip("resvg_py")
+    assert ident("figures", folder, "--format", "png", "--out", tmp_path / "png").code == 0
+    assert ident("figures", folder, "--out", tmp_path / "svg").code == 0
+    text = (tmp_path / "svg" / "deviations.svg").read_text()
+    # With a font that is not there, letters would be missing without a word.
+    mute = bytes(resvg.svg_to_bytes(svg_string=text, sans_serif_family="No Such Font", zoom=3.0))
+    assert len((tmp_path / "png" / "deviations.png").read_bytes()) > len(mute) + 5000
+
+
+def test_png_without_its_library_says_how_to_get_it(
+    folder: Path, ident: Ident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "resvg_py", None)
+    ended = ident("figures", folder, "--format", "png", "--out", tmp_path / "figures")
+    assert ended.code == 2
+    assert "pip install 'ident-service[figures]'" in ended.err
+    assert not (tmp_path / "figures").exists()
+
+
+def test_png_without_a_font_is_refused(
+    folder: Path, ident: Ident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("resvg_py")
+    monkeypatch.setattr("ident_service.results.figure_files._FONTS", ("No Such Font",))
+    ended = ident("figures", folder, "--format", "png", "--out", tmp_path / "figures")
+    assert ended.code == 2
+    assert "PNG needs one of the fonts No Such Font" in ended.err
+
+
+def test_figures_do_not_go_into_the_results(folder: Path, ident: Ident) -> None:
+    ended = ident("figures", folder, "--out", folder)
+    assert ended.code == 2
+    assert "holds the results" in ended.err

@@ -1,0 +1,40 @@
+"""One arm commissioned twice, once more with a drier joint, and the command run inside this process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from helpers.changed_arms import changed, identified_folder
+
+from ident_service.cli import main
+
+Ident = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture(scope="session")
+def commissioned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folders `accepted` and `again` of the same small arm, and `dry` with 30 % more friction in its elbow."""
+    folder = tmp_path_factory.mktemp("commissioned")
+    identified_folder(changed("planar2", seed=1), folder / "accepted")
+    identified_folder(changed("planar2", seed=2), folder / "again")
+    identified_folder(changed("planar2", seed=3, factors={"fv2": 1.3, "fc2": 1.3}), folder / "dry")
+    return folder
+
+
+@pytest.fixture
+def ident(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ident:
+    """Run the command; exit code, stdout, stderr."""
+    monkeypatch.setenv("IDENT_STATE", str(tmp_path / "state"))
+
+    def run(*words: object) -> tuple[int, str, str]:
+        capsys.readouterr()
+        try:
+            code = main([str(word) for word in words])
+        except SystemExit as end:
+            code = int(end.code or 0)
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return run

@@ -1,0 +1,168 @@
+"""The verb `export`: all files or none, what formats lack in the answer, and reasons where something cannot be done."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from estimation.synthetic import SampledRecording, stamps, waves
+from exports.export_bench import some_delta
+
+from ident_service.cli import main
+from ident_service.config.load import load_arm
+from ident_service.errors import ModelError
+from ident_service.estimation.identify import identify
+from ident_service.model.arm_model import arm_model
+from ident_service.model.regressor import joint_regressor
+from ident_service.results.export import formats
+from ident_service.results.run_folder import write_manifest, write_results
+
+ALL = ["planar2.csv", "planar2.json", "planar2.sdf", "planar2.urdf", "planar2.xml", "planar2_dynamics.h"]
+
+
+def results_in(folder: Path, *, real: bool) -> Path:
+    """A folder of results of the planar arm; an unreal one's last link is turned inside out."""
+    model = arm_model(load_arm("planar2"))
+    delta = some_delta(model)
+    if not real:
+        delta[model.layout.inertial(1)] *= -0.5
+    time = np.arange(5000) / 250.0
+    q, dq, ddq = (waves(1, 2).derivative(time, order) for order in range(3))
+    torque = np.einsum("jps,p->sj", joint_regressor(model.chain, model.layout, q, dq, ddq), delta)
+    recording = SampledRecording(stamps(5000, 250.0), q, torque, sha256="a" * 64)
+    folder.mkdir()
+    write_results(folder, identify(model, [recording], [], set_name=None if real else "none"))
+    write_manifest(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return results_in(tmp_path_factory.mktemp("real") / "run", real=True)
+
+
+@pytest.fixture(scope="module")
+def unreal(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return results_in(tmp_path_factory.mktemp("unreal") / "run", real=False)
+
+
+@pytest.fixture(autouse=True)
+def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """No test writes below the home folder."""
+    monkeypatch.setenv("IDENT_STATE", str(tmp_path / "state"))
+    return tmp_path / "state"
+
+
+def code_of(*words: object) -> int:
+    try:
+        return main([str(word) for word in words])
+    except SystemExit as end:
+        return int(end.code or 0)
+
+
+def names_in(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_all_formats_are_written_and_what_they_lack_is_said(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of("export", run, "--out", tmp_path / "out") == 0
+    assert names_in(tmp_path / "out") == ALL
+    said = capsys.readouterr().out
+    assert said.startswith(f"files: {tmp_path / 'out'}\n  planar2.urdf (urdf)\n    has no place for: gravity\n")
+    assert "  planar2.xml (mjcf)\n    has no place for: torque offset (fo) of every joint\n" in said
+
+
+def test_the_answer_for_programs_names_every_file(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of("export", run, "--format", " c, csv,c", "--out", tmp_path / "out", "--json") == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["exit_code"] == 0
+    assert answer["folder"] == str(tmp_path / "out")
+    assert [(file["format"], file["file"]) for file in answer["files"]] == [
+        ("c", "planar2_dynamics.h"),
+        ("csv", "planar2.csv"),
+    ]
+    assert answer["files"][1]["not_carried"] == ["kinematics"]
+    assert names_in(tmp_path / "out") == ["planar2.csv", "planar2_dynamics.h"]
+
+
+def test_without_a_folder_the_state_folder_gets_a_new_one(run: Path, state: Path) -> None:
+    assert code_of("export", run, "--format", "csv") == 0
+    assert code_of("export", run, "--format", "csv") == 0
+    assert len(names_in(state / "exports")) == 2
+
+
+def test_the_same_parameters_give_the_same_bytes(run: Path, tmp_path: Path) -> None:
+    for folder in ("one", "two"):
+        assert code_of("export", run, "--out", tmp_path / folder) == 0
+    for name in ALL:
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+
+
+@pytest.mark.parametrize("words", ["urdf,stl", "", ",", "URDF"])
+def test_unknown_formats_are_a_usage_error(
+    run: Path, tmp_path: Path, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of("export", run, "--format", words, "--out", tmp_path / "out") == 2
+    assert "formats are urdf, mjcf, sdf, json, csv, c" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_no_body_has_goes_into_three_formats(
+    unreal: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of("export", unreal, "--format", "c,csv,json", "--out", tmp_path / "out") == 0
+    assert names_in(tmp_path / "out") == ["planar2.csv", "planar2.json", "planar2_dynamics.h"]
+    assert "no body has these parameters: base parameters only" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["urdf", "mjcf", "sdf"])
+def test_what_no_body_has_goes_into_no_other(
+    unreal: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of("export", unreal, "--format", f"csv,{name}", "--out", tmp_path / "out") == 1
+    assert "no body has these parameters" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_one_format_that_fails_leaves_no_file(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_: object) -> formats.Export:
+        raise ModelError("read back differs")
+
+    monkeypatch.setitem(formats.FORMATS, "c", fail)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mine.txt").write_text("stays")
+    assert code_of("export", run, "--out", tmp_path / "out") == 1
+    assert names_in(tmp_path / "out") == ["mine.txt"]
+    assert names_in(tmp_path) == ["out"]
+
+
+def test_a_folder_that_is_there_keeps_its_other_files(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mine.txt").write_text("stays")
+    (tmp_path / "out" / "planar2.csv").write_text("old")
+    assert code_of("export", run, "--format", "csv", "--out", tmp_path / "out") == 0
+    assert names_in(tmp_path / "out") == ["mine.txt", "planar2.csv"]
+    assert (tmp_path / "out" / "planar2.csv").read_text() != "old"
+
+
+def test_a_torn_run_is_refused(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    torn = tmp_path / "torn"
+    shutil.copytree(run, torn)
+    (torn / "parameters.json").write_text((torn / "parameters.json").read_text()[:-9])
+    assert code_of("export", torn, "--out", tmp_path / "out") == 1
+    assert "not what the manifest names" in capsys.readouterr().err
+    assert code_of("export", tmp_path / "nowhere", "--out", tmp_path / "out") == 2
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_place_that_cannot_be_written_is_named(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("")
+    assert code_of("export", run, "--format", "csv", "--out", tmp_path / "file") == 2
+    assert "is a file, not a folder" in capsys.readouterr().err

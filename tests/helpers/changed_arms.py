@@ -1,0 +1,76 @@
+"""Simulated arms that were changed between two commissionings: another seed, another motion, other true parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from ident_service.config.drivers import SimulatedDriver
+from ident_service.config.load import load_arm
+from ident_service.config.quantities import ParameterTable
+from ident_service.config.schema import ArmConfig, SeededMotion
+from ident_service.estimation.identify import identify
+from ident_service.excitation.plan import excitation
+from ident_service.model.arm_model import arm_model
+from ident_service.motion.factory import make_arm
+from ident_service.record.open import open_recording
+from ident_service.record.recording import Recording
+from ident_service.results.run_folder import write_manifest, write_results
+from ident_service.service.commission import record_motion
+
+
+def truth_of(config: ArmConfig) -> dict[str, float]:
+    """The simulated plant's link parameters by name."""
+    driver = config.driver
+    assert isinstance(driver, SimulatedDriver)
+    assert driver.truth is not None
+    return dict(zip(driver.truth.names, driver.truth.values, strict=True))
+
+
+def changed(
+    arm: str | ArmConfig,
+    *,
+    seed: int = 1,
+    motion: int | None = None,
+    factors: Mapping[str, float] | None = None,
+    added: Mapping[str, float] | None = None,
+) -> ArmConfig:
+    """An arm whose plant is another one.
+
+    Args:
+        arm: name of a shipped description, or a configuration.
+        seed: of the plant's noise.
+        motion: seed of the identification motion; the description's when None.
+        factors: what true parameters are multiplied by.
+        added: what is added to them, in SI units.
+    """
+    config = load_arm(arm) if isinstance(arm, str) else arm
+    truth = truth_of(config)
+    for name, factor in (factors or {}).items():
+        truth[name] *= factor
+    for name, value in (added or {}).items():
+        truth[name] = truth.get(name, 0.0) + value
+    table = ParameterTable(names=tuple(truth), values=tuple(truth.values()))
+    driver = config.driver.model_copy(update={"seed": seed, "truth": table})
+    motions = config.motions
+    if motion is not None:
+        planned = motions.identification
+        assert isinstance(planned, SeededMotion)
+        motions = motions.model_copy(update={"identification": planned.model_copy(update={"seed": motion})})
+    return config.model_copy(update={"driver": driver, "motions": motions})
+
+
+def recorded_arm(config: ArmConfig, path: Path, motion: str = "identification") -> Recording:
+    """Move the simulated arm along one of its motions, in virtual time."""
+    model = arm_model(config)
+    record_motion(make_arm(config), model, excitation(model, motion), path)
+    return open_recording(path, model.chain.names)
+
+
+def identified_folder(config: ArmConfig, folder: Path) -> Path:
+    """A folder of results from the arm's identification motion alone, as `ident identify` leaves it."""
+    folder.mkdir(parents=True)
+    recording = recorded_arm(config, folder / "identification.mcap")
+    write_results(folder, identify(arm_model(config), [recording]))
+    write_manifest(folder)
+    return folder

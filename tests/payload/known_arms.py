@@ -1,0 +1,64 @@
+"""Arms whose parameters are known but for drawn noise, and equations of them with any body on the last link."""
+
+from __future__ import annotations
+
+from functools import reduce
+
+import numpy as np
+from helpers.random_arms import model_around, random_chain, random_delta
+
+from ident_service.estimation.equations import Equations
+from ident_service.estimation.payload import KnownArm
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.base import BaseParameters, base_parameters
+from ident_service.model.information import Information, information_of, supports
+from ident_service.model.regressor import joint_regressor
+
+JOINTS = 4
+NOISE = np.array([0.5, 0.3, 0.1, 0.1])  # N m, standard deviation
+ARM: ArmModel = model_around(random_chain(np.random.default_rng(12), JOINTS, branches=False, prismatic=False))
+BASE: BaseParameters = base_parameters(ARM.chain, ARM.layout)
+DELTA = random_delta(np.random.default_rng(13), ARM.layout)
+LAST = ARM.layout.inertial(JOINTS - 1)
+
+
+def body(mass: float, center: tuple[float, float, float], radius: float = 0.05) -> np.ndarray:
+    """The ten parameters of a ball about the frame's origin (eq. 13), shape (10,)."""
+    c = np.array(center)
+    L = mass * (0.4 * radius**2 * np.eye(3) + c @ c * np.eye(3) - np.outer(c, c))
+    return np.array([L[0, 0], L[0, 1], L[0, 2], L[1, 1], L[1, 2], L[2, 2], *(mass * c), mass])
+
+
+def with_body(added: np.ndarray, sign: float = 1.0) -> np.ndarray:
+    """Link parameters of the arm with a body on its last link."""
+    delta = DELTA.copy()
+    delta[LAST] += sign * added
+    return delta
+
+
+def blocks_of(
+    delta: np.ndarray, rng: np.random.Generator, blocks: int = 40, samples: int = 40, *, speed: float = 1.0
+) -> Equations:
+    """Equations at random states with white noise; `speed` 0 for states at rest."""
+    joint_supports = supports(ARM.chain, ARM.layout, BASE.base)
+    made: list[Information] = []
+    for _ in range(blocks):
+        q, dq, ddq = rng.uniform(-2.0, 2.0, size=(3, samples, JOINTS))
+        H = joint_regressor(ARM.chain, ARM.layout, q, speed * dq, speed * ddq, BASE.base)
+        torque = np.einsum("jps,p->sj", H, BASE.K @ delta) + NOISE * rng.normal(size=q.shape)
+        made.append(information_of(H, torque, np.ones(q.shape, dtype=bool), joint_supports))
+    return Equations(tuple(made), blocks * samples)
+
+
+def true_covariance(recorded: Equations) -> np.ndarray:
+    """Of weighted least squares, with the noise known."""
+    information = reduce(Information.merged, recorded.blocks)
+    R = information.stacked(1.0 / NOISE)[:-1, :-1]
+    return np.linalg.inv(R.T @ R)
+
+
+def known(rng: np.random.Generator, delta: np.ndarray = DELTA, *, scale: float = 1.0) -> KnownArm:
+    """An arm as an identification finds it: the truth, off by a draw from its covariance."""
+    covariance = scale**2 * true_covariance(blocks_of(delta, rng))
+    beta = BASE.K @ delta + rng.multivariate_normal(np.zeros(BASE.size), covariance, method="cholesky")
+    return KnownArm(ARM, BASE, beta, covariance)

@@ -1,0 +1,165 @@
+"""`ident payload` on a simulated arm: what it finds, what it writes, what it refuses."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from importlib.resources import files
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pinocchio as pin
+import pytest
+from compare.conftest import Ident
+from helpers.changed_arms import changed, identified_folder, recorded_arm
+
+from ident_service.estimation.proof.certificate_exact import verify
+from ident_service.results.run_folder import read_results
+from ident_service.service.verify import verify_file
+
+pytestmark = pytest.mark.slow
+
+MASS, CENTER = 0.2, np.array([0.03, 0.01, 0.0])
+TOOL = {
+    "Lxx2": 1e-4 + MASS * CENTER[1] ** 2,
+    "Lxy2": -MASS * CENTER[0] * CENTER[1],
+    "Lyy2": 1e-4 + MASS * CENTER[0] ** 2,
+    "Lzz2": 1e-4 + MASS * float(CENTER @ CENTER),
+    "lx2": MASS * CENTER[0],
+    "ly2": MASS * CENTER[1],
+    "m2": MASS,
+}
+
+
+@pytest.fixture(scope="session")
+def arms(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folders of results `bare` and `tooled`, recordings `bare.mcap` and `tooled.mcap`."""
+    folder = tmp_path_factory.mktemp("arms")
+    identified_folder(changed("planar2", seed=11), folder / "bare")
+    identified_folder(changed("planar2", seed=12, added=TOOL), folder / "tooled")
+    recorded_arm(changed("planar2", seed=13), folder / "bare.mcap")
+    recorded_arm(changed("planar2", seed=14, added=TOOL), folder / "tooled.mcap")
+    return folder
+
+
+def within(document: dict[str, object], truth: dict[str, float], sign: float) -> None:
+    table = document["base_parameters"]
+    assert isinstance(table, dict)
+    for name, value, sigma in zip(table["expressions"], table["values"], table["standard_deviations"], strict=True):
+        assert abs(value - sign * truth[name]) < 3.0 * sigma
+
+
+def test_a_tool_is_found_and_written(arms: Path, ident: Ident, tmp_path: Path) -> None:
+    out = tmp_path / "with_tool"
+    code, text, _ = ident("payload", arms / "bare", arms / "tooled.mcap", "--out", out)
+    assert code == 0
+    assert text.startswith("ADDED: a body moves with the last link that the arm was identified without\n")
+    assert "no motion of this arm shows: Lxx2 Lxy2 Lxz2 Lyy2 Lyz2 lz2" in text
+    assert "\nCHANGED\n  body of link 2: " in text
+    assert "about +0.2 kg\n    may mean: another tool or payload" in text
+    wanted = ["arm.json", "comparison.html", "comparison.json", "comparison.txt", "identified.urdf", "manifest.json"]
+    wanted += ["parameters.json", "payload.json", "payload.txt"]
+    assert sorted(path.name for path in out.iterdir()) == wanted
+    document = json.loads((out / "payload.json").read_text())
+    jsonschema.validate(
+        document, json.loads(files("ident_service.results").joinpath("payload.schema.json").read_text())
+    )
+    assert document["verdict"] == "added"
+    within(document, TOOL, 1.0)
+    assert document["body"]["values"][9] == pytest.approx(MASS, abs=0.005)
+    assert (document["recordings"][0]["name"], document["link"]) == ("tooled.mcap", 2)
+
+
+def test_the_arm_with_its_tool_is_a_folder_like_any_other(arms: Path, ident: Ident, tmp_path: Path) -> None:
+    out = tmp_path / "with_tool"
+    assert ident("payload", arms / "bare", arms / "tooled.mcap", "--out", out)[0] == 0
+    loaded = read_results(out)
+    assert verify_file(out / "parameters.json").verdict == "feasible"
+    # Only the last link's body has moved.
+    before, after = (read_results(one).parameters.content["link_parameters"] for one in (arms / "bare", out))
+    moved = {
+        name
+        for name, old, new in zip(before["names"], before["values"], after["values"], strict=True)
+        if abs(old - new) > 1e-12
+    }
+    assert moved
+    assert all(name.endswith("2") and name[0] in "Llm" for name in moved)
+    mass = dict(zip(after["names"], after["values"], strict=True))["m2"]
+    assert mass - dict(zip(before["names"], before["values"], strict=True))["m2"] == pytest.approx(MASS, abs=0.005)
+    # It is the arm that an identification with the tool finds.
+    assert ident("compare", arms / "tooled", out)[0] == 0
+    # And what was put on comes off again.
+    code, text, _ = ident("payload", out, arms / "bare.mcap", "--out", tmp_path / "off")
+    assert code == 0
+    assert text.startswith("REMOVED")
+    names = list(pin.buildModelFromUrdf(str(out / "identified.urdf")).names)[1:]
+    assert names == list(loaded.config.joints)
+
+
+def test_nothing_on_the_arm_is_said_to_be_nothing(arms: Path, ident: Ident, tmp_path: Path) -> None:
+    code, text, _ = ident("payload", arms / "bare", arms / "bare.mcap", "--out", tmp_path / "none")
+    assert code == 3
+    assert text.startswith("NO PAYLOAD: the arm moves as it was identified\n")
+    assert sorted(path.name for path in (tmp_path / "none").iterdir()) == [
+        "manifest.json",
+        "payload.json",
+        "payload.txt",
+    ]
+
+
+def test_a_tool_that_was_taken_off_is_a_removal(arms: Path, ident: Ident, tmp_path: Path) -> None:
+    code, out, _ = ident("payload", arms / "tooled", arms / "bare.mcap", "--out", tmp_path / "off", "--json")
+    assert code == 0
+    document = json.loads(out)
+    assert document["verdict"] == "removed"
+    within(document, TOOL, -1.0)
+    assert document["body"]["values"][9] == pytest.approx(MASS, abs=0.005)
+    assert document["files"][-1] == "manifest.json"
+    assert verify_file(tmp_path / "off" / "parameters.json").verdict == "feasible"
+    assert ident("compare", arms / "bare", tmp_path / "off")[0] == 0
+
+
+def test_the_body_s_certificate_is_a_proof(arms: Path, ident: Ident, tmp_path: Path) -> None:
+    document = json.loads(ident("payload", arms / "bare", arms / "tooled.mcap", "--out", tmp_path / "a", "--json")[1])
+    body, base = document["body"], document["base_parameters"]
+    assert base["expressions"] == ["Lzz2", "lx2", "ly2", "m2"]
+    table = dict(zip(body["names"], body["values"], strict=True))
+    content = {
+        "format": "ident-parameters",
+        "version": 1,
+        "base_parameters": {
+            "expressions": base["expressions"],
+            "values": [table[name] for name in base["expressions"]],
+        },
+        "feasibility": {"feasible": True, "margin": body["margin"], "certificate": body["certificate"]},
+    }
+    assert verify(json.dumps(content)).verdict == "feasible"
+
+
+def test_what_cannot_be_meant_is_refused(arms: Path, ident: Ident, tmp_path: Path) -> None:
+    bare, tooled = arms / "bare", arms / "tooled.mcap"
+    torn = tmp_path / "torn"
+    shutil.copytree(bare, torn)
+    (torn / "arm.json").write_text("{}")
+    other = tmp_path / "other.csv"
+    other.write_text("t,q1,tau1\n" + "".join(f"{k / 100},{k},0\n" for k in range(500)))
+    out = tmp_path / "out"
+    cases = [
+        ((tmp_path / "nowhere", tooled), 2, "not a folder; give the folder of results of the arm without the load"),
+        ((bare / "parameters.json", tooled), 2, "not a folder"),
+        ((torn, tooled), 1, "arm.json: not what the manifest names"),
+        ((bare, bare / "identification.mcap"), 2, "the arm was identified from it; give a recording with the load"),
+        ((bare, tooled, tooled), 2, "the same recording twice"),
+        ((bare, tmp_path / "no.mcap"), 2, "no such file"),
+        ((bare, other), 1, "other.csv"),
+    ]
+    for words, wanted, reason in cases:
+        code, text, err = ident("payload", *words, "--out", out)
+        assert (code, text) == (wanted, ""), err
+        assert reason in err
+        assert not out.exists()
+    code, _, err = ident("payload", bare, tooled, "--out", bare)
+    assert code == 2
+    assert "would replace the arm's own parameters" in err
+    read_results(bare)

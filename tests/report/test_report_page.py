@@ -1,0 +1,221 @@
+"""The page's structure: what is in it, in which order, that nothing leaves it and nothing breaks into it."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from report.conftest import Made, made
+from report.pages import Node, parsed, sections
+from results.svg import Svg
+
+from ident_service.results.report.figures import figures
+from ident_service.results.report.page import report_html
+
+ORDER = ["verdict", "warnings", "parameters", "torque", "residual", "friction", "doubt", "bodies", "timing", "files"]
+
+
+def test_sections_come_in_order_under_one_heading_each(good: Made, bare: Made) -> None:
+    for page in (good.page, bare.page):
+        found = sections(page)
+        assert list(found) == ORDER
+        assert all(len(node.all("h2")) == 1 for node in found.values())
+        # Never blank: every section says or shows something beside its heading.
+        assert all(len(node.words) > len(node.one("h2").words) + 20 for node in found.values())
+        (document,) = parsed(page).all("html")
+        assert document.attributes["lang"] == "en"
+        assert len(document.all("h1")) == 1
+        assert document.one("title").words == document.one("h1").words == "Identification of random"
+
+
+def test_every_figure_has_a_sentence_and_a_text_alternative(good: Made) -> None:
+    found = parsed(good.page).all("figure")
+    # Two joints: torque on two recordings, residual, friction; deviations, correlation; two views; two timings.
+    assert len(found) == 4 + 2 + 2 + 2 + 2 + 2
+    for figure in found:
+        (svg,) = [child for child in figure.children if isinstance(child, Node) and child.tag == "svg"]
+        assert svg.attributes["role"] == "img"
+        assert len(svg.one("title").words) > 5
+        assert len(svg.one("desc").words) > 10
+        caption = figure.one("figcaption").words
+        assert re.search(r"\bGood: .+\. Bad: .+\.", caption), caption
+    assert len({figure.attributes["id"] for figure in found}) == len(found)
+
+
+def test_tables_say_what_their_rows_and_columns_are(good: Made, bare: Made) -> None:
+    for page in (good.page, bare.page):
+        for table in parsed(page).all("table"):
+            assert table.one("caption").words
+            heads = table.one("thead").all("th")
+            assert {head.attributes["scope"] for head in heads} == {"col"}
+            for row in table.one("tbody").all("tr"):
+                cells = [child for child in row.children if isinstance(child, Node)]
+                assert len(cells) == len(heads)
+                assert [cell.tag for cell in cells] == ["th"] + ["td"] * (len(heads) - 1)
+                assert cells[0].attributes["scope"] == "row"
+
+
+def test_nothing_leaves_the_page(good: Made) -> None:
+    page = good.page
+    for pattern in (
+        r"https?://",
+        r"\bsrc\s*=",
+        r"@import",
+        r"url\(",
+        r"<link",
+        r"<iframe",
+        r"\bon\w+\s*=\s*[\"']",
+        "fetch",
+    ):
+        assert not re.search(pattern, page), pattern
+    policy = next(
+        meta.attributes["content"]
+        for meta in parsed(page).all("meta")
+        if meta.attributes.get("http-equiv") == "Content-Security-Policy"
+    )
+    assert policy.startswith("default-src 'none'; ")
+    scripts = [script for script in parsed(page).all("script") if "type" not in script.attributes]
+    assert len(scripts) == 1
+    digest = base64.b64encode(hashlib.sha256("".join(map(str, scripts[0].children)).encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}'" in policy
+    assert "unsafe-eval" not in policy
+
+
+def test_the_parameter_table_is_the_parameter_file(good: Made) -> None:
+    table = sections(good.page)["parameters"].one("table")
+    heads = [head.words for head in table.one("thead").all("th")]
+    content = json.loads((good.folder / "parameters.json").read_text())["base_parameters"]
+    rows = [[cell for cell in row.children if isinstance(cell, Node)] for row in table.one("tbody").all("tr")]
+
+    def column(name: str) -> list[float]:
+        return [float(row[heads.index(name)].one("data").attributes["value"]) for row in rows]
+
+    assert [row[1].words for row in rows] == content["expressions"]
+    assert column("FBPE-OLS pseudo_inertia") == content["values"]
+    assert column("\u03c3") == content["standard_deviations"]
+    assert [row[heads.index("verdict")].words for row in rows] == content["verdicts"]
+    np.testing.assert_array_equal(column("OLS"), good.estimate.candidates[0].beta)
+    np.testing.assert_allclose(column("CAD"), good.estimate.base.K @ (1.1 * good.delta), rtol=1e-12)
+    for row in rows:
+        cell = row[heads.index("OLS")]
+        value = float(cell.one("data").attributes["value"])
+        assert float(cell.words.replace("\u2212", "-")) == pytest.approx(value, rel=1e-4)
+
+
+def test_a_bound_stands_where_it_binds(good: Made) -> None:
+    bounds = tuple(("link 2: a mass distribution exists",) if k == 3 else () for k in range(good.estimate.base.size))
+    page = report_html(replace(good.evidence, bounds=bounds), good.parameters, good.config, {})
+    rows = sections(page)["parameters"].one("tbody").all("tr")
+    said = [[cell for cell in row.children if isinstance(cell, Node)][-1].words for row in rows]
+    assert said == [bounds[k][0] if k == 3 else "\u2014" for k in range(len(rows))]
+
+
+def test_what_is_absent_is_said(bare: Made) -> None:
+    found = {name: node.words for name, node in sections(bare.page).items()}
+    assert "No real body has these parameters" in found["verdict"]
+    assert "judged on no recording that it had not seen" in found["verdict"]
+    assert "has no CAD values" in found["parameters"]
+    assert "no recording that the fit has not seen" in found["torque"]
+    assert "No body has these parameters" in found["bodies"]
+    assert "no account of its cycles" in found["timing"]
+
+
+def test_without_friction_or_spectra_that_is_said(good: Made) -> None:
+    recordings = tuple(replace(one, spectra=()) for one in good.evidence.recordings)
+    evidence = replace(good.evidence, recordings=recordings, friction=())
+    found = {
+        name: node.words for name, node in sections(report_html(evidence, good.parameters, good.config, {})).items()
+    }
+    assert "No recording is long enough for a spectrum." in found["residual"]
+    assert "The arm's model has no friction" in found["friction"]
+
+
+EVIL = "<script>alert(1)</script>\"'&</style>]]>--"
+
+
+def test_names_cannot_break_into_the_page(good: Made) -> None:
+    recordings = tuple(replace(one, name=EVIL) for one in good.evidence.recordings)
+    evidence = replace(
+        good.evidence,
+        joints=(EVIL, "b"),
+        recordings=recordings,
+        timing=tuple(replace(one, recording=EVIL) for one in good.evidence.timing),
+        warnings=(EVIL,),
+    )
+    content = json.loads(json.dumps(good.parameters.content))
+    content["base_parameters"]["expressions"][0] = EVIL
+    content["provenance"]["software"] = EVIL
+    content["feasibility"]["tight"] = [EVIL]
+    config = good.config.model_copy(update={"name": EVIL, "description": EVIL})
+    page = report_html(evidence, replace(good.parameters, content=content), config, {EVIL: "0" * 64})
+    plain = report_html(good.evidence, good.parameters, good.config, {"x": "0" * 64})
+
+    def shape(text: str) -> list[str]:
+        document = parsed(text)
+        return sorted(f"{tag}" for tag in ("script", "style", "figure", "section", "h1") for _ in document.all(tag))
+
+    assert shape(page) == shape(plain)
+    assert "alert(1)" in parsed(page).one("h1").words
+    assert "<script>alert" not in page
+    for figure in figures(evidence, good.parameters).all():
+        Svg.of(figure.svg())
+
+
+def test_drawings_are_sound_by_themselves(good: Made, bare: Made) -> None:
+    for one in (good, bare):
+        for figure in figures(one.evidence, one.parameters).all():
+            svg = Svg.of(figure.svg())
+            svg.require_sound()
+            assert (svg.title, svg.description) == (figure.title, figure.description)
+
+
+def test_a_peak_of_one_sample_is_drawn(good: Made) -> None:
+    traced = good.evidence.recordings[0]
+    joint = traced.joints[0]
+    torque = joint.torque.copy()
+    torque[1, 1000] = 10.0 * np.abs(torque).max()
+    changed = replace(traced, joints=(replace(joint, torque=torque), *traced.joints[1:]))
+    evidence = replace(good.evidence, recordings=(changed, *good.evidence.recordings[1:]))
+    svg = Svg.of(figures(evidence, good.parameters).torque[0][0].svg())
+    (measured,) = svg.points("polygon", "measured")
+    # The frame reaches just beyond the peak, which stands far above everything else.
+    top, others = np.sort(measured[:, 1])[0], np.sort(measured[:, 1])[1:]
+    assert top < 60.0
+    assert others.min() > top + 50.0
+
+
+def test_recordings_are_in_the_page_for_the_script(good: Made) -> None:
+    scripts = {s.attributes["id"]: s for s in parsed(good.page).all("script") if "id" in s.attributes}
+    assert list(scripts) == ["recording-0", "recording-1"]
+    content = json.loads("".join(map(str, scripts["recording-0"].children)))
+    assert len(content["joints"]) == 2
+    assert set(content["joints"][0]) == {"torque", "predicted", "residual", "standstill"}
+    zooms = [
+        json.loads(f.attributes["data-zoom"]) for f in parsed(good.page).all("figure") if "data-zoom" in f.attributes
+    ]
+    assert [(zoom["recording"], zoom["joint"]) for zoom in zooms] == [(0, 0), (0, 1), (1, 0), (1, 1)]
+
+
+def test_hashes_of_what_was_used_are_named(good: Made) -> None:
+    words = sections(good.page)["files"].words
+    manifest = json.loads((good.folder / "manifest.json").read_text())["files"]
+    for digest in (good.evidence.recordings[0].sha256, manifest["parameters.json"], manifest["evidence.json"]):
+        assert digest in words
+
+
+def test_warnings_are_listed(tmp_path: Path) -> None:
+    one = made(tmp_path / "results", warnings=("motion_1.csv: stamps jitter", "motion_1.csv: torn"))
+    found = sections(one.page)
+    assert [item.words for item in found["warnings"].all("li")] == list(one.evidence.warnings)
+    assert "mend what the warnings name" in found["verdict"].words
+
+
+def test_the_page_is_small(good: Made) -> None:
+    # Two short recordings of two joints; the WAM's size is held by the slow tests.
+    assert len(good.page.encode()) < 1e6
