@@ -66,6 +66,9 @@ def test_no_daemon_does_what_is_the_terminals(ident: Ident) -> None:
     ended = ident("accept", "run", "--note", "x", "--server", "http://127.0.0.1:1")
     assert ended.code == 2
     assert "no daemon does this" in ended.err
+    for words in (("run", "planar2", "--can-log"), ("home", "planar2", "--zero"), ("simulate", "--out", "x")):
+        ended = ident(*words, "--server", "http://127.0.0.1:1")
+        assert (ended.code, f"{words[-1] if words[-1] != 'x' else '--out'} would be lost" in ended.err) == (2, True)
     ended = ident("jobs", "list")
     assert ended.code == 2
     assert "ident serve" in ended.err
