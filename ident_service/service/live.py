@@ -180,6 +180,11 @@ class LiveRuns:
                 self._runs.popitem(last=False)[1].close()
         return found
 
+    def close(self) -> None:
+        """Forget all."""
+        for name in list(self._runs):
+            self.forget(name)
+
     def forget(self, name: str) -> None:
         """One that has ended."""
         with self._lock:

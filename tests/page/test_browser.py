@@ -175,14 +175,29 @@ def test_a_rehearsal_moves_while_a_key_is_held(browser: Browser, reached: Reache
     page = log_in(browser, reached)
     begin(page, reached, "Check")
     assert ended(page) == "done"
-    begin(page, reached, "Rehearse")
-    page.locator("#hold").focus()
+    arm_page(page, reached)
+    page.get_by_role("button", name="Rehearse", exact=True).click()
+    page.get_by_label("Type the arm's name").fill(ARM)
+    page.keyboard.press("Tab")
+    expect(page.locator("#hold")).to_be_focused()
+    assert not rows.jobs(reached.service.db, arm=ARM, states=rows.LIVE)
     page.keyboard.down(" ")
     expect(page.locator("#hold")).to_have_attribute("aria-pressed", "true")
     page.get_by_role("heading", name="The arm now").wait_for()
+    assert in_use(control_path(state, ARM))
     page.keyboard.up(" ")
     assert ended(page) == "cancelled"
     assert not in_use(control_path(state, ARM))
+
+
+def test_a_rehearsal_with_another_name_moves_nothing(browser: Browser, reached: Reached) -> None:
+    page = log_in(browser, reached)
+    arm_page(page, reached)
+    page.get_by_role("button", name="Rehearse", exact=True).click()
+    page.get_by_label("Type the arm's name").fill("planar3")
+    page.locator("#hold").press(" ")
+    expect(page.locator("#detail")).to_contain_text("Nothing has moved")
+    assert not rows.jobs(reached.service.db, arm=ARM)
 
 
 @pytest.mark.parametrize("width", [1280, 400])

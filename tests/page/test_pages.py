@@ -11,12 +11,14 @@ from pathlib import Path
 
 import pytest
 from daemon.conftest import URL, Asked, quick_text, serving
+from fastapi.routing import APIRoute
 
 from ident_service.config.load import load_arm
 from ident_service.service.arm_state import arm_folder, fault_file
 from ident_service.service.commission import simulate
 from ident_service.service.import_run import import_run
 from ident_service.service.pages.render import STATIC, mark, static
+from ident_service.service.pages.routes import PAGES
 from ident_service.service.registry import jobs as rows
 from ident_service.service.registry.tokens import add_token
 
@@ -159,6 +161,15 @@ def test_strangers_are_led_to_the_way_in(daemon: Asked, commissioned: Path) -> N
         answer = daemon.get(address)
         assert answer.status_code == 303, address
         assert answer.headers["location"].startswith("/login?next=%2F")
+    filled = {"arm": ARM, "job": "j1", "run": commissioned.name, "name": "n", "version": "v"}
+    open_to_all = {"/login", "/logout", "/static/{version}/{name}", "/stop"}
+    tried = 0
+    for route in (route for router in PAGES for route in router.routes if isinstance(route, APIRoute)):
+        for method in () if route.path in open_to_all else route.methods:
+            tried += 1
+            answer = daemon.ask(method, route.path.format(**filled), headers=FORM)
+            assert (answer.status_code, "/login" in answer.headers.get("location", "")) == (303, True), route.path
+    assert tried >= 20
     for address in ("/new", f"/arms/{ARM}/move", f"/arms/{ARM}/accept", "/jobs/j1/cancel"):
         answer = daemon.post(address, content="a=b", headers=FORM)
         assert (answer.status_code, answer.headers["location"]) == (303, "/login?next=%2F"), address
@@ -226,6 +237,15 @@ def test_a_motion_needs_the_typed_name_and_a_fresh_page(daemon: Asked) -> None:
     enter(daemon, "viewer")
     assert "data-lease" not in daemon.get(where).text
     daemon.post("/stop", content="", headers=FORM)
+
+
+def test_a_rehearsal_begins_on_its_own_page_only(daemon: Asked) -> None:
+    enter(daemon, "operator")
+    answer = daemon.post(f"/arms/{ARM}/confirm", content="kind=rehearse&speed=0.2", headers=FORM)
+    assert (answer.status_code, complaints(answer.text)) == (200, [])
+    assert 'id="hold"' in answer.text
+    answer = daemon.post(f"/arms/{ARM}/move", content=f"kind=rehearse&name={ARM}", headers=FORM)
+    assert (answer.status_code, "held" in answer.text) == (400, True)
 
 
 def test_stop_needs_nobody_here_and_somebody_elsewhere(daemon: Asked) -> None:

@@ -60,6 +60,7 @@ def create_app(settings: Settings, ready: Callable[[Service], None] = lambda _: 
             yield
         finally:
             await run_in_threadpool(engine.close)
+            app.state.live.close()
             db.close()
 
     app = FastAPI(

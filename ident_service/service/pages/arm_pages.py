@@ -90,6 +90,8 @@ def ask_confirmation(service: Serving, who: Operator, arm: ArmName, form: Form) 
 @router.post("/arms/{arm}/move")
 def move(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
     """Begin a motion that a person has confirmed; the page of its job keeps its lease from then on."""
+    if form.get("kind") == "rehearse":
+        raise UsageError("a rehearsal begins when the button of its page is held")
     asked = _asked(arm, form)
     body = {"job": asked, "confirm": {"name": form.get("name", ""), "challenge": form.get("challenge", "")}}
     try:
@@ -182,6 +184,9 @@ def _confirmation(service: Service, who: Access, arm: str, form: dict[str, str],
     fields = {"kind": form["kind"], "motion": form.get("motion", ""), "speed": form.get("speed", "")}
     motion = known_motions.known_motion(service.db, fields["motion"]) if fields["motion"] else None
     status = 409 if problem else 200
+    # A rehearsal begins with the hand on its button: its lease would lapse before a page could be loaded.
+    if form["kind"] == "rehearse":
+        return page("rehearse", who, status, arm=given.arm, given=given, fields=fields, motion=motion)
     return page("confirm", who, status, arm=given.arm, given=given, fields=fields, motion=motion, problem=problem)
 
 

@@ -46,12 +46,13 @@ def show_job(service: Serving, who: Viewer, job: Id, attended: bool = False) -> 
     row = rows.known_job(service.db, job)
     live = row["state"] in rows.LIVE
     attends = attended and live and bool(row["motion"]) and row["created_by"] == who.name and who.role == "operator"
+    attends = attends and row["kind"] != "rehearse"  # whose lease is kept by a hand on its own page
     return page(
         "job",
         who,
         job=jobs.answer_of(service, row),
         live=live,
-        lease=("hold" if row["kind"] == "rehearse" else "keep") if attends else "",
+        lease="keep" if attends else "",
         recorded=row["kind"] in RECORDED,
         log=_log(service, row),
         entered=row["run"] is not None and service.db.row("SELECT 1 FROM runs WHERE id = ?", row["run"]) is not None,
@@ -100,6 +101,11 @@ def _log(service: Service, row: Row) -> str:
     return log
 
 
+def _shown(service: Service, row: Row) -> str:
+    answer = jobs.answer_of(service, row)
+    return json.dumps({"job": answer.model_dump(mode="json"), "log": _log(service, row)[-4096:]})
+
+
 async def _events(service: Service, live: LiveRuns, row: Row) -> AsyncIterator[str]:
     run = None
     if row["kind"] in RECORDED and row["run"] is not None and row["state"] in rows.LIVE:
@@ -114,8 +120,7 @@ async def _events(service: Service, live: LiveRuns, row: Row) -> AsyncIterator[s
         if since >= _STATE:
             since = 0.0
             row = await run_in_threadpool(rows.known_job, service.db, row["id"])
-            answer = await run_in_threadpool(jobs.answer_of, service, row)
-            shown = json.dumps({"job": json.loads(answer.model_dump_json()), "log": _log(service, row)[-4096:]})
+            shown = await run_in_threadpool(_shown, service, row)
             if shown != told:
                 told = shown
                 news.append(f"event: job\ndata: {shown}\n\n")

@@ -2,7 +2,7 @@
 "use strict";
 
 const job = document.getElementById("job");
-const id = job.dataset.job;
+let id = job.dataset.job; // empty before a rehearsal has begun
 const WINDOW = 10; // s that plots show
 const LAG = 0.25; // s behind the newest sample, so that what comes in pieces moves evenly
 const FRAME = 1000 / 30; // ms
@@ -14,35 +14,60 @@ const byId = (name) => document.getElementById(name);
 
 // --- the lease: while this page is there, or while a key is held
 
+let pending = 0;
+
 function renew() {
-  return fetch(`/api/v1/jobs/${id}/lease`, { method: "POST" }).catch(() => null);
+  if (!id || pending > 1) return; // a service that stalls is not asked more and more often
+  pending += 1;
+  fetch(`/api/v1/jobs/${id}/lease`, { method: "POST" })
+    .catch(() => null)
+    .finally(() => (pending -= 1));
 }
 
-function keepLease() {
-  renew();
-  setInterval(renew, 300);
+async function rehearse() {
+  const said = job.dataset;
+  const asked = { kind: "rehearse", arm: said.arm, speed: Number(said.speed) };
+  if (said.motion) asked.motion = said.motion;
+  const confirm = { name: byId("name").value.trim(), challenge: said.challenge };
+  const answer = await fetch("/api/v1/jobs", {
+    method: "POST",
+    headers: { "Content-Type": "application/json" },
+    body: JSON.stringify({ job: asked, confirm }),
+  });
+  const told = await answer.json();
+  if (!answer.ok) throw new Error(told.error.message);
+  return told.id;
 }
 
-function holdLease(button) {
+function holdToMove(button) {
   let timer = null;
-  const press = () => {
-    if (timer !== null) return;
-    button.setAttribute("aria-pressed", "true");
-    renew();
-    timer = setInterval(renew, 70);
-  };
+  let begun = false;
   const release = () => {
     if (timer === null) return;
     clearInterval(timer);
     timer = null;
     button.setAttribute("aria-pressed", "false");
+    // Not renewed, it lapses in a quarter of a second; said aloud, it ends at once.
+    if (id) fetch(`/api/v1/jobs/${id}/cancel`, { method: "POST" }).catch(() => null);
   };
-  const waiting = setInterval(() => {
-    // Nothing moves while the job waits for its process; the lease it needs meanwhile is kept by this page.
-    if (byId("state").textContent === "queued") renew();
-    else clearInterval(waiting);
-  }, 70);
-  button.setAttribute("aria-pressed", "false");
+  const press = () => {
+    if (timer !== null || begun) return;
+    begun = true;
+    button.setAttribute("aria-pressed", "true");
+    timer = setInterval(renew, 70);
+    byId("detail").textContent = "";
+    rehearse().then(
+      (made) => {
+        id = made;
+        if (timer === null) fetch(`/api/v1/jobs/${id}/cancel`, { method: "POST" }).catch(() => null);
+        listen();
+      },
+      (error) => {
+        release();
+        byId("detail").textContent = `Nothing has moved: ${error.message}. Go back to the page of the arm and begin again.`;
+      },
+    );
+  };
   button.addEventListener("pointerdown", (event) => {
     button.setPointerCapture(event.pointerId);
     press();
@@ -50,18 +75,20 @@ function holdLease(button) {
   for (const kind of ["pointerup", "pointercancel", "lostpointercapture", "blur"]) button.addEventListener(kind, release);
   button.addEventListener("contextmenu", (event) => event.preventDefault());
   button.addEventListener("keydown", (event) => {
-    if (event.key === " " || event.key === "Enter") {
-      event.preventDefault();
-      press();
-    }
+    if (event.key !== " " && event.key !== "Enter") return;
+    event.preventDefault();
+    if (!event.repeat) press();
   });
   button.addEventListener("keyup", release);
   addEventListener("blur", release);
   document.addEventListener("visibilitychange", () => document.hidden && release());
 }
 
-if (job.dataset.lease === "keep") keepLease();
-if (job.dataset.lease === "hold") holdLease(byId("hold"));
+if (job.dataset.lease === "keep") {
+  renew();
+  setInterval(renew, 300);
+}
+if (byId("hold")) holdToMove(byId("hold"));
 
 // --- news of the job
 
@@ -308,6 +335,7 @@ function showDoubt(text) {
 
 function listen() {
   closeStreams();
+  if (!id) return;
   Object.assign(series, { joints: [], time: [] });
   Object.assign(doubt, { time: [], shares: [], first: [] });
   play = null;
@@ -332,5 +360,6 @@ document.addEventListener("visibilitychange", () => {
   if (document.hidden) closeStreams();
   else listen();
 });
+document.addEventListener("stop-asked", listen);
 listen();
 if (byId("live")) requestAnimationFrame(frame);

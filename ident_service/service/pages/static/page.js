@@ -17,6 +17,7 @@ document.addEventListener("keydown", (event) => {
   event.preventDefault();
   const status = document.getElementById("stop-status");
   status.textContent = "Stop asked …";
+  closeStreams();
   fetch("/api/v1/stop", { method: "POST" })
     .then((answer) => {
       if (!answer.ok) throw new Error(String(answer.status));
@@ -26,5 +27,6 @@ document.addEventListener("keydown", (event) => {
       const what = done.arms.length ? done.arms.join(", ") : done.jobs.length ? "motions that had not begun" : "";
       status.textContent = what ? `Asked to stop: ${what}.` : "Nothing was moving.";
     })
+    .then(() => document.dispatchEvent(new Event("stop-asked")))
     .catch(() => document.getElementById("stop").submit());
 });
