@@ -2,7 +2,8 @@
 
 All is read from what the recorder has flushed into the run's file: the motion process, its ring and its recorder are
 never asked for anything. Ten viewers cost what one does: whoever looks first reads on for all. Doubt is worked out by a
-thread of the lowest priority, one bounded step every second and a half, and only while somebody watches.
+thread, one bounded step every second and a half, and only while somebody watches. The thread keeps the service's own
+priority: with a lower one it could be kept waiting while it holds the interpreter, and a stop with it.
 """
 
 from __future__ import annotations
@@ -10,23 +11,23 @@ from __future__ import annotations
 import json
 import logging
 import math
-import os
 import threading
 import time
 from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from ident_service.config.load import arm_from_json
 from ident_service.errors import IdentError, RecordingError
-from ident_service.estimation.growing import Doubt, GrowingInformation
-from ident_service.model.arm_model import arm_model
 from ident_service.record.recording import Block
 from ident_service.record.tail import RecordingTail, Samples
+
+if TYPE_CHECKING:  # estimation is loaded by the thread that needs it: the service starts without
+    from ident_service.estimation.growing import Doubt, GrowingInformation
 
 ARM, RECORDING = "arm.json", "run.mcap"
 BIN_NS: Final = 20_000_000  # one point for the eye
@@ -141,8 +142,10 @@ class LiveRun:
     # --- the thread that works out the doubt
 
     def _work(self) -> None:
+        from ident_service.estimation.growing import GrowingInformation
+        from ident_service.model.arm_model import arm_model
+
         try:
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 19)
             if self._growing is None:
                 self._growing = GrowingInformation(arm_model(arm_from_json(self._folder / ARM)))
             while self._now() - self._seen < _PATIENCE:

@@ -8,10 +8,8 @@ from fastapi import APIRouter, Query, Response
 from fastapi.responses import HTMLResponse
 
 from ident_service.errors import UsageError
-from ident_service.results.comparison.page import comparison_html
 from ident_service.service.api import runs
 from ident_service.service.api.asking import Serving, Viewer
-from ident_service.service.comparison import compare_files
 from ident_service.service.jobs.asked import ArmName, Id
 from ident_service.service.jobs.commands import REPORTS
 from ident_service.service.pages.asking import PageRoute
@@ -43,6 +41,10 @@ def show_run(service: Serving, who: Viewer, run: Id) -> Response:
 @router.get("/compare")
 def compare(service: Serving, who: Viewer, reference: Id, other: Id) -> Response:
     """The comparison of two runs' parameters, as `ident compare` writes it."""
+    # Loaded when they are asked for: the service starts without.
+    from ident_service.results.comparison.page import comparison_html
+    from ident_service.service.comparison import compare_files
+
     if reference == other:
         raise UsageError("choose two different runs to compare")
     comparison, _ = compare_files([known.run_folder(service.db, service.state, one) for one in (reference, other)])
