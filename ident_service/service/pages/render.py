@@ -77,7 +77,7 @@ def _lasting(seconds: float | None) -> str:
     if seconds is None:
         return "\u2014"
     minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes} min {rest} s" if minutes else f"{rest} s"
+    return " ".join([*([f"{minutes} min"] if minutes else []), *([f"{rest} s"] if rest or not minutes else [])])
 
 
 def _short(sha256: str) -> str:
