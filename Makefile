@@ -9,6 +9,7 @@ READY  := $(VENV)/.ready
 demo: $(READY)
 	$(BIN)/ident simulate
 
+# The page's tests drive the system's Chromium (Debian: `apt install chromium`; or CHROMIUM=path), and skip without one.
 test: lint types coverage
 	$(BIN)/pytest -n 2 -m "not campaign and not realtime"
 	$(BIN)/pytest -m "realtime and not campaign"

@@ -4,6 +4,7 @@
 
     IdentError
     ├── UsageError (ValueError)        a command or call that cannot be meant: missing file, contradictory options
+    │   └── UnknownId (LookupError)    an id that the registry does not have
     ├── ConfigError (ValueError)       an arm description with mistakes, all of them, each with file:line:column
     ├── ModelError (ValueError)        a mechanism or array shape that the model cannot represent
     ├── RecordingError (ValueError)    a recording that cannot be used: wrong joints, NaN, too short, torn row
@@ -39,6 +40,10 @@ class IdentError(Exception):
 
 class UsageError(IdentError, ValueError):
     """The request itself cannot be meant: a file that does not exist, options that contradict each other."""
+
+
+class UnknownId(UsageError, LookupError):
+    """An arm, motion, run, file or job was named that the registry does not have."""
 
 
 @dataclass(frozen=True)

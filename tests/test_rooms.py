@@ -43,8 +43,11 @@ DOORS: dict[str, set[str]] = {
     "canopen": {"drivers", "sim_backend"},
     "can": {"drivers", "sim_backend"},
     "fastapi": {"service"},
+    "jinja2": {"service"},
+    "starlette": {"service"},
+    "uvicorn": {"service"},
 }
-HEAVY = ("pinocchio", "ruckig", "cvxpy", "clarabel", "mcap", "canopen", "can", "fastapi")
+HEAVY = ("pinocchio", "ruckig", "cvxpy", "clarabel", "mcap", "canopen", "can", "fastapi", "jinja2", "uvicorn")
 
 
 @dataclass(frozen=True)

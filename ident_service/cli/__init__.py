@@ -19,11 +19,14 @@ from ident_service.cli import (
     commission,
     comparing,
     configs,
+    daemon,
     emulate,
     exports,
+    keeping,
     motions,
     parameters,
     recovery,
+    remote,
     results,
 )
 from ident_service.cli.answer import (
@@ -42,7 +45,10 @@ from ident_service.errors import ArmFault, ConfigError, IdentError, MotionRefuse
 
 __all__ = ["DONE", "FAILED", "FAULTED", "USAGE", "VERDICT_NO", "main"]
 
-GROUPS = (commission, motions, arm, recovery, parameters, results, comparing, exports, configs, bus, emulate)
+GROUPS = (
+    *(commission, motions, arm, recovery, parameters, results, comparing, exports, keeping),
+    *(configs, bus, emulate, daemon, remote),
+)
 _EXIT_CODES: tuple[tuple[type[IdentError], int], ...] = (
     (ConfigError, USAGE),
     (UsageError, USAGE),
@@ -73,7 +79,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         raise
     try:
         _own_packages_only()
-        verb: Callable[[argparse.Namespace], Answer] = arguments.verb
+        verb: Callable[[argparse.Namespace], Answer] = arguments.verb if arguments.server is None else remote.remotely
         code, text, document = verb(arguments)
     except KeyboardInterrupt:
         # Asked twice, or by somebody who does not want to wait for what could be saved.

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
+from ident_service.cli.lease import add_lease, asked_lease, until
 from ident_service.cli.moving import RELEASED, HeldKey, add_can_log, moved, require_terminal
 from ident_service.cli.words import Parser, Verbs, seconds, speed
 from ident_service.errors import DriverError, MotionRefused, UsageError
@@ -34,6 +35,7 @@ def add(verbs: Verbs) -> None:
     sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
     sub.add_argument("--home", action="store_true", help="for `ident home` and `ident recover`, and no motion")
     sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person: the arm is supported")
+    add_lease(sub, confirm=False)
     sub = verbs.add("run", _run, "move the arm along a motion and record it")
     _motion(sub)
     sub.add_argument("--speed", type=speed, default=1.0, metavar="SHARE", help="of the motion's own speed")
@@ -61,6 +63,7 @@ def _motion(sub: Parser) -> None:
         "--out", type=Path, metavar="DIR", help="run folder; must not exist (default: below the state folder)"
     )
     add_can_log(sub)
+    add_lease(sub)
 
 
 def _chosen(config: ArmConfig, motion: Path | None) -> Excitation:
@@ -116,9 +119,14 @@ def _check(arguments: argparse.Namespace) -> Answer:
     faults.require_none(faults.latched())
     require_writable(path.parent)
     arm, model = make_arm(config), arm_model(config)
-    # Whoever looks for the one who moves the arm finds this process, and its stop ends the preflight.
-    with ControlFile.take(control_path(state, config.name), None) as controls:
-        stoppable = StoppableArm(arm, lambda: controls.stop)
+    lease, stopping = asked_lease(arguments, config), StopOnSignal()
+    # Whoever looks for the one who moves the arm finds this process, and its stop ends the preflight. A person's Ctrl-C
+    # ends it at once, a question too; a program's polite signal waits for the next cycle.
+    with (
+        nullcontext() if lease is None else stopping,
+        ControlFile.take(control_path(state, config.name), None) as controls,
+    ):
+        stoppable = StoppableArm(arm, until(lambda: controls.stop or stopping.requested(), lease))
         # The rate is measured with what a run gets of the kernel.
         with nullcontext() if arm.clock.lock_step else asked():
             ticket = preflight(stoppable, model, motion, confirm=confirm)
@@ -127,20 +135,34 @@ def _check(arguments: argparse.Namespace) -> Answer:
     return code, ticket_text(ticket) + f"ticket: {path}\n", {"path": str(path), "ticket": ticket_document(ticket)}
 
 
-def _run(arguments: argparse.Namespace) -> Answer:
+def _run(arguments: argparse.Namespace, seconds: float | None = None) -> Answer:
+    """Run; `seconds` is how long the lease lasts that a program keeps, the ordinary time if None."""
     from ident_service.config.load import load_arm
 
     config = load_arm(arguments.arm)
+    lease = asked_lease(arguments, config, seconds)
     motion = _chosen(config, arguments.motion)
     sentence = f"{motion.name} motion of {motion.duration / arguments.speed:g} s"
     stopping = StopOnSignal()
     with stopping:
-        return moved(arguments, config, motion, sentence, speed=arguments.speed, stop_requested=stopping.requested)
+        return moved(
+            arguments,
+            config,
+            motion,
+            sentence,
+            speed=arguments.speed,
+            lease=seconds,
+            stop_requested=until(stopping.requested, lease),
+        )
 
 
 def _rehearse(arguments: argparse.Namespace) -> Answer:
     if arguments.no_key:
         return _run(arguments)
+    if arguments.lease_from_stdin:
+        from ident_service.motion.controls import HOLD_TO_RUN_SECONDS
+
+        return _run(arguments, HOLD_TO_RUN_SECONDS)
     terminal = require_terminal(arguments)
     from ident_service.config.load import load_arm
     from ident_service.motion.controls import HOLD_TO_RUN_SECONDS

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
+from ident_service.cli.lease import add_lease, asked_lease, until
 from ident_service.cli.moving import add_can_log, moved
 from ident_service.cli.words import Verbs
 from ident_service.errors import UsageError
@@ -33,9 +34,10 @@ def add(verbs: Verbs) -> None:
     sub.add_argument(
         "--zero", action="store_true", help="move nothing: a person has led the arm home, and its encoders begin there"
     )
-    sub.add_argument("--confirm", metavar="NAME", help="with --zero: the arm's name, typed by a person who has looked")
+    sub.add_argument("--confirm", metavar="NAME", help="with --zero or --server: the arm's name, typed by a person")
     sub.add_argument("--out", type=Path, metavar="DIR", help=_HELP_OUT)
     add_can_log(sub)
+    add_lease(sub, confirm=False)
     sub = verbs.add(
         "recover", _recover, "after a fault or a stop: what is in the way, and what to do (exit code 3: something is)"
     )
@@ -43,6 +45,7 @@ def add(verbs: Verbs) -> None:
     sub.add_argument("--leave-limit", action="store_true", help="MOVE the arm: slowly back inside its position limits")
     sub.add_argument("--out", type=Path, metavar="DIR", help=_HELP_OUT)
     add_can_log(sub)
+    add_lease(sub)
 
 
 def _home(arguments: argparse.Namespace) -> Answer:
@@ -97,6 +100,8 @@ def _recover(arguments: argparse.Namespace) -> Answer:
         return _slowly(arguments, config, Destination.INSIDE)
     if arguments.out is not None:
         raise UsageError("--out is for the recording of --leave-limit; without it nothing moves")
+    if arguments.lease_from_stdin:
+        raise UsageError("--lease-from-stdin is for --leave-limit; without it nothing moves")
     if arguments.can_log:
         raise UsageError("--can-log is for --leave-limit; without it nothing moves")
     found = recover(config, state_folder(arguments), called=arguments.arm)
@@ -119,11 +124,13 @@ def _recover(arguments: argparse.Namespace) -> Answer:
 def _slowly(arguments: argparse.Namespace, config: ArmConfig, destination: Destination) -> Answer:
     from ident_service.motion.faults import HOLD
 
+    lease = asked_lease(arguments, config)
     tell(arguments, f"{config.name}: keep out of its reach; where the way ends the arm is held for {HOLD:g} s,")
     tell(arguments, "then its drives brake it: support it, an arm without brakes sinks. Ctrl-C stops.")
     stopping = StopOnSignal()
     with stopping:
-        return moved(arguments, config, destination, f"slowly {destination.value}", stop_requested=stopping.requested)
+        asked = until(stopping.requested, lease)
+        return moved(arguments, config, destination, f"slowly {destination.value}", stop_requested=asked)
 
 
 def _text(found: Recovery) -> str:

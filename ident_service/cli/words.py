@@ -52,16 +52,19 @@ class Verbs:
     Attributes:
         commands: argparse's list of verbs.
         common: what every verb understands.
+        prefix: the words before the verb, with a space behind them.
     """
 
     commands: argparse._SubParsersAction[Parser]
     common: Parser
+    prefix: str = ""
 
     @classmethod
     def of(cls, parser: Parser) -> Verbs:
         """The list of a command that has verbs and nothing else."""
         common = Parser(add_help=False)
         common.add_argument("--json", action="store_true", help="one JSON object on stdout, nothing else")
+        common.add_argument("--server", metavar="URL", help="have a daemon there do it; things are named by its ids")
         common.add_argument("--state", help="state folder (default: $IDENT_STATE, or the user's XDG state folder)")
         return cls(parser.add_subparsers(required=True, metavar="VERB"), common)
 
@@ -78,13 +81,13 @@ class Verbs:
             Its parser, to add arguments to.
         """
         parser = self.commands.add_parser(name, parents=[self.common], help=text, description=text, **rest)
-        parser.set_defaults(verb=run)
+        parser.set_defaults(verb=run, word=f"{self.prefix}{name}", words=parser)
         return parser
 
     def group(self, name: str, text: str) -> Verbs:
         """Add a word that verbs of its own follow, as in `ident config check`."""
         parser = self.commands.add_parser(name, help=text)
-        return Verbs(parser.add_subparsers(required=True, metavar="VERB"), self.common)
+        return Verbs(parser.add_subparsers(required=True, metavar="VERB"), self.common, f"{self.prefix}{name} ")
 
 
 def seed(text: str) -> int:

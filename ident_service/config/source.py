@@ -51,7 +51,7 @@ def read_tree(path: Path, _chain: tuple[Path, ...] = ()) -> Tree:
     path = path.resolve()
     if path in _chain:
         raise ConfigError([Problem(path, 1, 1, "extends itself: " + " -> ".join(p.name for p in (*_chain, path)))])
-    tree = _parse(path)
+    tree = read_alone(path)
     if not isinstance(tree.value, dict):
         raise ConfigError([Problem(path, 1, 1, "an arm description is a mapping of keys to values")])
     parent = tree.value.pop("extends", None)
@@ -80,7 +80,12 @@ def _merge(base: Any, over: Any) -> Any:
     return base | {key: _merge(base[key], value) if key in base else value for key, value in over.items()}
 
 
-def _parse(path: Path) -> Tree:
+def read_alone(path: Path) -> Tree:
+    """Read a YAML file and no other, whatever it `extends`.
+
+    Raises:
+        ConfigError: unreadable file, bad YAML, or something refused.
+    """
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
             raise ConfigError([Problem(path, 1, 1, f"larger than {MAX_FILE_BYTES} bytes")])

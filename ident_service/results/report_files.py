@@ -13,9 +13,10 @@ from ident_service.results.evidence.evidence import Evidence
 from ident_service.results.evidence.file import EVIDENCE, read_evidence, write_evidence
 from ident_service.results.evidence.making import gather_evidence
 from ident_service.results.files import write_atomically
+from ident_service.results.manifest import MANIFEST, hashes, write_manifest
 from ident_service.results.parameter_file import read_parameters
 from ident_service.results.report.page import report_html
-from ident_service.results.run_folder import MANIFEST, PARAMETERS, Results, hashes, read_results, write_manifest
+from ident_service.results.run_folder import PARAMETERS, Results, read_results
 
 REPORT_PAGE = "report.html"
 

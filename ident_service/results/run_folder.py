@@ -5,20 +5,21 @@ Nothing is believed of a folder that is read before every file has the hash that
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ident_service import __version__
 from ident_service.config.load import arm_from_json
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import ParameterError, UsageError
 from ident_service.estimation.identify import Estimate
 from ident_service.results.export.urdf_file import write_urdf
 from ident_service.results.files import write_atomically
+from ident_service.results.manifest import MANIFEST as MANIFEST
+from ident_service.results.manifest import hashes as hashes
+from ident_service.results.manifest import verified_files
+from ident_service.results.manifest import write_manifest as write_manifest
 from ident_service.results.parameter_file import (
     ParameterFile,
     parameters_document,
@@ -27,9 +28,8 @@ from ident_service.results.parameter_file import (
 )
 from ident_service.results.summary import parameter_table, summary
 
-PARAMETERS, URDF, REPORT, MANIFEST = "parameters.json", "identified.urdf", "report.txt", "manifest.json"
+PARAMETERS, URDF, REPORT = "parameters.json", "identified.urdf", "report.txt"
 ARM = "arm.json"
-_MAX_BYTES = 64 * 2**20
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def read_results(folder: Path) -> Results:
         ParameterError: its files are torn, changed, foreign, or do not belong together.
         ConfigError: the arm in it is not one that this version reads.
     """
-    sha256 = _verified(folder)
+    sha256 = verified_files(folder)
     for name in (PARAMETERS, ARM):
         if name not in sha256:
             raise UsageError(f"{folder}: {name} is not among its files; it comes from `ident identify` or `simulate`")
@@ -67,38 +67,6 @@ def read_results(folder: Path) -> Results:
     if named != config.sha256:
         raise ParameterError(f"{folder}: {PARAMETERS} was identified for another arm than {ARM} describes")
     return Results(folder, config, parameters, sha256)
-
-
-def _verified(folder: Path) -> Mapping[str, str]:
-    """Name to SHA-256, each found to be true."""
-    if not folder.is_dir():
-        raise UsageError(f"{folder}: no such folder; give one that `ident identify` or `ident simulate` made")
-    path = folder / MANIFEST
-    if not path.is_file():
-        raise UsageError(f"{folder}: no {MANIFEST} in it; give a folder that `ident identify` or `ident simulate` made")
-    if path.stat().st_size > _MAX_BYTES:
-        raise ParameterError(f"{path}: larger than {_MAX_BYTES} bytes")
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        kind, files = content["format"], content["files"]
-        known = kind == "ident-run" and all(
-            isinstance(value, str) and Path(name).name == name for name, value in files.items()
-        )
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ParameterError(f"{path}: not a manifest: {error}") from None
-    if not known:
-        raise ParameterError(f"{path}: not the manifest of a run")
-    for name, wanted in files.items():
-        if not (folder / name).is_file():
-            raise ParameterError(f"{folder / name}: named by the manifest, but not there")
-        if _sha256(folder / name) != wanted:
-            raise ParameterError(f"{folder / name}: not what the manifest names; it was changed, or is torn")
-    return dict(files)
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def write_results(folder: Path, estimate: Estimate, more: dict[str, Any] | None = None) -> list[str]:
@@ -120,20 +88,3 @@ def write_results(folder: Path, estimate: Estimate, more: dict[str, Any] | None 
         names.append(URDF)
     write_atomically(folder / REPORT, summary(estimate) + "\n" + parameter_table(estimate))
     return [*names, REPORT]
-
-
-def write_manifest(folder: Path) -> None:
-    """Name and SHA-256 of every file in the folder, for verification on another machine."""
-    manifest = {
-        "format": "ident-run",
-        "version": 1,
-        "software": f"ident-service {__version__}",
-        "files": hashes(folder),
-    }
-    write_atomically(folder / MANIFEST, json.dumps(manifest, indent=1) + "\n")
-
-
-def hashes(folder: Path) -> dict[str, str]:
-    """Name to SHA-256 of every file in a folder but its manifest and hidden ones."""
-    paths = [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")]
-    return {path.name: _sha256(path) for path in paths if path.name != MANIFEST}

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from ident_service.config.drivers import SimulatedDriver
 from ident_service.config.load import load_arm
 from ident_service.config.quantities import ParameterTable
 from ident_service.config.schema import ArmConfig, SeededMotion
+from ident_service.config.simulation import SimulatedDriver
 from ident_service.estimation.identify import identify
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import arm_model

@@ -1,0 +1,92 @@
+"""Verbs about the daemon: `serve`, and `token` for who may talk to it.
+
+Boundary: words to calls, results to words; the work is `service/api` and `service/registry/tokens.py`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from datetime import UTC, datetime
+from pathlib import Path
+
+from ident_service.cli.answer import DONE, Answer, print_to_person, state_folder
+from ident_service.cli.words import Verbs
+
+TERMINAL = "terminal"
+_PORT = 8470
+
+
+def add(verbs: Verbs) -> None:
+    """Register the verbs."""
+    sub = verbs.add("serve", _serve, "the daemon: API, jobs and registry of the state folder")
+    sub.add_argument("--host", default="127.0.0.1", help="address to listen on; any but a loopback one needs TLS")
+    sub.add_argument("--port", type=_port, default=_PORT, help=f"default {_PORT}; 0 for any that is free")
+    sub.add_argument("--tls-cert", type=Path, metavar="FILE", help="certificate chain, PEM")
+    sub.add_argument("--tls-key", type=Path, metavar="FILE", help="its key, PEM")
+    sub.add_argument("--name", action="append", default=[], metavar="HOST", help="host name that clients use, too")
+    sub.add_argument("--motion-door", type=Path, metavar="SOCKET", help="of the unit that motions run in")
+
+    token = verbs.group("token", "who may talk to the daemon")
+    sub = token.add("add", _add, "make a token and print it; nothing can print it again")
+    sub.add_argument("name", metavar="NAME", help="which the audit trail will show")
+    sub.add_argument("--role", choices=["viewer", "operator"], required=True)
+    token.add("list", _list, "names and roles")
+    sub = token.add("revoke", _revoke, "let a token, and the sessions that it began, count no more")
+    sub.add_argument("name", metavar="NAME")
+
+
+def _serve(arguments: argparse.Namespace) -> Answer:
+    from ident_service.service.api.logs import log_as_json
+    from ident_service.service.api.serve import serve
+    from ident_service.service.api.settings import Settings
+
+    state = state_folder(arguments).absolute()
+    settings = Settings(
+        state,
+        host=arguments.host,
+        port=arguments.port,
+        tls_cert=arguments.tls_cert,
+        tls_key=arguments.tls_key,
+        names=tuple(arguments.name),
+        motion_door=arguments.motion_door,
+    )
+    log_as_json()
+    serve(settings, lambda url: print_to_person(f"ident: {url}, state {state}, token in {state / 'token'}\n"))
+    return DONE, "", {"state": str(state)}
+
+
+def _add(arguments: argparse.Namespace) -> Answer:
+    from ident_service.service.registry.database import Database
+    from ident_service.service.registry.tokens import add_token
+
+    with Database(state_folder(arguments)) as db:
+        secret = add_token(db, arguments.name, arguments.role, TERMINAL)
+    return DONE, f"{secret}\n", {"name": arguments.name, "role": arguments.role, "token": secret}
+
+
+def _list(arguments: argparse.Namespace) -> Answer:
+    from ident_service.service.registry.database import Database
+    from ident_service.service.registry.tokens import tokens
+
+    with Database(state_folder(arguments)) as db:
+        rows = tokens(db)
+    lines = []
+    for row in rows:
+        since = datetime.fromtimestamp(row["created"], UTC).strftime("%Y-%m-%d")
+        lines.append(f"{row['name']:<24} {row['role']:<9} since {since}{', revoked' if row['revoked'] else ''}\n")
+    return DONE, "".join(lines) or "no tokens yet; `ident serve` makes the first\n", {"tokens": [dict(r) for r in rows]}
+
+
+def _revoke(arguments: argparse.Namespace) -> Answer:
+    from ident_service.service.registry.database import Database
+    from ident_service.service.registry.tokens import revoke_token
+
+    with Database(state_folder(arguments)) as db:
+        revoke_token(db, arguments.name, TERMINAL)
+    return DONE, f"{arguments.name}: revoked\n", {"name": arguments.name, "revoked": True}
+
+
+def _port(text: str) -> int:
+    if not text.isdigit() or int(text) > 65535:
+        raise argparse.ArgumentTypeError("a port is a number from 0 to 65535")
+    return int(text)

@@ -1,0 +1,284 @@
+"""`ident VERB ... --server URL`: the same verb, done by a daemon; and `jobs`, which looks at what daemons do.
+
+Boundary: words to requests by id, answers to words. Files that are named here are read here and uploaded.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ident_service.cli.answer import DONE, FAILED, FAULTED, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
+from ident_service.cli.words import Verbs, count
+from ident_service.errors import IdentError, UsageError
+
+if TYPE_CHECKING:
+    from ident_service.service.client import Client
+
+Verb = Callable[["Client", argparse.Namespace], Answer]
+_LOOK = 0.4  # s between looks at a job, and between renewals of its lease
+_CODES = {"done": DONE, "refused": VERDICT_NO, "faulted": FAULTED}
+_LIVE = ("queued", "running")
+_MOVE = ("check", "run", "home")
+
+
+def add(verbs: Verbs) -> None:
+    """Register `jobs`."""
+    jobs = verbs.group("jobs", "what a daemon does; without --server, that of the state folder")
+    sub = jobs.add("list", _with_client(_list), "jobs, the newest first")
+    sub.add_argument("--most", type=count, default=20, metavar="N")
+    for name, verb, text in (
+        ("show", _show, "one job and what its command answered"),
+        ("watch", _watch, "wait for its end; its exit code becomes ours"),
+        ("cancel", _cancel, "have it end; a motion by a controlled stop"),
+    ):
+        sub = jobs.add(name, _with_client(verb), text)
+        sub.add_argument("job", metavar="ID")
+
+
+def remotely(arguments: argparse.Namespace) -> Answer:
+    """Have a daemon do what the words say.
+
+    Raises:
+        UsageError: a verb that no daemon does.
+        IdentError: as the daemon says.
+    """
+    verb = REMOTE.get(arguments.word)
+    if verb is None:
+        raise UsageError(f"{arguments.word}: no daemon does this; --server is for {', '.join(sorted(REMOTE))}")
+    given = {name for name, value in vars(arguments).items() if value != arguments.words.get_default(name)}
+    if lost := sorted(given - _CARRIED[arguments.word] - _OURS):
+        options = ", ".join(f"--{name.replace('_', '-')}" for name in lost)
+        raise UsageError(f"{arguments.word} --server: {options} would be lost; a daemon is not told of it")
+    return _with_client(verb)(arguments)
+
+
+def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
+    """The verb with a connection of its own."""
+
+    def connected(arguments: argparse.Namespace) -> Answer:
+        with closing(_client(arguments)) as client:
+            return verb(client, arguments)
+
+    return connected
+
+
+def _asked(make: Callable[[Client, argparse.Namespace], dict[str, Any]]) -> Verb:
+    """A verb that is a job."""
+
+    def verb(client: Client, arguments: argparse.Namespace) -> Answer:
+        job = {key: value for key, value in make(client, arguments).items() if value is not None}
+        body: dict[str, Any] = {"job": {**job, "kind": arguments.word}}
+        if arguments.word in _MOVE:
+            body["confirm"] = _confirmation(client, arguments)
+        made = client.post("/api/v1/jobs", body)
+        tell(arguments, f"job {made['id']}")
+        return _followed(client, arguments, made, moves=arguments.word in _MOVE)
+
+    return verb
+
+
+def _simulate(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+    motion = _motion(client, arguments.arm, arguments.motion)
+    return {
+        "arm": arguments.arm,
+        "motion": motion,
+        "seed": arguments.seed,
+        "feasible_set": arguments.feasible_set,
+    }
+
+
+def _identify(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+    return {
+        "arm": arguments.arm,
+        "recordings": [_recording(path) for path in arguments.recordings],
+        "validate_on": [_recording(path) for path in arguments.validate],
+        "method": arguments.method,
+        "feasible_set": arguments.feasible_set,
+        "prior": arguments.prior,
+    }
+
+
+def _design(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+    seconds = arguments.seconds if arguments.seconds is not None or arguments.starts is not None else 60.0
+    return {
+        "arm": arguments.arm,
+        "seconds": seconds,
+        "starts": arguments.starts,
+        "seed": arguments.seed,
+        "criterion": arguments.criterion,
+        "parameters": arguments.chosen,
+        "motion": arguments.motion,
+        "after": [_recording(path) for path in arguments.after],
+    }
+
+
+def _check(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+    motion = _motion(client, arguments.arm, arguments.motion)
+    return {"arm": arguments.arm, "motion": motion, "home": arguments.home}
+
+
+def _run(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+    return {"arm": arguments.arm, "motion": _motion(client, arguments.arm, arguments.motion), "speed": arguments.speed}
+
+
+def _home(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+    return {"arm": arguments.arm}
+
+
+def _ask(client: Client, arguments: argparse.Namespace) -> Answer:
+    answer = client.post(f"/api/v1/arms/{_id(arguments.arm)}/{arguments.word}")
+    reached = bool(answer.get("reached", answer.get("arms")) or answer.get("jobs"))
+    words = f"{arguments.word} asked" if reached else "nobody moves the arm"
+    return DONE, f"{arguments.arm}: {words}\n", answer
+
+
+def _ack(client: Client, arguments: argparse.Namespace) -> Answer:
+    path = f"/api/v1/arms/{_id(arguments.arm)}/faults/{_id(arguments.fault)}/ack"
+    answer = client.post(path)
+    return DONE, f"{arguments.arm}: acknowledged {answer['code']} ({answer['cause']})\n", answer
+
+
+def _list(client: Client, arguments: argparse.Namespace) -> Answer:
+    jobs = client.get(f"/api/v1/jobs?most={min(arguments.most, 500)}")
+    lines = [f"{job['id']:<44} {job['state']:<12} {job['arm'] or '':<16} by {job['created_by']}\n" for job in jobs]
+    return DONE, "".join(lines) or "no jobs yet\n", {"jobs": jobs}
+
+
+def _show(client: Client, arguments: argparse.Namespace) -> Answer:
+    return _told(client, client.get(f"/api/v1/jobs/{_id(arguments.job)}"), DONE)
+
+
+def _watch(client: Client, arguments: argparse.Namespace) -> Answer:
+    return _followed(client, arguments, client.get(f"/api/v1/jobs/{_id(arguments.job)}"), moves=False, ours=False)
+
+
+def _cancel(client: Client, arguments: argparse.Namespace) -> Answer:
+    return _told(client, client.post(f"/api/v1/jobs/{_id(arguments.job)}/cancel"), DONE)
+
+
+REMOTE: dict[str, Verb] = {
+    "simulate": _asked(_simulate),
+    "identify": _asked(_identify),
+    "design": _asked(_design),
+    "check": _asked(_check),
+    "run": _asked(_run),
+    "home": _asked(_home),
+    **dict.fromkeys(("stop", "pause", "resume"), _ask),
+    "ack": _ack,
+    "jobs list": _list,
+    "jobs show": _show,
+    "jobs watch": _watch,
+    "jobs cancel": _cancel,
+}
+
+
+# What of each verb a daemon is told; anything else that is given must not be lost in silence.
+_OURS = frozenset({"json", "state", "server", "verb", "word", "words", "asks"})
+_MOTION = frozenset({"arm", "motion", "confirm"})
+_CARRIED: dict[str, frozenset[str]] = {
+    "simulate": frozenset({"arm", "motion", "seed", "feasible_set"}),
+    "identify": frozenset({"arm", "recordings", "validate", "method", "feasible_set", "prior"}),
+    "design": frozenset({"arm", "seconds", "starts", "seed", "criterion", "chosen", "motion", "after"}),
+    "check": _MOTION | {"home"},
+    "run": _MOTION | {"speed"},
+    "home": _MOTION,
+    **dict.fromkeys(("stop", "pause", "resume"), frozenset({"arm"})),
+    "ack": frozenset({"arm", "fault"}),
+    "jobs list": frozenset({"most"}),
+    **dict.fromkeys(("jobs show", "jobs watch", "jobs cancel"), frozenset({"job"})),
+}
+
+
+def _followed(
+    client: Client, arguments: argparse.Namespace, job: dict[str, Any], *, moves: bool, ours: bool = True
+) -> Answer:
+    """Wait for the end of a job, its lease renewed meanwhile; Ctrl-C has it end, if it is ours."""
+    stopping, cancelled, phase = StopOnSignal(), False, ""
+    with stopping:
+        while job["state"] in _LIVE:
+            if stopping.requested() and not cancelled:
+                cancelled = True
+                if not ours:
+                    break
+                client.post(f"/api/v1/jobs/{job['id']}/cancel")
+            elif moves and not cancelled:
+                _renew(client, job["id"])
+            time.sleep(_LOOK)
+            job = client.get(f"/api/v1/jobs/{job['id']}")
+            said = (job["progress"] or {}).get("phase", job["state"])
+            if said != phase:
+                phase = said
+                tell(arguments, phase)
+    return _told(client, job, _CODES.get(job["state"], FAILED))
+
+
+def _renew(client: Client, job: str) -> None:
+    """A lease that cannot be renewed any more is that of a motion that ends, which the next look tells."""
+    try:
+        client.post(f"/api/v1/jobs/{job}/lease")
+    except IdentError as error:
+        if "has no lease" not in str(error):
+            raise
+
+
+def _told(client: Client, job: dict[str, Any], code: int) -> Answer:
+    result = client.get(f"/api/v1/jobs/{job['id']}/result")["answer"]
+    lines = [f"job {job['id']}: {job['kind']}, {job['state']}"]
+    lines += [job["detail"]] if job["detail"] else []
+    lines += [f"run {job['run']}"] if job["run"] else []
+    return code, "\n".join([*lines, ""]), {"job": job, "answer": result}
+
+
+def _confirmation(client: Client, arguments: argparse.Namespace) -> dict[str, str]:
+    """The arm's name as a person types it, now or as `--confirm`, and a challenge for it."""
+    name = arguments.confirm
+    if name is None and sys.stdin.isatty() and not arguments.json:
+        name = input(f"{arguments.arm} will move where you may not see it. Type its name to confirm: ").strip()
+    if name != arguments.arm:
+        raise UsageError(f"a motion is confirmed by the arm's name, typed: --confirm {arguments.arm}")
+    word = client.post(f"/api/v1/arms/{_id(arguments.arm)}/challenge")["challenge"]
+    return {"name": name, "challenge": word}
+
+
+def _motion(client: Client, arm: str, motion: Path | None) -> str | None:
+    """The id of a motion; a file is uploaded first."""
+    if motion is None:
+        return None
+    if motion.is_file():
+        content = motion.read_text(encoding="utf-8", errors="replace")
+        return str(client.post("/api/v1/motions", {"arm": arm, "motion": content})["id"])
+    return str(motion)
+
+
+def _recording(path: Path) -> dict[str, str]:
+    """`RUN` or `RUN/NAME`, both as the daemon calls them."""
+    run, _, name = str(path).partition("/")
+    return {"run": run, **({"name": name} if name else {})}
+
+
+def _id(word: str) -> str:
+    """A word that may stand in an address."""
+    if not word or any(letter in word for letter in "/?#% \\") or not word.isprintable() or word.startswith("."):
+        raise UsageError(f"{word!r}: with --server, arms, runs and jobs are named by id, not by path")
+    return word
+
+
+def _client(arguments: argparse.Namespace) -> Client:
+    from ident_service.service.client import Client
+    from ident_service.service.registry.tokens import TOKEN_FILE, read_token
+
+    state, url = state_folder(arguments), arguments.server
+    if url is None:
+        try:
+            url = (state / "serve.url").read_text(encoding="ascii").strip()
+        except OSError:
+            raise UsageError(f"no daemon serves {state}; start one with `ident serve`, or give --server URL") from None
+    token = os.environ.get("IDENT_TOKEN") or read_token(state / TOKEN_FILE)
+    return Client(url, token)

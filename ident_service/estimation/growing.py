@@ -1,0 +1,141 @@
+"""Information that grows while an arm moves: the R factor of what was recorded so far, and the doubt that is left.
+
+New samples wait until they make a window long enough for the zero-phase filter; the window's equations are merged into
+the factor (`model/information.py`) and all but its end is forgotten. Work and memory of a step are bounded, whatever
+the length of the run. Deviations are those of eq. 81, which takes residuals for white: they show how doubt shrinks; the
+result's own come from blocks (`doubt.py`) and are larger.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ident_service.config.recording import RecordingFormat
+from ident_service.errors import RecordingError
+from ident_service.estimation.doubt import Verdict, verdicts
+from ident_service.estimation.equations import equation_rows
+from ident_service.estimation.least_squares import ordinary_least_squares
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.base import base_parameters
+from ident_service.model.chain import Array
+from ident_service.model.information import empty_information, information_of, supports
+from ident_service.model.threads import one_blas_thread
+from ident_service.record.recording import BLOCK_SAMPLES, Block, cut, join
+
+_FIRST = 2.0  # s; a filter that needs more says so, and gets it
+_LONGEST = 60.0  # s
+_MOST = 10.0  # s beyond the shortest window that are worked on in one step
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """What is left of it.
+
+    Attributes:
+        seconds: of motion that went in [s].
+        beta: least squares, each joint's equations divided by its residual [SI], shape (base,).
+        deviations: eq. 81 [SI], infinite where nothing is known yet, shape (base,).
+        verdicts: a word per base parameter.
+    """
+
+    seconds: float
+    beta: Array
+    deviations: Array
+    verdicts: tuple[Verdict, ...]
+
+
+class GrowingInformation:
+    """The information of one run.
+
+    Attributes:
+        base: the grouping of the parameters.
+    """
+
+    def __init__(self, model: ArmModel) -> None:
+        """Nothing is known yet.
+
+        Args:
+            model: of the arm; averaging over periods and trimming, which need a whole recording, are left out.
+        """
+        options = model.config.identification.model_copy(update={"period": None})
+        config = model.config.model_copy(update={"identification": options, "recording": RecordingFormat()})
+        self._model = replace(model, config=config)
+        self.base = base_parameters(model.chain, model.layout)
+        self._supports = supports(model.chain, model.layout, self.base.base)
+        self._information = empty_information(self._supports, self.base.size)
+        self._waiting: list[Block] = []
+        self._need, self._done_ns, self._seconds = _FIRST, -1, 0.0
+
+    def add(self, block: Block) -> None:
+        """New samples, consecutive to those before."""
+        self._waiting.append(block)
+
+    @one_blas_thread()
+    def step(self) -> bool:
+        """Work on what waits, a bounded part of it; whether anything has become known."""
+        if not self._waiting:
+            return False
+        whole = join(self._waiting)
+        self._waiting = [whole]
+        first = int(whole.stamp_ns[0])
+        if (int(whole.stamp_ns[-1]) - first) * 1e-9 < self._need:
+            return False
+        stop = int(np.searchsorted(whole.stamp_ns, first + int((self._need + _MOST) * 1e9)))
+        window = cut(whole, 0, stop)
+        try:
+            found = self._merge(window)
+        except RecordingError:  # too short for the filter
+            if self._need >= _LONGEST:
+                self._waiting = [cut(whole, stop, len(whole.stamp_ns))] if stop < len(whole.stamp_ns) else []
+            self._need = min(1.5 * self._need, _LONGEST)
+            return False
+        # The next window looks at the end of this one again, because its own edges are left out.
+        edge = self._model.config.identification.edge
+        keep = int(np.searchsorted(whole.stamp_ns, self._done_ns - int((edge + 0.1) * 1e9)))
+        self._waiting = [cut(whole, max(keep, 0), len(whole.stamp_ns))]
+        return found
+
+    def _merge(self, window: Block) -> bool:
+        first, found = int(window.stamp_ns[0]), False
+        for rows in equation_rows(_Window(window, self._model.chain.names), self._model, self.base):
+            time_ns = first + np.rint(rows.time * 1e9).astype(np.int64)
+            new = time_ns > self._done_ns
+            if not new.any():
+                continue
+            block = information_of(rows.H_b[:, :, new], rows.torque[new], rows.keep[new], self._supports)
+            self._information = self._information.merged(block)
+            self._seconds += float(rows.time[new][-1] - rows.time[new][0])
+            self._done_ns, found = int(time_ns[-1]), True
+        return found
+
+    @one_blas_thread()
+    def doubt(self) -> Doubt | None:
+        """What is left of it; None before anything is known."""
+        information = self._information
+        if int(information.rows.sum()) <= self.base.size:
+            return None
+        fit = ordinary_least_squares(information)
+        spread = np.sqrt(information.squared_residuals(fit.beta) / np.maximum(information.rows, 1))
+        floor = 1e-9 * np.sqrt(information.squared_torques() / np.maximum(information.rows, 1)) + 1e-300
+        fit = ordinary_least_squares(information, np.where(information.rows > 0, 1.0 / np.maximum(spread, floor), 1.0))
+        deviations = fit.standard_deviations
+        return Doubt(self._seconds, fit.beta, deviations, verdicts(fit.beta, deviations, self.base.units))
+
+
+class _Window:
+    """Samples behind the protocol of a recording; ours hold their torque from stamp to stamp."""
+
+    torque_held, torn, sha256 = True, False, ""
+    path = Path("the run so far")
+
+    def __init__(self, block: Block, names: tuple[str, ...]) -> None:
+        self._block, self.joint_names, self.joints = block, names, len(names)
+
+    def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
+        """As the protocol says."""
+        for start in range(0, len(self._block.stamp_ns), samples):
+            yield cut(self._block, start, min(start + samples, len(self._block.stamp_ns)))

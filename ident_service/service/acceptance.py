@@ -1,0 +1,224 @@
+"""Accepting is a person's act: from then on a run's parameters are the arm's current ones, under a path that stays.
+
+```
+STATE/arms/NAME/accepted/0001/    every set that was ever accepted: its files, and acceptance.json
+STATE/arms/NAME/current/          parameters.json, identified.urdf: the last one's
+```
+
+A new number is one folder that appears whole; that is the act. `current` and the registry follow it and are brought up
+to date by `settle` after a kill in between. A roll-back is a new number with an earlier set: nothing is taken away.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Final
+
+from ident_service.errors import ParameterError, UsageError
+from ident_service.results.files import appearing_folder, write_atomically
+from ident_service.results.manifest import file_sha256
+from ident_service.service.arm_state import arm_folder
+from ident_service.service.registry.audit import note as audit
+from ident_service.service.registry.database import Database
+
+PARAMETERS, URDF, ARM = "parameters.json", "identified.urdf", "arm.json"
+ACCEPTED, CURRENT, ACT = "accepted", "current", "acceptance.json"
+LONGEST_NOTE: Final = 2000
+
+
+@dataclass(frozen=True)
+class Acceptance:
+    """One act.
+
+    Attributes:
+        arm: name.
+        number: from 1; the highest is the current one.
+        run: id of the run, or the name of its folder, that the parameters stem from.
+        origin: the number whose set it is; its own, or that which was rolled back to.
+        parameters_sha256: of its `parameters.json`.
+        note: why, in the person's words.
+        at: when [s since 1970 in UTC].
+        who: the name of the token, or `terminal`.
+    """
+
+    arm: str
+    number: int
+    run: str
+    origin: int
+    parameters_sha256: str
+    note: str
+    at: float
+    who: str
+
+
+def accept(db: Database, state: Path, folder: Path, note: str, who: str, *, arm: str | None = None) -> Acceptance:
+    """Make the parameters of a run's folder the arm's current ones.
+
+    Args:
+        db: the registry.
+        state: the state folder.
+        folder: of results, verified against its manifest here.
+        note: why.
+        who: accepts.
+        arm: whose they are to be; the one that the folder names if None.
+
+    Raises:
+        UsageError: no note, nothing was identified in the folder, or it is about another arm.
+        ParameterError: the folder is not what its manifest names, or no body can have its parameters.
+    """
+    from ident_service.results.run_folder import read_results
+
+    note = _noted(note)
+    results = read_results(folder)
+    if results.parameters.content.get("feasibility", {}).get("feasible") is not True:
+        raise ParameterError(f"{folder}: no body can have these parameters, so no arm has them; accept a feasible set")
+    if arm not in (None, results.config.name):
+        raise UsageError(f"{folder.name} is about the arm {results.config.name}, not {arm}")
+    arm = results.config.name
+    with _acting(state, arm):
+        number = len(acceptances(state, arm)) + 1
+        act = Acceptance(arm, number, folder.name, number, results.sha256[PARAMETERS], note, round(time.time(), 3), who)
+        _write(state, act, folder)
+        _follow(db, state, arm)
+        audit(db, who, "accepted", arm, number=number, run=act.run, note=note, sha256=act.parameters_sha256)
+    return act
+
+
+def rollback(db: Database, state: Path, arm: str, note: str, who: str, to: int | None = None) -> Acceptance:
+    """Make an earlier accepted set the current one again.
+
+    Args:
+        db: the registry.
+        state: the state folder.
+        arm: name.
+        note: why.
+        who: asks.
+        to: number of the acceptance; the one before the current set's if None.
+
+    Raises:
+        UsageError: no note, or there is no such set.
+    """
+    note = _noted(note)
+    with _acting(state, arm):
+        acts = acceptances(state, arm)
+        if not acts:
+            raise UsageError(f"{arm}: nothing has been accepted yet")
+        if to is None:
+            earlier = [act for act in acts if act.number == act.origin and act.number < acts[-1].origin]
+            if not earlier:
+                raise UsageError(f"{arm}: nothing was accepted before the current set")
+            target = earlier[-1]
+        elif 1 <= to <= len(acts):
+            target = acts[to - 1]
+        else:
+            raise UsageError(f"{arm}: no acceptance {to}; they are numbered from 1 to {len(acts)}")
+        act = Acceptance(
+            *(arm, len(acts) + 1, target.run, target.origin, target.parameters_sha256),
+            *(note, round(time.time(), 3), who),
+        )
+        source = _folder(state, arm, target.number)
+        if file_sha256(source / PARAMETERS) != target.parameters_sha256:
+            raise ParameterError(f"{source / PARAMETERS}: was changed since it was accepted")
+        _write(state, act, source)
+        _follow(db, state, arm)
+        audit(db, who, "rolled back", arm, number=act.number, to=target.number, note=note)
+    return act
+
+
+def acceptances(state: Path, arm: str) -> list[Acceptance]:
+    """All acts about an arm, the earliest first.
+
+    Raises:
+        ParameterError: a file of them was damaged by somebody.
+    """
+    place, acts = arm_folder(state, arm) / ACCEPTED, list[Acceptance]()
+    while (folder := place / f"{len(acts) + 1:04d}").is_dir():
+        try:
+            acts.append(Acceptance(**json.loads((folder / ACT).read_text(encoding="utf-8"))))
+        except (OSError, ValueError, TypeError) as error:
+            raise ParameterError(f"{folder / ACT}: cannot be read ({error}); put a copy of it back") from None
+    return acts
+
+
+def settle(db: Database, state: Path) -> None:
+    """Bring `current` and the registry up to date with what was accepted, for every arm; after a kill, for example."""
+    place = state / "arms"
+    for folder in sorted(place.iterdir()) if place.is_dir() else ():
+        if (folder / ACCEPTED).is_dir():
+            with _acting(state, folder.name):
+                _follow(db, state, folder.name)
+
+
+def accepted_runs(db: Database) -> set[str]:
+    """Ids of the runs that any acceptance stems from."""
+    return {row["run"] for row in db.rows("SELECT DISTINCT run FROM acceptances")}
+
+
+def _noted(note: str) -> str:
+    note = note.strip()
+    if not note:
+        raise UsageError("say why, in a note; it is what people read years later")
+    if len(note) > LONGEST_NOTE:
+        raise UsageError(f"a note has {LONGEST_NOTE} characters at most")
+    return note
+
+
+def _folder(state: Path, arm: str, number: int) -> Path:
+    return arm_folder(state, arm) / ACCEPTED / f"{number:04d}"
+
+
+def _write(state: Path, act: Acceptance, source: Path) -> None:
+    with appearing_folder(_folder(state, act.arm, act.number)) as folder:
+        for name in (PARAMETERS, ARM, URDF):
+            if (source / name).is_file():
+                _copied(source / name, folder / name)
+        write_atomically(folder / ACT, json.dumps(asdict(act), indent=1) + "\n")
+
+
+def _follow(db: Database, state: Path, arm: str) -> None:
+    """`current` and the registry say what the folders of acceptances say."""
+    acts = acceptances(state, arm)
+    if not acts:
+        return
+    source, current = _folder(state, arm, acts[-1].number), arm_folder(state, arm) / CURRENT
+    current.mkdir(exist_ok=True)
+    # The parameters last: who has seen them sees a URDF that is as new.
+    for name in (URDF, ARM, PARAMETERS):
+        if not (source / name).is_file():
+            (current / name).unlink(missing_ok=True)
+        elif not (current / name).is_file() or file_sha256(current / name) != file_sha256(source / name):
+            write_atomically(current / name, (source / name).read_text(encoding="utf-8"))
+    with db.transaction():
+        for act in acts:
+            db.write("INSERT OR IGNORE INTO acceptances VALUES (?, ?, ?, ?, ?, ?, ?, ?)", *asdict(act).values())
+
+
+def _copied(source: Path, target: Path) -> None:
+    with source.open("rb") as reading, target.open("xb") as writing:
+        shutil.copyfileobj(reading, writing)
+        writing.flush()
+        os.fsync(writing.fileno())
+
+
+@contextmanager
+def _acting(state: Path, arm: str) -> Iterator[None]:
+    """One act at a time about an arm, from whichever process."""
+    folder = arm_folder(state, arm)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        fd = os.open(folder / "accepting", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    except OSError as error:
+        raise UsageError(f"{folder}: cannot be written: {error.strerror}") from None
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(fd)

@@ -1,0 +1,96 @@
+"""Routes about the service itself: its health, its figures, who asks, sessions of the page, the audit trail."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import PlainTextResponse
+from pydantic import BaseModel, ConfigDict, Field
+
+from ident_service import __version__
+from ident_service.errors import IdentError
+from ident_service.service.api.answers import AuditLine, HealthAnswer, WhoAnswer
+from ident_service.service.api.asking import COOKIE, Cookie, Serving, Viewer, address_of, throttled, unknown
+from ident_service.service.api.gate import SESSION_SECONDS, Throttled
+from ident_service.service.api.mistakes import failures, failures_of_files
+from ident_service.service.arm_state import fault_file
+from ident_service.service.registry.audit import trail
+
+router = APIRouter(tags=["service"], responses=failures())
+
+
+class Login(BaseModel):
+    """A token, to be exchanged for a session of the page."""
+
+    model_config = ConfigDict(extra="forbid")
+    token: Annotated[str, Field(min_length=1, max_length=200)]
+
+
+@router.get("/healthz", responses={503: {"model": HealthAnswer, "description": "The queue is not looked after."}})
+def healthz(service: Serving, response: Response) -> HealthAnswer:
+    """Whether the service looks after its queue; asks for no token."""
+    healthy = service.engine.healthy and not service.engine.closing
+    response.status_code = 200 if healthy else 503
+    return HealthAnswer(healthy=healthy, version=__version__)
+
+
+@router.get("/metrics", response_class=PlainTextResponse, responses=failures_of_files())
+def metrics(service: Serving, _: Viewer) -> PlainTextResponse:
+    """Figures in Prometheus' text format."""
+    rows = service.db.rows("SELECT kind, state, COUNT(*) AS number FROM jobs GROUP BY kind, state")
+    faults, place = dict[str, int](), service.state / "arms"
+    for folder in place.iterdir() if place.is_dir() else ():
+        try:
+            faults[folder.name] = len(fault_file(service.state, folder.name).latched())
+        except IdentError:
+            faults[folder.name] = 1  # a file that somebody damaged stands in the way like one
+    jobs = {(row["kind"], row["state"]): row["number"] for row in rows}
+    text = service.metrics.text(jobs, service.engine.moving(), faults)
+    return PlainTextResponse(text, media_type="text/plain; version=0.0.4")
+
+
+@router.get("/api/v1/whoami")
+def whoami(who: Viewer) -> WhoAnswer:
+    """Who asks."""
+    return WhoAnswer(name=who.name, role=who.role)
+
+
+@router.post("/api/v1/login")
+def login(service: Serving, request: Request, response: Response, body: Login) -> WhoAnswer:
+    """Exchange a token for a session, in a cookie that scripts cannot read and other sites do not send."""
+    try:
+        found = service.gate.log_in(body.token, address_of(request))
+    except Throttled as error:
+        raise throttled(error) from None
+    if found is None:
+        raise unknown()
+    session, who = found
+    response.set_cookie(
+        *(COOKIE, session),
+        max_age=int(SESSION_SECONDS),
+        path="/",
+        secure=service.settings.tls,
+        httponly=True,
+        samesite="strict",
+    )
+    return WhoAnswer(name=who.name, role=who.role)
+
+
+@router.post("/api/v1/logout", status_code=204)
+def logout(service: Serving, response: Response, cookie: Cookie = None) -> None:
+    """End the session."""
+    if cookie is not None:
+        service.gate.log_out(cookie)
+    response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
+
+
+@router.get("/api/v1/audit")
+def audit(
+    service: Serving,
+    _: Viewer,
+    before: Annotated[int, Query(ge=0, lt=2**62)] | None = None,
+    most: Annotated[int, Query(ge=1, le=500)] = 100,
+) -> list[AuditLine]:
+    """Who did what, the newest first; `before` the id of a line goes on from there."""
+    return [AuditLine(**row) for row in trail(service.db, before=before, most=most)]

@@ -1,0 +1,88 @@
+"""The application: everything put together, and nothing done before it starts."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+from fastapi import FastAPI
+from fastapi.concurrency import run_in_threadpool
+from fastapi.routing import APIRoute
+
+from ident_service import __version__
+from ident_service.service.acceptance import settle
+from ident_service.service.api import about, arms, jobs, runs
+from ident_service.service.api.asking import Service
+from ident_service.service.api.doors import Doors
+from ident_service.service.api.gate import Gate
+from ident_service.service.api.metrics import Metrics
+from ident_service.service.api.mistakes import answer_mistakes
+from ident_service.service.api.settings import Settings
+from ident_service.service.jobs.engine import Engine
+from ident_service.service.live import LiveRuns
+from ident_service.service.pages.routes import PAGES
+from ident_service.service.registry.arms import know_shipped
+from ident_service.service.registry.database import Database
+from ident_service.service.registry.runs import rebuild_runs
+from ident_service.service.registry.tokens import first_token
+
+ROUTERS = (about.router, arms.router, jobs.router, runs.router, *PAGES)
+"""In this order."""
+
+
+def create_app(settings: Settings, ready: Callable[[Service], None] = lambda _: None) -> FastAPI:
+    """The service as an ASGI application; its database is opened now, its queue runs while its lifespan does.
+
+    Args:
+        settings: how it runs.
+        ready: called when it answers.
+
+    Raises:
+        UsageError: the state folder cannot be used.
+    """
+    db = Database(settings.state)
+    first_token(db, settings.state)
+    know_shipped(db)
+    engine = Engine(
+        *(db, settings.state),
+        computing=settings.computing,
+        motion_door=settings.motion_door,
+        lease_factor=settings.lease_factor,
+    )
+    service = Service(settings, db, engine, Gate(db), Metrics())
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        settle(db, settings.state)
+        engine.start(lambda: rebuild_runs(db, settings.state))
+        ready(service)
+        try:
+            yield
+        finally:
+            await run_in_threadpool(engine.close)
+            app.state.live.close()
+            db.close()
+
+    app = FastAPI(
+        title="ident",
+        version=__version__,
+        description="Commission a robot arm. Everything is named by id; every motion needs an operator, a lease and "
+        "the typed name of its arm; stop needs none of them.",
+        openapi_url="/api/v1/openapi.json",
+        docs_url=None,  # these pages load scripts from other machines
+        redoc_url=None,
+        lifespan=lifespan,
+        generate_unique_id_function=_operation,
+    )
+    app.state.service = service
+    app.state.live = LiveRuns()
+    for router in ROUTERS:
+        app.include_router(router)
+    answer_mistakes(app)
+    app.add_middleware(Doors, settings=settings, metrics=service.metrics)
+    return app
+
+
+def _operation(route: APIRoute) -> str:
+    """The name of an operation is that of its function, for clients that are generated."""
+    return route.name

@@ -1,0 +1,187 @@
+"""Routes about arms: the list, a description that is uploaded, its faults, what was accepted, a motion's challenge."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Annotated
+
+from fastapi import APIRouter
+from pydantic import BaseModel, ConfigDict, Field
+
+from ident_service.config.simulation import SimulatedDriver
+from ident_service.motion.control_file import mover
+from ident_service.service.acceptance import LONGEST_NOTE, accept, acceptances, rollback
+from ident_service.service.api.answers import (
+    AcceptanceAnswer,
+    ArmAnswer,
+    ArmLine,
+    AskedAnswer,
+    ChallengeAnswer,
+    FaultAnswer,
+    MotionAnswer,
+)
+from ident_service.service.api.asking import Operator, Service, Serving, Viewer
+from ident_service.service.api.gate import CHALLENGE_SECONDS
+from ident_service.service.api.mistakes import failures
+from ident_service.service.arm_state import control_path, fault_file
+from ident_service.service.jobs.asked import ArmName, FileName, Id
+from ident_service.service.registry import arms as known
+from ident_service.service.registry import motions
+from ident_service.service.registry.audit import note
+from ident_service.service.registry.runs import run_folder
+
+router = APIRouter(prefix="/api/v1", tags=["arms"], responses=failures(404))
+Text = Annotated[str, Field(max_length=known.MOST_BYTES)]
+Note = Annotated[str, Field(min_length=1, max_length=LONGEST_NOTE)]
+
+
+class _Body(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class Description(_Body):
+    """An arm's description, as YAML, and the files that it names by name."""
+
+    description: Text
+    files: Annotated[dict[FileName, Text], Field(max_length=16)] = {}
+
+
+class MotionUpload(_Body):
+    """A motion made for an arm: the content of a `motion.json`."""
+
+    arm: ArmName
+    motion: Annotated[str, Field(max_length=4 * 2**20)]
+
+
+class Acceptance(_Body):
+    """A person's word that the parameters of a run are the arm's."""
+
+    run: Id
+    note: Note
+
+
+class Rollback(_Body):
+    """A person's word that an earlier set is the arm's again; the one before the current set if `to` is left out."""
+
+    note: Note
+    to: Annotated[int, Field(ge=1, lt=10_000)] | None = None
+
+
+@router.get("/arms")
+def list_arms(service: Serving, _: Viewer) -> list[ArmLine]:
+    """All arms."""
+    return [ArmLine(**row) for row in known.arm_names(service.db)]
+
+
+@router.post("/arms", status_code=201)
+def add_arm(service: Serving, who: Operator, body: Description) -> ArmAnswer:
+    """Take a description; a later one of the same name replaces it."""
+    return _arm(service, known.add_arm(service.db, service.state, body.description, body.files, who.name).name)
+
+
+@router.get("/arms/{arm}")
+def get_arm(service: Serving, _: Viewer, arm: ArmName) -> ArmAnswer:
+    """One arm, and how it is."""
+    return _arm(service, arm)
+
+
+@router.post("/arms/{arm}/challenge", status_code=201)
+def challenge(service: Serving, who: Operator, arm: ArmName) -> ChallengeAnswer:
+    """A word that, with the typed name of the arm, confirms one motion: a request that comes twice moves it once."""
+    name = known.known_arm(service.db, service.state, arm).name
+    return ChallengeAnswer(arm=name, challenge=service.gate.challenge(name, who.name), seconds=CHALLENGE_SECONDS)
+
+
+@router.get("/arms/{arm}/faults")
+def list_faults(service: Serving, _: Viewer, arm: ArmName) -> list[FaultAnswer]:
+    """Faults that nobody has acknowledged, the earliest first."""
+    return _arm(service, arm).faults
+
+
+@router.post("/arms/{arm}/faults/{code}/ack")
+def acknowledge(service: Serving, who: Operator, arm: ArmName, code: Id) -> FaultAnswer:
+    """Acknowledge a fault by its name."""
+    name = known.known_arm(service.db, service.state, arm).name
+    file = fault_file(service.state, name)
+    since = {one.code: one.since for one in file.remembered()}
+    cause = file.acknowledge(code)
+    note(service.db, who.name, "fault acknowledged", name, code=code, cause=cause)
+    return FaultAnswer(code=code, cause=cause, since=since[code])
+
+
+@router.post("/arms/{arm}/pause")
+def pause(service: Serving, who: Operator, arm: ArmName) -> AskedAnswer:
+    """Let the arm stand."""
+    return _pause(service, who.name, arm, wanted=True)
+
+
+@router.post("/arms/{arm}/resume")
+def resume(service: Serving, who: Operator, arm: ArmName) -> AskedAnswer:
+    """Let it go on."""
+    return _pause(service, who.name, arm, wanted=False)
+
+
+@router.get("/arms/{arm}/acceptances")
+def list_acceptances(service: Serving, _: Viewer, arm: ArmName) -> list[AcceptanceAnswer]:
+    """What was accepted, the earliest first; the last one is current."""
+    name = known.known_arm(service.db, service.state, arm).name
+    return [AcceptanceAnswer(**asdict(act)) for act in acceptances(service.state, name)]
+
+
+@router.post("/arms/{arm}/acceptances", status_code=201)
+def accept_run(service: Serving, who: Operator, arm: ArmName, body: Acceptance) -> AcceptanceAnswer:
+    """Accept the parameters of a run of this arm."""
+    name = known.known_arm(service.db, service.state, arm).name
+    folder = run_folder(service.db, service.state, body.run)
+    act = accept(service.db, service.state, folder, body.note, who.name, arm=name)
+    return AcceptanceAnswer(**asdict(act))
+
+
+@router.post("/arms/{arm}/rollback", status_code=201)
+def roll_back(service: Serving, who: Operator, arm: ArmName, body: Rollback) -> AcceptanceAnswer:
+    """Make an earlier accepted set the current one again."""
+    name = known.known_arm(service.db, service.state, arm).name
+    return AcceptanceAnswer(**asdict(rollback(service.db, service.state, name, body.note, who.name, body.to)))
+
+
+@router.get("/motions")
+def list_motions(service: Serving, _: Viewer, arm: ArmName | None = None) -> list[MotionAnswer]:
+    """All motions, or those of an arm, the newest first."""
+    return [MotionAnswer(**row) for row in motions.motions(service.db, arm)]
+
+
+@router.post("/motions", status_code=201)
+def add_motion(service: Serving, who: Operator, body: MotionUpload) -> MotionAnswer:
+    """Take a motion that was designed elsewhere; preflight judges it like any other."""
+    name = known.known_arm(service.db, service.state, body.arm).name
+    return MotionAnswer(**motions.add_motion(service.db, service.state, name, body.motion, who.name))
+
+
+@router.get("/motions/{motion}")
+def get_motion(service: Serving, _: Viewer, motion: Id) -> MotionAnswer:
+    """One motion."""
+    return MotionAnswer(**motions.known_motion(service.db, motion))
+
+
+def _arm(service: Service, arm: str) -> ArmAnswer:
+    found = known.known_arm(service.db, service.state, arm)
+    acts = acceptances(service.state, found.name)
+    config = found.config
+    return ArmAnswer(
+        name=found.name,
+        source="shipped" if found.source == "shipped" else "uploaded",
+        description=config.description,
+        sha256=config.sha256,
+        joints=list(config.joints) or list(config.kinematics.dh.joints if config.kinematics.dh else ()),
+        simulated=isinstance(config.driver, SimulatedDriver),
+        resources=list(known.resources(config)),
+        moved_by=mover(control_path(service.state, found.name)),
+        faults=[FaultAnswer(**asdict(one)) for one in fault_file(service.state, found.name).remembered()],
+        accepted=AcceptanceAnswer(**asdict(acts[-1])) if acts else None,
+    )
+
+
+def _pause(service: Service, who: str, arm: str, *, wanted: bool) -> AskedAnswer:
+    name = known.known_arm(service.db, service.state, arm).name
+    reached = service.engine.pause(name, who, wanted=wanted)
+    return AskedAnswer(arm=name, asked="pause" if wanted else "resume", reached=reached)

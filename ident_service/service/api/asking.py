@@ -1,0 +1,150 @@
+"""Who asks a request, and may they: what a route depends on.
+
+A token comes as `Authorization: Bearer`, or a session of the page as a cookie. A cookie comes by itself, so what
+changes anything with one must say which page it came from, too (`doors.py` has seen that it is ours).
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import logging
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Final
+
+from fastapi import Depends, HTTPException, Request
+from fastapi.concurrency import run_in_threadpool
+from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBearer
+
+from ident_service.service.api.gate import Gate, Throttled
+from ident_service.service.api.metrics import Metrics
+from ident_service.service.api.settings import Settings
+from ident_service.service.jobs.engine import Engine
+from ident_service.service.registry.database import Database
+from ident_service.service.registry.tokens import Access
+
+COOKIE: Final = "ident_session"
+_LOG = logging.getLogger("ident.http")
+_SAFE = frozenset({"GET", "HEAD"})
+
+
+@dataclass(frozen=True)
+class Service:
+    """What the routes work on: `app.state.service`."""
+
+    settings: Settings
+    db: Database
+    engine: Engine
+    gate: Gate
+    metrics: Metrics
+
+    @property
+    def state(self) -> Path:
+        """The state folder."""
+        return self.settings.state
+
+
+def service_of(request: Request) -> Service:
+    """The service that this request reached."""
+    service = request.app.state.service
+    assert isinstance(service, Service)  # noqa: S101 - `create_app` put it there
+    return service
+
+
+_bearer = HTTPBearer(auto_error=False, description="a token, as `ident token add` prints it")
+_cookie = APIKeyCookie(name=COOKIE, auto_error=False, description="a session, from /api/v1/login")
+Bearer = Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
+Cookie = Annotated[str | None, Depends(_cookie)]
+
+
+def address_of(request: Request) -> str:
+    """Where a request comes from."""
+    return request.client.host if request.client else ""
+
+
+async def access_of(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> Access | None:
+    """Who asks; None where nobody says so.
+
+    Raises:
+        HTTPException: 401 for a token that is nobody's, 429 after too many of them, 403 for a session that is used from
+            nowhere.
+    """
+    service, found = service_of(request), None
+    if bearer is not None:
+        try:
+            found = await run_in_threadpool(service.gate.by_token, bearer.credentials, address_of(request))
+        except Throttled as error:
+            raise throttled(error) from None
+        if found is None:
+            raise unknown()
+    elif cookie is not None:
+        found = await run_in_threadpool(service.gate.by_session, cookie)
+        if found is not None and request.method not in _SAFE and "origin" not in request.headers:
+            raise HTTPException(403, "a request with a session says which page it comes from")
+    if found is not None:
+        request.state.who = found.name
+    return found
+
+
+async def viewer(found: Annotated[Access | None, Depends(access_of)]) -> Access:
+    """Anybody with a token or a session; raises 401 for others."""
+    if found is None:
+        raise unknown()
+    return found
+
+
+async def operator(found: Annotated[Access, Depends(viewer)]) -> Access:
+    """An operator; raises 403 for others."""
+    if found.role != "operator":
+        raise HTTPException(403, f"the token {found.name!r} may look only; this needs the role operator")
+    return found
+
+
+def anybody_near(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> str:
+    """Whose stop this is: any token or session, and on this machine anybody at all.
+
+    A stop does no harm, and whoever needs it may have no token at hand, or one that is out of date, or be throttled.
+    From another machine it takes a token of any role, so that strangers on a network cannot keep an arm from working.
+    """
+    service = service_of(request)
+    near = _loopback(address_of(request)) and service.settings.loopback
+    found: Access | None = None
+    try:
+        if bearer is not None:
+            found = service.gate.for_stop(bearer.credentials)
+        elif cookie is not None:
+            found = service.gate.by_session(cookie)
+    except Exception:
+        if not near:
+            raise
+        _LOG.exception("nobody could be asked whose stop this is")
+    if found is None and not near:
+        raise unknown()
+    request.state.who = "anybody" if found is None else found.name
+    return str(request.state.who)
+
+
+def unknown() -> HTTPException:
+    """Nobody that we know."""
+    return HTTPException(
+        401, "give a token that counts: Authorization: Bearer TOKEN", headers={"WWW-Authenticate": "Bearer"}
+    )
+
+
+def throttled(error: Throttled) -> HTTPException:
+    """Too many failed attempts."""
+    return HTTPException(429, str(error), headers={"Retry-After": str(math.ceil(error.seconds))})
+
+
+def _loopback(address: str) -> bool:
+    try:
+        return ipaddress.ip_address(address).is_loopback
+    except ValueError:
+        return False
+
+
+Serving = Annotated[Service, Depends(service_of)]
+Viewer = Annotated[Access, Depends(viewer)]
+Operator = Annotated[Access, Depends(operator)]
+"""What routes ask for."""

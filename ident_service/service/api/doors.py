@@ -1,0 +1,153 @@
+"""What every request meets before anything looks at it: its Host, its Origin, its size; and what every answer carries.
+
+Pure ASGI, so that bodies are counted as they come and streams are not held back.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections.abc import Awaitable, Callable, MutableMapping
+from contextlib import suppress
+from typing import Any, Final
+from urllib.parse import urlsplit
+
+from fastapi import HTTPException
+
+from ident_service.service.api.metrics import Metrics
+from ident_service.service.api.settings import Settings
+
+Scope = MutableMapping[str, Any]
+Message = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[Message]]
+Send = Callable[[Message], Awaitable[None]]
+App = Callable[[Scope, Receive, Send], Awaitable[None]]
+
+MOST_BODY: Final = 64 * 1024
+MOST_UPLOAD: Final = 16 * 2**20
+UPLOADS: Final = ("/api/v1/arms", "/api/v1/motions")
+_SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
+_LOG = logging.getLogger("ident.http")
+_HEADERS: Final = (
+    (
+        b"content-security-policy",
+        b"default-src 'self'; img-src 'self' data:; object-src 'none'; base-uri 'none'; form-action 'self'; "
+        b"frame-ancestors 'none'",
+    ),
+    (b"x-content-type-options", b"nosniff"),
+    (b"x-frame-options", b"DENY"),
+    (b"referrer-policy", b"no-referrer"),
+    (b"cross-origin-opener-policy", b"same-origin"),
+    (b"cross-origin-resource-policy", b"same-origin"),
+    (b"permissions-policy", b"camera=(), geolocation=(), microphone=()"),
+)
+
+
+class _TooLarge(HTTPException):
+    """The body has more bytes than it may."""
+
+    def __init__(self, most: int) -> None:
+        super().__init__(413, f"a request has {most} bytes at most")
+
+
+class Doors:
+    """Wraps the application."""
+
+    def __init__(self, app: App, settings: Settings, metrics: Metrics) -> None:
+        self._app, self._metrics = app, metrics
+        self._hosts, self._scheme = settings.hosts, "https" if settings.tls else "http"
+        hsts = ((b"strict-transport-security", b"max-age=31536000"),) if settings.tls else ()
+        self._headers = (*_HEADERS, *hsts)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """One request."""
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+            return
+        if scope["type"] != "http":
+            return  # there is nothing else here
+        began, status, started = time.perf_counter(), 500, False
+
+        async def answer(message: Message) -> None:
+            nonlocal status, started
+            if message["type"] == "http.response.start":
+                status, started = message["status"], True
+                given = {name for name, _ in message.get("headers", ())}
+                more = [(name, value) for name, value in self._headers if name not in given]
+                if b"cache-control" not in given:
+                    more.append((b"cache-control", b"no-store"))
+                message["headers"] = [*message.get("headers", ()), *more]
+            await send(message)
+
+        try:
+            if (refused := self._refusal(scope)) is not None:
+                await _refuse(answer, *refused)
+                return
+            try:
+                await self._app(scope, _counted(scope, receive), answer)
+            except _TooLarge as error:
+                if not started:
+                    await _refuse(answer, 413, "TooLarge", error.detail)
+        finally:
+            self._metrics.request(scope["method"], status, time.perf_counter() - began)
+            _LOG.info(
+                "request",
+                extra={
+                    "method": scope["method"],
+                    "path": scope["path"],
+                    "status": status,
+                    "seconds": round(time.perf_counter() - began, 6),
+                    "who": scope.get("state", {}).get("who"),
+                },
+            )
+
+    def _refusal(self, scope: Scope) -> tuple[int, str, str] | None:
+        """Why this request is not for us: status, kind and words; None if it is."""
+        headers = scope["headers"]
+        hosts = [value for name, value in headers if name == b"host"]
+        host = hosts[0].decode("latin-1") if len(hosts) == 1 else ""
+        if _name(host) not in self._hosts:
+            return 421, "WrongHost", "this service is not called that; use the address or name that it was started with"
+        origins = [value.decode("latin-1") for name, value in headers if name == b"origin"]
+        if any(origin.lower() != f"{self._scheme}://{host.lower()}" for origin in origins):
+            return 403, "WrongOrigin", "a page of another origin may not ask this service for anything"
+        sites = [value for name, value in headers if name == b"sec-fetch-site"]
+        if scope["method"] not in _SAFE and any(site not in (b"same-origin", b"none") for site in sites):
+            return 403, "WrongOrigin", "a page of another origin may not ask this service for anything"
+        return None
+
+
+def _name(host: str) -> str:
+    """The name in a Host header, without port and brackets; empty where it is not one."""
+    with suppress(ValueError):
+        parts = urlsplit(f"//{host}")
+        if not (parts.path or parts.query or parts.fragment or parts.username or parts.password):
+            _ = parts.port
+            return parts.hostname or ""
+    return ""
+
+
+def _counted(scope: Scope, receive: Receive) -> Receive:
+    upload = scope["method"] == "POST" and scope["path"] in UPLOADS
+    most, seen = MOST_UPLOAD if upload else MOST_BODY, 0
+
+    async def counted() -> Message:
+        nonlocal seen
+        message = await receive()
+        if message["type"] == "http.request":
+            seen += len(message.get("body", b""))
+            if seen > most:
+                raise _TooLarge(most)
+        return message
+
+    return counted
+
+
+async def _refuse(send: Send, status: int, kind: str, words: str) -> None:
+    body = json.dumps({"error": {"kind": kind, "message": words}}).encode()
+    length = str(len(body)).encode()
+    # What is left of the body is not read: the connection ends with the answer.
+    headers = [(b"content-type", b"application/json"), (b"content-length", length), (b"connection", b"close")]
+    await send({"type": "http.response.start", "status": status, "headers": headers})
+    await send({"type": "http.response.body", "body": body})

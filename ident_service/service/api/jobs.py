@@ -1,0 +1,191 @@
+"""Routes about jobs: asked for, watched, cancelled, their lease renewed; and stop, which asks for nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from typing import Annotated, Any, Final, Literal
+
+from fastapi import APIRouter, Depends, HTTPException, Query, Request
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import PlainTextResponse, StreamingResponse
+from pydantic import BaseModel, ConfigDict, Field
+
+from ident_service.errors import MotionRefused
+from ident_service.motion.controls import HOLD_TO_RUN_SECONDS, LEASE_SECONDS
+from ident_service.service.api.answers import JobAnswer, JobResult, LeaseAnswer, StopAnswer
+from ident_service.service.api.asking import Bearer, Cookie, Operator, Service, Serving, Viewer, anybody_near
+from ident_service.service.api.mistakes import failures, failures_of_files
+from ident_service.service.jobs.asked import MOVES, ArmName, Asked, Id
+from ident_service.service.jobs.commands import JOBS
+from ident_service.service.jobs.outcome import said
+from ident_service.service.registry import jobs as rows
+from ident_service.service.registry.database import Row
+
+router = APIRouter(prefix="/api/v1", tags=["jobs"], responses=failures(404, 409))
+MOST_LOG: Final = 2**20
+_EVENTS = 0.2  # s between looks at a job that is watched
+_BREATH = 10.0  # s without news, after which a comment shows that the line is up
+# Its own threads: whatever else is busy, a stop is not.
+_STOPS = ThreadPoolExecutor(4, thread_name_prefix="stop")
+_STREAM: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"text/event-stream": {}}, "description": "Events."},
+    **failures_of_files(404, 409),
+}
+State = Literal["queued", "running", "done", "refused", "failed", "faulted", "cancelled", "interrupted"]
+
+
+class Confirmation(BaseModel):
+    """A person's word for one motion: the arm's name, typed, and the challenge that was given for it."""
+
+    model_config = ConfigDict(extra="forbid")
+    name: Annotated[str, Field(max_length=64)]
+    challenge: Annotated[str, Field(max_length=64)]
+
+
+class JobRequest(BaseModel):
+    """A job; one that may move an arm needs the confirmation, and its lease renewed from now on."""
+
+    model_config = ConfigDict(extra="forbid")
+    job: Asked
+    confirm: Confirmation | None = None
+
+
+@router.post("/jobs", status_code=201)
+def create_job(service: Serving, who: Operator, body: JobRequest) -> JobAnswer:
+    """Queue a job."""
+    if body.job.kind in MOVES:
+        arm = getattr(body.job, "arm", "")
+        # The challenge is used up first, so that a name cannot be tried again with it.
+        good = body.confirm is not None and service.gate.confirm(body.confirm.challenge, arm, who.name)
+        if body.confirm is None or not good or body.confirm.name != arm:
+            raise MotionRefused(
+                f"{arm}: a motion needs a fresh challenge of this arm (POST /api/v1/arms/{arm}/challenge), used once, "
+                "and the arm's name as a person has typed it"
+            )
+    return answer_of(service, service.engine.create(body.job, who.name))
+
+
+@router.get("/jobs")
+def list_jobs(
+    service: Serving,
+    _: Viewer,
+    state: Annotated[list[State] | None, Query()] = None,
+    arm: ArmName | None = None,
+    before: Annotated[int, Query(ge=0, lt=2**62)] | None = None,
+    most: Annotated[int, Query(ge=1, le=500)] = 100,
+) -> list[JobAnswer]:
+    """Jobs, the newest first; `before` the number of one goes on from there."""
+    found = rows.jobs(service.db, states=tuple(state or rows.STATES), arm=arm, before=before, most=most)
+    return [answer_of(service, row) for row in found]
+
+
+@router.get("/jobs/{job}")
+def get_job(service: Serving, _: Viewer, job: Id) -> JobAnswer:
+    """One job."""
+    return answer_of(service, rows.known_job(service.db, job))
+
+
+@router.get("/jobs/{job}/log", response_class=PlainTextResponse, responses=failures_of_files(404, 409))
+def get_log(service: Serving, _: Viewer, job: Id) -> PlainTextResponse:
+    """What its process said, the last of it."""
+    row = rows.known_job(service.db, job)
+    return PlainTextResponse(said(service.state / JOBS / row["id"], MOST_LOG).log)
+
+
+@router.get("/jobs/{job}/result")
+def get_result(service: Serving, _: Viewer, job: Id) -> JobResult:
+    """What its command answered."""
+    row = rows.known_job(service.db, job)
+    answer = said(service.state / JOBS / row["id"]).answer
+    return JobResult(job=row["id"], answer=without_paths(answer, str(service.state)))
+
+
+@router.get("/jobs/{job}/events", response_class=StreamingResponse, responses=_STREAM)
+async def watch_job(service: Serving, _: Viewer, job: Id) -> StreamingResponse:
+    """Server-sent events: `job` whenever it changes, until it has ended."""
+    row = await run_in_threadpool(rows.known_job, service.db, job)
+    return StreamingResponse(_events(service, row["id"]), media_type="text/event-stream")
+
+
+@router.post("/jobs/{job}/cancel")
+def cancel_job(service: Serving, who: Operator, job: Id) -> JobAnswer:
+    """Have it end; a motion comes to a controlled stop, and the job then says what happened."""
+    service.engine.cancel(job, who.name)
+    return answer_of(service, rows.known_job(service.db, job))
+
+
+@router.post("/jobs/{job}/lease")
+def renew_lease(service: Serving, who: Operator, job: Id) -> LeaseAnswer:
+    """Say that whoever asked for the motion is still there; only they can."""
+    row = rows.known_job(service.db, job)
+    if row["created_by"] != who.name:
+        raise HTTPException(403, "the lease of a motion is renewed by whoever asked for it")
+    if not service.engine.renew(row["id"]):
+        raise MotionRefused(f"the job {job} has no lease to renew: {row['state']}")
+    seconds = HOLD_TO_RUN_SECONDS if row["kind"] == "rehearse" else LEASE_SECONDS
+    return LeaseAnswer(job=row["id"], seconds=seconds)
+
+
+async def _near(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> str:
+    return await asyncio.get_running_loop().run_in_executor(_STOPS, anybody_near, request, bearer, cookie)
+
+
+Near = Annotated[str, Depends(_near)]
+
+
+@router.post("/stop")
+async def stop_all(service: Serving, who: Near) -> StopAnswer:
+    """Bring all arms to a controlled stop. Needs no lease and no role; on the service's own machine no token either."""
+    return await _stop(service, None, who)
+
+
+@router.post("/arms/{arm}/stop")
+async def stop_arm(service: Serving, who: Near, arm: ArmName) -> StopAnswer:
+    """Bring an arm to a controlled stop, likewise; one that nobody moves is no mistake."""
+    return await _stop(service, arm, who)
+
+
+async def _stop(service: Service, arm: str | None, who: str) -> StopAnswer:
+    done = await asyncio.get_running_loop().run_in_executor(_STOPS, service.engine.stop, arm, who)
+    return StopAnswer(**done)
+
+
+def answer_of(service: Service, row: Row) -> JobAnswer:
+    """A job as it is answered: without the words of its command, which name places of this machine."""
+    found = service.engine.progress(row)
+    shown = {key: value for key, value in row.items() if key in JobAnswer.model_fields}
+    shown["detail"] = without_paths(row["detail"], str(service.state))
+    progress = None if found is None else without_paths(asdict(found), str(service.state))
+    return JobAnswer(**{**shown, "progress": progress})
+
+
+def without_paths(value: Any, state: str) -> Any:
+    """Values in which places below the state folder are told relative to it."""
+    if isinstance(value, str):
+        return value.replace(f"{state}/", "")
+    if isinstance(value, list):
+        return [without_paths(part, state) for part in value]
+    if isinstance(value, dict):
+        return {key: without_paths(part, state) for key, part in value.items()}
+    return value
+
+
+async def _events(service: Service, job: str) -> AsyncIterator[str]:
+    last, silent = "", 0.0
+    while True:
+        row = await run_in_threadpool(rows.known_job, service.db, job)
+        shown = (await run_in_threadpool(answer_of, service, row)).model_dump_json()
+        if shown != last:
+            last, silent = shown, 0.0
+            yield f"event: job\ndata: {json.dumps(json.loads(shown))}\n\n"
+        elif silent > _BREATH:
+            silent = 0.0
+            yield ": still here\n\n"
+        if row["state"] not in rows.LIVE or (service.engine.closing and row["state"] == "queued"):
+            return
+        await asyncio.sleep(_EVENTS)
+        silent += _EVENTS

@@ -1,0 +1,98 @@
+"""What goes wrong, as one shape of answer with the status that fits."""
+
+from __future__ import annotations
+
+import logging
+from http import HTTPStatus
+from typing import Any, Final
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
+from ident_service.errors import (
+    ArmError,
+    ConfigError,
+    IdentError,
+    MotionRefused,
+    ParameterError,
+    RecordingError,
+    UnknownId,
+    UsageError,
+)
+from ident_service.service.api.answers import Failure
+
+_STATUS: Final[tuple[tuple[type[IdentError], int], ...]] = (
+    (UnknownId, 404),
+    (UsageError, 400),
+    (ConfigError, 422),
+    (ParameterError, 422),
+    (RecordingError, 422),
+    (MotionRefused, 409),
+    (ArmError, 409),
+)
+_LOG = logging.getLogger("ident.http")
+_WORDS: Final = {
+    400: "The request cannot be meant.",
+    401: "No token or session, or one that does not count.",
+    403: "Not with this role, or not from this page.",
+    404: "No such thing is known.",
+    405: "Not with this method.",
+    409: "Not now: a fault, a lease or another motion stands against it.",
+    413: "Too large.",
+    421: "The service is not called that.",
+    422: "The request has mistakes; the message names them.",
+    429: "Too many failed attempts.",
+}
+
+
+def failures(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """For a route: the statuses of its failures, besides those that any route may have."""
+    every = {400, 401, 403, 413, 421, 422, 429, *statuses}
+    return {status: {"model": Failure, "description": _WORDS[status]} for status in sorted(every)}
+
+
+def failures_of_files(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """The same for a route whose good answers are not JSON: its failures are."""
+    content = {"application/json": {"schema": {"$ref": "#/components/schemas/Failure"}}}
+    return {
+        status: {"description": said["description"], "content": content} for status, said in failures(*statuses).items()
+    }
+
+
+def status_of(error: IdentError) -> int:
+    """The status of an answer that this error becomes."""
+    return next((status for kind, status in _STATUS if isinstance(error, kind)), 500)
+
+
+def answer_mistakes(app: FastAPI) -> None:
+    """Turn every error into that shape."""
+
+    @app.exception_handler(IdentError)
+    async def _ident(_: Request, error: IdentError) -> JSONResponse:
+        status = status_of(error)
+        if status == HTTPStatus.INTERNAL_SERVER_ERROR:
+            _LOG.error("an answer failed", exc_info=error)
+        return _answer(status, type(error).__name__, str(error))
+
+    @app.exception_handler(RequestValidationError)
+    async def _invalid(_: Request, error: RequestValidationError) -> JSONResponse:
+        said = "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()[:10])
+        return _answer(422, "InvalidRequest", said)
+
+    @app.exception_handler(HTTPException)
+    async def _http(_: Request, error: HTTPException) -> JSONResponse:
+        kind = HTTPStatus(error.status_code).phrase.title().replace(" ", "").replace("-", "")
+        return _answer(error.status_code, kind, str(error.detail), dict(error.headers or {}))
+
+    @app.exception_handler(Exception)
+    async def _ours(_: Request, error: Exception) -> JSONResponse:
+        _LOG.error("an answer failed", exc_info=error)
+        return _answer(500, "InternalError", "the service failed; its log says how")
+
+
+def _answer(status: int, kind: str, message: str, headers: dict[str, str] | None = None) -> JSONResponse:
+    # What was sent may hold what is no text; it must not keep us from answering.
+    message = message.encode("utf-8", "replace").decode("utf-8")
+    return JSONResponse({"error": {"kind": kind, "message": message}}, status, headers=headers)

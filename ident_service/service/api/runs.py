@@ -1,0 +1,70 @@
+"""Routes about runs: what was recorded and identified, and the files of their manifests."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query
+from fastapi.responses import FileResponse
+
+from ident_service.errors import UnknownId
+from ident_service.service.api.answers import ParametersAnswer, RecordingAnswer, RunAnswer, RunLine
+from ident_service.service.api.asking import Serving, Viewer
+from ident_service.service.api.mistakes import failures, failures_of_files
+from ident_service.service.jobs.asked import ArmName, FileName, Id
+from ident_service.service.jobs.commands import REPORTS
+from ident_service.service.registry import runs
+
+router = APIRouter(prefix="/api/v1", tags=["runs"], responses=failures(404))
+_REPORT = "report.html"
+_BINARY: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"application/octet-stream": {}}, "description": "The file."},
+    **failures_of_files(404),
+}
+# Of a page without network, whose own style and script stand in it; it can reach nothing of ours.
+_POLICY = (
+    "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:; frame-ancestors 'self'; "
+    "sandbox allow-scripts allow-downloads"
+)
+_PAGE: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"text/html": {}}, "description": "The report."},
+    **failures_of_files(404),
+}
+
+
+@router.get("/runs")
+def list_runs(
+    service: Serving, _: Viewer, arm: ArmName | None = None, most: Annotated[int, Query(ge=1, le=500)] = 100
+) -> list[RunLine]:
+    """Runs, the newest first."""
+    return [RunLine(**row) for row in runs.runs(service.db, arm, most=most)]
+
+
+@router.get("/runs/{run}")
+def get_run(service: Serving, _: Viewer, run: Id) -> RunAnswer:
+    """One run."""
+    row, found = runs.known_run(service.db, run), runs.parameter_set(service.db, run)
+    return RunAnswer(
+        **row,
+        files=runs.run_files(service.db, service.state, run),
+        recordings=[RecordingAnswer(**one) for one in runs.recordings(service.db, run)],
+        parameters=None if found is None else ParametersAnswer(**found),
+    )
+
+
+@router.get("/runs/{run}/files/{name}", response_class=FileResponse, responses=_BINARY)
+def get_file(service: Serving, _: Viewer, run: Id, name: FileName) -> FileResponse:
+    """A file that its manifest names; as something to be kept, never as a page."""
+    path = runs.run_file(service.db, service.state, run, name)
+    return FileResponse(path, media_type="application/octet-stream", filename=name)
+
+
+@router.get("/runs/{run}/report.html", response_class=FileResponse, responses=_PAGE)
+def get_report(service: Serving, _: Viewer, run: Id) -> FileResponse:
+    """The report: the one that a job of the kind `report` has made since, or the run's own."""
+    path = service.state / REPORTS / f"{runs.known_run(service.db, run)['id']}.html"
+    if not path.is_file() and _REPORT in runs.run_files(service.db, service.state, run):
+        path = runs.run_file(service.db, service.state, run, _REPORT)
+    if not path.is_file():
+        raise UnknownId(f"the run {run} has no report yet; ask for a job of the kind report")
+    return FileResponse(path, media_type="text/html", headers={"Content-Security-Policy": _POLICY})

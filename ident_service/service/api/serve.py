@@ -1,0 +1,155 @@
+"""The daemon: one per state folder, listening until it is told to end; arms come to rest first."""
+
+from __future__ import annotations
+
+import asyncio
+import fcntl
+import logging
+import os
+import signal
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import FrameType
+from typing import Final
+
+import uvicorn
+
+from ident_service.errors import UsageError
+from ident_service.service.api.app import create_app
+from ident_service.service.api.asking import Service
+from ident_service.service.api.notify import tell_manager, watchdog_seconds
+from ident_service.service.api.settings import Settings
+
+LOCK: Final = "serve.lock"
+URL_FILE: Final = "serve.url"
+_LAST_ANSWERS = 5  # s for requests that are being answered when the service ends
+_LOG = logging.getLogger("ident.serve")
+
+
+def serve(settings: Settings, tell: Callable[[str], None] = lambda _: None) -> None:
+    """Serve until a signal ends it.
+
+    Args:
+        settings: how.
+        tell: called with the address, when it answers.
+
+    Raises:
+        UsageError: another service has the state folder, or the address cannot be had.
+    """
+    with single_instance(settings.state), _listening(settings) as listening:
+        host, port = listening.getsockname()[:2]
+        url = f"{'https' if settings.tls else 'http'}://{f'[{host}]' if ':' in host else host}:{port}"
+
+        def ready(_: Service) -> None:
+            # In the file for programs that start us and let us choose the port.
+            (settings.state / URL_FILE).write_text(url + "\n", encoding="ascii")
+            tell(url)
+            tell_manager("READY=1")
+
+        app = create_app(settings, ready)
+        config = uvicorn.Config(
+            app,
+            log_config=None,
+            access_log=False,
+            server_header=False,
+            proxy_headers=False,
+            ws="none",
+            lifespan="on",
+            http="h11",
+            timeout_graceful_shutdown=_LAST_ANSWERS,
+            ssl_certfile=settings.tls_cert,
+            ssl_keyfile=settings.tls_key,
+        )
+        server = _Server(config, app.state.service)
+        try:
+            server.run(sockets=[listening])
+        finally:
+            (settings.state / URL_FILE).unlink(missing_ok=True)
+
+
+@contextmanager
+def single_instance(state: Path) -> Iterator[None]:
+    """Hold the state folder's lock; it vanishes with this process, however that ends.
+
+    Raises:
+        UsageError: another process holds it, or it cannot be made.
+    """
+    path = state / LOCK
+    try:
+        state.mkdir(parents=True, exist_ok=True)
+        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be made: {error.strerror}; give another state folder") from None
+    try:
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            pid = os.pread(fd, 20, 0).decode("ascii", "replace").strip() or "unknown"
+            raise UsageError(f"{state}: process {pid} serves this state folder already") from None
+        os.ftruncate(fd, 0)
+        os.pwrite(fd, str(os.getpid()).encode(), 0)
+        yield
+    finally:
+        os.close(fd)
+
+
+class _Server(uvicorn.Server):
+    """uvicorn's, that stops the arms as soon as it is to end, and tells the service manager that it lives."""
+
+    def __init__(self, config: uvicorn.Config, service: Service) -> None:
+        super().__init__(config)
+        self._service = service
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """A signal: the arms first. Another interrupt means in a hurry, and they are being stopped already."""
+        tell_manager("STOPPING=1")
+        # Not in the signal's own frame: what it interrupts may hold the lock that is needed.
+        if not self.should_exit:
+            threading.Thread(target=self._service.engine.begin_closing, name="closing", daemon=True).start()
+        # uvicorn would raise the signal again at the end; ours is a good one.
+        self.force_exit = self.should_exit and sig == signal.SIGINT
+        self.should_exit = True
+
+    async def main_loop(self) -> None:
+        """Serve, and keep the watchdog quiet as long as the queue is looked after."""
+        length = watchdog_seconds()
+        task = None if length is None else asyncio.create_task(self._live(length))
+        try:
+            await super().main_loop()
+        finally:
+            if task is not None:
+                task.cancel()
+                with suppress(asyncio.CancelledError):
+                    await task
+
+    async def _live(self, seconds: float) -> None:
+        while True:
+            if self._service.engine.healthy:
+                tell_manager("WATCHDOG=1")
+            else:
+                _LOG.error("the queue is not looked after")
+            await asyncio.sleep(seconds)
+
+
+@contextmanager
+def _listening(settings: Settings) -> Iterator[socket.socket]:
+    """A socket at the address.
+
+    Raises:
+        UsageError: it cannot be had.
+    """
+    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    listening = socket.socket(family, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
+    try:
+        try:
+            listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listening.bind((settings.host, settings.port))
+        except (OSError, OverflowError) as error:
+            why = getattr(error, "strerror", None) or error
+            raise UsageError(f"{settings.host}:{settings.port}: cannot be listened on: {why}") from None
+        yield listening
+    finally:
+        listening.close()

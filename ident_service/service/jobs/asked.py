@@ -1,0 +1,198 @@
+"""What may be asked of the service as a job: ids and plain values, never a path.
+
+Boundary: shapes and bounds; what becomes of them is `commands.py`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,119}$")]
+ArmName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,119}$")]
+Speed = Annotated[float, Field(gt=0, le=1)]
+Seed = Annotated[int, Field(ge=0, lt=2**31)]
+FeasibleSet = Literal["pseudo_inertia", "inertia", "none"]
+
+
+class Ask(BaseModel):
+    """A request that refuses keys it does not know."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class RecordingOf(Ask):
+    """A recording, by the run that it is of and its name in the manifest."""
+
+    run: Id
+    name: FileName = "run.mcap"
+
+
+class Design(Ask):
+    """Search for a motion; what is left out is as the arm's description says."""
+
+    kind: Literal["design"]
+    arm: ArmName
+    seconds: Annotated[float, Field(gt=0, le=24 * 3600)] | None = None
+    starts: Annotated[int, Field(ge=1, le=100_000)] | None = None
+    seed: Seed = 0
+    criterion: Literal["d_optimal", "condition_number", "a_optimal"] | None = None
+    parameters: Annotated[tuple[Annotated[str, Field(min_length=1, max_length=200)], ...], Field(max_length=100)] = ()
+    motion: Literal["fourier", "postures"] | None = None
+    after: Annotated[tuple[RecordingOf, ...], Field(max_length=16)] = ()
+
+
+class Check(Ask):
+    """Preflight for a motion, the description's own without one, or for a way home."""
+
+    kind: Literal["check"]
+    arm: ArmName
+    motion: Id | None = None
+    home: bool = False
+
+    @model_validator(mode="after")
+    def _one(self) -> Check:
+        if self.home and self.motion is not None:
+            raise ValueError("give a motion or home, not both")
+        return self
+
+
+class Rehearse(Ask):
+    """The run, slowly, while the lease is renewed as fast as a held key repeats."""
+
+    kind: Literal["rehearse"]
+    arm: ArmName
+    motion: Id | None = None
+    speed: Speed = 0.2
+
+
+class Run(Ask):
+    """Move the arm along a motion and record it."""
+
+    kind: Literal["run"]
+    arm: ArmName
+    motion: Id | None = None
+    speed: Speed = 1.0
+
+
+class Home(Ask):
+    """Lead the arm home, slowly."""
+
+    kind: Literal["home"]
+    arm: ArmName
+
+
+class LeaveLimit(Ask):
+    """Lead an arm that stands outside its position limits back inside, slowly."""
+
+    kind: Literal["leave_limit"]
+    arm: ArmName
+
+
+class Recover(Ask):
+    """After a fault or a stop: what is in the way, and what to do; nothing moves."""
+
+    kind: Literal["recover"]
+    arm: ArmName
+
+
+class Watch(Ask):
+    """Look at the arm without a torque or a change of state."""
+
+    kind: Literal["watch"]
+    arm: ArmName
+    seconds: Annotated[float, Field(gt=0, le=60)] = 2.0
+
+
+class Base(Ask):
+    """Base parameters and their expressions."""
+
+    kind: Literal["base"]
+    arm: ArmName
+
+
+class Preview(Ask):
+    """What a motion asks of the arm, and what it will teach."""
+
+    kind: Literal["preview"]
+    arm: ArmName
+    motion: Id | None = None
+
+
+class Identify(Ask):
+    """From recordings to parameters."""
+
+    kind: Literal["identify"]
+    arm: ArmName
+    recordings: Annotated[tuple[RecordingOf, ...], Field(min_length=1, max_length=16)]
+    validate_on: Annotated[tuple[RecordingOf, ...], Field(max_length=16)] = ()
+    method: Literal["ols", "wls", "huber", "iv"] | None = None
+    feasible_set: FeasibleSet | None = None
+    prior: Literal["none", "euclidean", "entropic"] | None = None
+
+
+class Simulate(Ask):
+    """The whole job on a simulated arm, scored against the known truth."""
+
+    kind: Literal["simulate"]
+    arm: ArmName = "wam7_sim"
+    motion: Id | None = None
+    seed: Seed | None = None
+    feasible_set: FeasibleSet | None = None
+
+
+class Report(Ask):
+    """The report of a run as one page."""
+
+    kind: Literal["report"]
+    run: Id
+
+
+class Export(Ask):
+    """The parameters of a run for other tools."""
+
+    kind: Literal["export"]
+    run: Id
+    formats: Annotated[tuple[Literal["urdf", "mjcf", "sdf", "json", "csv", "c"], ...], Field(min_length=1)] = ("urdf",)
+
+
+class Verify(Ask):
+    """The certificate in a run's parameters, in exact arithmetic."""
+
+    kind: Literal["verify"]
+    run: Id
+
+
+class Compare(Ask):
+    """Two runs: what changed, and by how many deviations."""
+
+    kind: Literal["compare"]
+    run: Id
+    other: Id
+
+
+Asked = Annotated[
+    Base
+    | Preview
+    | Design
+    | Watch
+    | Recover
+    | Check
+    | Rehearse
+    | Run
+    | Home
+    | LeaveLimit
+    | Identify
+    | Simulate
+    | Report
+    | Export
+    | Verify
+    | Compare,
+    Field(discriminator="kind"),
+]
+"""Any of them; `kind` says which."""
+
+MOVES = frozenset({"check", "rehearse", "run", "home", "leave_limit"})
+"""Kinds that may give an arm a torque: they need a lease, and a person's word."""

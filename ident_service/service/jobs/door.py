@@ -1,0 +1,54 @@
+"""What a motion's own unit runs: takes one request from its socket and becomes the command that was asked for.
+
+The socket is standard input, and stays it: its end stops the arm. Only verbs that move an arm under a lease are taken.
+The service is believed no more than that: it can ask for nothing here but motions, which preflight and guard judge.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+
+from ident_service.service.jobs.child import ANSWER, LOG, PROCESS, name_of
+
+_MOST = 64 * 1024
+_VERBS = frozenset({"check", "rehearse", "run", "home", "recover"})
+
+
+def main() -> int:
+    """Become the command; returns only where nothing was asked for, or nothing that is done here."""
+    line = bytearray()
+    # Byte by byte: what comes after the line is the command's.
+    while not line.endswith(b"\n") and len(line) < _MOST:
+        if not (part := os.read(0, 1)):
+            return 1
+        line += part
+    try:
+        request = json.loads(line)
+        words, folder = [str(word) for word in request["words"]], Path(request["folder"])
+    except (ValueError, KeyError, TypeError):
+        return refuse("not a request")
+    if not words or words[0] not in _VERBS or "--lease-from-stdin" not in words:
+        return refuse("only motions under a lease are done here")
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
+    try:
+        process, answer, log = (os.open(folder / name, flags, 0o600) for name in (PROCESS, ANSWER, LOG))
+    except OSError as error:
+        return refuse(f"{folder}: {error.strerror}")
+    os.write(process, name_of(os.getpid()).encode("ascii") + b"\n")
+    os.close(process)
+    os.dup2(answer, 1)
+    os.dup2(log, 2)
+    return os.execv(sys.executable, [sys.executable, "-P", "-m", "ident_service", *words])  # noqa: S606 - our own interpreter
+
+
+def refuse(why: str) -> int:
+    """Say why on stderr, which is the journal's."""
+    os.write(2, f"ident: {why}\n".encode())
+    return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,45 @@
+"""What a job has made is entered in the registry: its run, its motion."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ident_service.results.manifest import MANIFEST, write_manifest
+from ident_service.service.jobs.commands import EXPORTS
+from ident_service.service.registry.database import Database, Row
+from ident_service.service.registry.motions import MOTION_FILE, MOTIONS, index_motion
+from ident_service.service.registry.runs import RUNS, index_run
+
+_MAKES_A_RUN = frozenset({"run", "rehearse", "home", "leave_limit", "identify", "simulate"})
+
+
+def keep(db: Database, state: Path, row: Row, by: str) -> None:
+    """Enter the folder that a job's process has left, if it has.
+
+    Args:
+        db: the registry.
+        state: the state folder.
+        row: of the job.
+        by: who asked for it.
+
+    Raises:
+        IdentError: the folder is not what its manifest names, or not one of a run.
+    """
+    made = row["run"]
+    if made is None:
+        return
+    if row["kind"] in _MAKES_A_RUN and (folder := state / RUNS / made).is_dir():
+        # What was killed has no manifest. Nothing writes there any more, so what is there now is what there is.
+        if not (folder / MANIFEST).is_file():
+            write_manifest(folder)
+        index_run(db, state, made)
+    elif row["kind"] == "design" and (state / MOTIONS / made / MOTION_FILE).is_file():
+        index_motion(db, state, made, row["arm"], by)
+
+
+def folder_of(state: Path, row: Row) -> Path | None:
+    """The folder that a job makes, there or not; None for one that makes none."""
+    if row["run"] is None or row["kind"] in ("report", "verify", "compare"):
+        return None
+    place = {"design": MOTIONS, "export": EXPORTS}.get(row["kind"], RUNS)
+    return state / place / str(row["run"])

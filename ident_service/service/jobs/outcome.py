@@ -1,0 +1,130 @@
+"""What became of a job, told from the files that its process left; after a crash of the service, too.
+
+Boundary: files in, a state and words out.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from ident_service.motion.ending import ENDED
+from ident_service.results.manifest import MANIFEST
+from ident_service.service.jobs.child import ANSWER, LOG
+
+_MOST = 32 * 2**20
+_LAST = 64 * 1024
+_STATES: Final = {0: "done", 3: "refused", 4: "faulted"}
+STOPPED: Final = "stopped"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a job.
+
+    Attributes:
+        state: one of those in `registry/jobs.py`.
+        detail: why, in words; empty where there is nothing to say.
+        exit_code: of the command, None without one.
+    """
+
+    state: str
+    detail: str
+    exit_code: int | None
+
+
+@dataclass(frozen=True)
+class Said:
+    """The files of a job's process.
+
+    Attributes:
+        answer: its one JSON object; empty where it had none.
+        log: the end of what it said.
+    """
+
+    answer: dict[str, Any] = field(default_factory=dict)
+    log: str = ""
+
+
+def said(folder: Path, most: int = _LAST) -> Said:
+    """Read them; `most` bytes of the log."""
+    answer: dict[str, Any] = {}
+    try:
+        with (folder / ANSWER).open("rb") as stream:
+            content = json.loads(stream.read(_MOST))
+        answer = content if isinstance(content, dict) else {}
+    except (OSError, ValueError, RecursionError):
+        pass  # none yet, or torn with its process
+    try:
+        with (folder / LOG).open("rb") as stream:
+            end = stream.seek(0, 2)
+            stream.seek(max(end - most, 0))
+            log = stream.read(most).decode("utf-8", "replace")
+    except OSError:
+        log = ""
+    return Said(answer, log)
+
+
+def outcome(heard: Said, exit_code: int | None, asked_to_end: str) -> Outcome:
+    """Judge a process that has ended.
+
+    Args:
+        heard: what it said.
+        exit_code: as its parent saw it, None where it had another one.
+        asked_to_end: why it was asked to, empty if it was not.
+    """
+    code = heard.answer.get("exit_code")
+    if not isinstance(code, int):
+        how = "" if exit_code is None else f" (signal {-exit_code})" if exit_code < 0 else f" (exit code {exit_code})"
+        last = heard.log.strip().splitlines()[-1:]
+        words = "; ".join([f"its process ended without an answer{how}", *last])
+        return Outcome("cancelled", asked_to_end, exit_code) if asked_to_end else Outcome("failed", words, exit_code)
+    message = _message(heard.answer)
+    if code == 0 and _report(heard.answer).get("state") == STOPPED:
+        return Outcome("cancelled", asked_to_end or "the arm was brought to rest: somebody asked for a stop", code)
+    state = _STATES.get(code, "failed")
+    if asked_to_end and state in ("failed", "refused"):
+        return Outcome("cancelled", "; ".join(filter(None, (asked_to_end, message))), code)
+    return Outcome(state, message, code)
+
+
+def interrupted(heard: Said, folder: Path | None, *, moves: bool) -> str:
+    """What can be told of a job that was running when the service died.
+
+    Args:
+        heard: what its process said, until now.
+        folder: that it made, if any.
+        moves: whether it is about a motion.
+    """
+    words = ["the service died while it ran"]
+    code = heard.answer.get("exit_code")
+    if folder is not None and (folder / ENDED).is_file():
+        try:
+            ended = json.loads((folder / ENDED).read_text(encoding="utf-8"))
+            words.append(f"the motion ended: {ended.get('error') or ended.get('state')}")
+        except (OSError, ValueError, AttributeError):
+            words.append(f"{ENDED} of its folder cannot be read")
+    elif moves and folder is not None and folder.is_dir():
+        words.append(f"its folder has no {ENDED}: the motion process was killed")
+    if isinstance(code, int):
+        words.append(f"its process went on and answered with exit code {code}")
+        if message := _message(heard.answer):
+            words.append(message)
+    if folder is not None and folder.is_dir():
+        kept = [path.name for path in sorted(folder.iterdir()) if not path.name.startswith(".")]
+        words.append(f"kept: {', '.join(kept)}" + ("" if MANIFEST in kept else f"; without a {MANIFEST}"))
+    else:
+        words.append("nothing was kept")
+    return "; ".join(words)
+
+
+def _message(answer: dict[str, Any]) -> str:
+    error = answer.get("error")
+    return str(error.get("message", "")) if isinstance(error, dict) else ""
+
+
+def _report(answer: dict[str, Any]) -> dict[str, Any]:
+    report = answer.get("report")
+    return report if isinstance(report, dict) else {}

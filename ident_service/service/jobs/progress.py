@@ -1,0 +1,53 @@
+"""How far a job is, from what it said so far and how long such jobs took before.
+
+Boundary: text and numbers in, an estimate out.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+_MOTION = re.compile(r"motion of (?P<seconds>[0-9.e+-]+) s")
+_SEARCH = re.compile(r"about (?P<seconds>[0-9]+) s left")
+_SURE = 0.99  # a job that still runs is never told to be done
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a job is.
+
+    Attributes:
+        phase: its last words.
+        fraction: from 0 to 1; None where nobody can know.
+        remaining: seconds, None where nobody can know.
+    """
+
+    phase: str
+    fraction: float | None
+    remaining: float | None
+
+
+def progress(log: str, elapsed: float, typical: float | None) -> Progress:
+    """Judge a job that runs.
+
+    Args:
+        log: what it said, its last lines at least.
+        elapsed: since it began [s].
+        typical: what such jobs took [s]; None before there was one.
+    """
+    lines = [line.strip() for line in log.splitlines() if line.strip()]
+    phase = lines[-1] if lines else "starting"
+    searches = _SEARCH.findall(log)
+    if searches:
+        return _of(phase, elapsed, elapsed + float(searches[-1]))
+    motion = _MOTION.search(log)
+    if typical is None and motion is None:
+        return Progress(phase, None, None)
+    # A first run knows how long its motion is, and not its ways there and back.
+    return _of(phase, elapsed, typical if typical is not None else float(motion["seconds"]) if motion else 0.0)
+
+
+def _of(phase: str, elapsed: float, whole: float) -> Progress:
+    fraction = min(elapsed / whole, _SURE) if whole > 0.0 else _SURE
+    return Progress(phase, max(fraction, 0.0), max(whole - elapsed, 0.0))

@@ -1,0 +1,81 @@
+"""After the service died: what ran is called interrupted, with what its files show, and never done.
+
+A motion is not begun by a restart: a person asked for it at another moment. What waits to compute goes on waiting.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from ident_service.errors import IdentError
+from ident_service.motion.control_file import in_use
+from ident_service.service.arm_state import control_path
+from ident_service.service.jobs.child import PROCESS, alive, end_orphan
+from ident_service.service.jobs.commands import JOBS
+from ident_service.service.jobs.keeping import folder_of, keep
+from ident_service.service.jobs.outcome import interrupted, said
+from ident_service.service.registry import jobs as rows
+from ident_service.service.registry.audit import note
+from ident_service.service.registry.database import Database, Row
+
+_UNTOLD = "the service died while it ran; its process is being looked for"
+_WAIT = 40.0  # s for a process of the service before: a controlled stop and its recording take less
+
+
+def mark_interrupted(db: Database, state: Path) -> None:
+    """Mark what ran, and motions that waited; quick, before anything is answered."""
+    with db.transaction():
+        for row in rows.jobs(db, states=rows.LIVE, most=1_000_000):
+            if row["state"] == "running":
+                detail = _UNTOLD
+            elif row["motion"]:
+                detail = "the service ended before it began; nothing has moved, ask for it again"
+            else:
+                continue
+            rows.ended(db, row["id"], "interrupted", detail)
+            note(db, "service", "job interrupted", row["id"])
+
+
+def explain_interrupted(db: Database, state: Path, cut_short: Callable[[], bool] = lambda: False) -> None:
+    """See that processes of the service before have ended, and tell what their files show."""
+    for row in rows.jobs(db, states=("interrupted",), most=1_000_000):
+        if row["detail"] != _UNTOLD or cut_short():
+            continue
+        process = _process(state, row)
+        # A motion has heard the end of its input and stops its arm; a computation is nobody's any more.
+        if not end_orphan(process, _WAIT):
+            rows.explain(db, row["id"], f"the service died while it ran; its process lives on ({process.split()[0]})")
+            continue
+        if row["motion"]:
+            _wait_for_rest(control_path(state, row["arm"]))
+        folder = folder_of(state, row)
+        detail = interrupted(said(state / JOBS / row["id"]), folder, moves=bool(row["motion"]))
+        try:
+            keep(db, state, row, row["created_by"])
+        except (IdentError, OSError) as error:
+            detail = f"{detail}; its folder could not be entered: {error}"
+        rows.explain(db, row["id"], detail)
+
+
+def orphans(db: Database, state: Path) -> list[str]:
+    """Ids of interrupted jobs whose process lives still."""
+    found = rows.jobs(db, states=("interrupted",), most=1000)
+    return [row["id"] for row in found if alive(_process(state, row))]
+
+
+def _wait_for_rest(controls: Path) -> None:
+    """The motion process may outlive its parent for as long as its stop takes."""
+    until = time.monotonic() + _WAIT
+    while in_use(controls) and time.monotonic() < until:
+        time.sleep(0.05)
+
+
+def _process(state: Path, row: Row) -> str:
+    if row["process"]:
+        return str(row["process"])
+    try:
+        return (state / JOBS / str(row["id"]) / PROCESS).read_text(encoding="ascii").strip()
+    except (OSError, ValueError):
+        return ""

@@ -1,0 +1,195 @@
+"""Pages of arms: the list, one with its ladder, and the acts of a person: confirm, acknowledge, accept, roll back."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from fastapi import APIRouter, Response
+
+from ident_service.errors import IdentError, MotionRefused, UsageError
+from ident_service.motion.control_file import in_use
+from ident_service.service.api import arms, jobs
+from ident_service.service.api.asking import Operator, Service, Serving, Viewer
+from ident_service.service.arm_state import control_path, fault_file
+from ident_service.service.jobs.asked import MOVES, ArmName
+from ident_service.service.pages.asking import Form, PageRoute, seen
+from ident_service.service.pages.ladder import ladder
+from ident_service.service.pages.render import page
+from ident_service.service.registry import arms as known
+from ident_service.service.registry import jobs as rows
+from ident_service.service.registry import motions as known_motions
+from ident_service.service.registry import runs as known_runs
+from ident_service.service.registry.tokens import Access
+
+router = APIRouter(include_in_schema=False, route_class=PageRoute)
+_NUMBERS: Final = {"speed": float, "seconds": float, "seed": int, "starts": int}
+_KINDS: Final = frozenset({"design", "identify", "simulate", "report", "export"})
+
+
+@router.get("/")
+def list_arms(service: Serving, who: Viewer) -> Response:
+    """All arms, without reading their descriptions: that takes longer than a first page may."""
+    accepted = {
+        row["arm"]: row["number"]
+        for row in service.db.rows("SELECT arm, MAX(number) AS number FROM acceptances GROUP BY arm")
+    }
+    lines = []
+    for row in known.arm_names(service.db):
+        try:
+            faults = len(fault_file(service.state, row["name"]).latched())
+        except IdentError:
+            faults = 1  # a file that somebody damaged stands in the way like one
+        moving = in_use(control_path(service.state, row["name"]))
+        lines.append({**row, "accepted": accepted.get(row["name"]), "faults": faults, "moving": moving})
+    busy = rows.jobs(service.db, states=rows.LIVE, most=50)
+    return page("arms", who, arms=lines, jobs=[jobs.answer_of(service, row) for row in busy])
+
+
+@router.get("/new")
+def describe(who: Operator) -> Response:
+    """Ask for a description."""
+    return page("new", who, problem="", text="")
+
+
+@router.post("/new")
+def take_description(service: Serving, who: Operator, form: Form) -> Response:
+    """Take it, or show every mistake in it."""
+    text = form.get("description", "").replace("\r\n", "\n")
+    try:
+        added = arms.add_arm(service, who, arms.Description(description=text))
+    except IdentError as error:
+        return page("new", who, 422, problem=str(error), text=text)
+    return seen(f"/arms/{added.name}")
+
+
+@router.get("/arms/{arm}")
+def show_arm(service: Serving, who: Viewer, arm: ArmName) -> Response:
+    """One arm: where it stands on the ladder, what was recorded, and what was accepted."""
+    answer = arms.get_arm(service, who, arm)
+    config = known.known_arm(service.db, service.state, arm).config
+    sets = service.db.rows("SELECT run FROM parameter_sets WHERE arm = ?", answer.name)
+    return page(
+        "arm",
+        who,
+        arm=answer,
+        rungs=ladder(service.db, service.state, config),
+        motions=known_motions.motions(service.db, answer.name),
+        runs=known_runs.runs(service.db, answer.name, most=20),
+        identified=[row["run"] for row in sets],
+        acts=list(reversed(arms.list_acceptances(service, who, arm))),
+        jobs=[jobs.answer_of(service, row) for row in rows.jobs(service.db, arm=answer.name, most=10)],
+    )
+
+
+@router.post("/arms/{arm}/confirm")
+def ask_confirmation(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
+    """Say what is about to move, and ask for the arm's name."""
+    return _confirmation(service, who, arm, form, "")
+
+
+@router.post("/arms/{arm}/move")
+def move(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
+    """Begin a motion that a person has confirmed; the page of its job keeps its lease from then on."""
+    if form.get("kind") == "rehearse":
+        raise UsageError("a rehearsal begins when the button of its page is held")
+    asked = _asked(arm, form)
+    body = {"job": asked, "confirm": {"name": form.get("name", ""), "challenge": form.get("challenge", "")}}
+    try:
+        job = jobs.create_job(service, who, jobs.JobRequest.model_validate(body))
+    except MotionRefused:
+        words = "That was not the arm's name, or this page was open for too long. Nothing has moved; try again."
+        return _confirmation(service, who, arm, form, words)
+    return seen(f"/jobs/{job.id}?attended=1")
+
+
+@router.post("/arms/{arm}/jobs")
+def compute(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
+    """Queue a job that moves nothing."""
+    if form.get("kind") not in _KINDS:
+        raise UsageError("choose what is to be done on the page of the arm")
+    job = jobs.create_job(service, who, jobs.JobRequest.model_validate({"job": _asked(arm, form)}))
+    return seen(f"/jobs/{job.id}")
+
+
+@router.post("/arms/{arm}/ack")
+def acknowledge(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
+    """Acknowledge a fault that was read."""
+    arms.acknowledge(service, who, arm, form.get("code", ""))
+    return seen(f"/arms/{arm}")
+
+
+@router.post("/arms/{arm}/accept")
+def accept(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
+    """A person's word that the parameters of a run are the arm's."""
+    _require_name(arm, form)
+    arms.accept_run(service, who, arm, arms.Acceptance(run=form.get("run", ""), note=form.get("note", "")))
+    return seen(f"/arms/{arm}#accepted")
+
+
+@router.post("/arms/{arm}/rollback")
+def roll_back(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
+    """A person's word that an earlier set is the arm's again."""
+    _require_name(arm, form)
+    body = {"note": form.get("note", ""), **({"to": form["to"]} if form.get("to") else {})}
+    arms.roll_back(service, who, arm, arms.Rollback.model_validate(body))
+    return seen(f"/arms/{arm}#accepted")
+
+
+@router.post("/arms/{arm}/pause")
+def pause(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
+    """Let the arm stand, or go on."""
+    (arms.pause if form.get("wanted") == "pause" else arms.resume)(service, who, arm)
+    job = form.get("job", "")
+    return seen(f"/jobs/{rows.known_job(service.db, job)['id']}?attended=1" if job else f"/arms/{arm}")
+
+
+def _asked(arm: str, form: dict[str, str]) -> dict[str, Any]:
+    """The job that a form asks for; what it leaves empty is left out."""
+    kind = form.get("kind", "")
+    given = {key: value for key, value in form.items() if value and key in _FIELDS.get(kind, ())}
+    try:
+        asked: dict[str, Any] = {key: _NUMBERS.get(key, str)(value) for key, value in given.items()}
+    except ValueError:
+        raise UsageError(f"{kind}: a number is missing, or is none") from None
+    asked["kind"] = kind
+    if kind in ("report", "export"):
+        return {**asked, **({"formats": _formats(form)} if kind == "export" else {})}
+    if kind == "identify":
+        asked["recordings"] = [{"run": asked.pop("recording", "")}]
+        if "validation" in asked:
+            asked["validate_on"] = [{"run": asked.pop("validation")}]
+    return {**asked, "arm": arm}
+
+
+_FIELDS: Final[dict[str, tuple[str, ...]]] = {
+    "design": ("seconds", "seed", "criterion"),
+    "check": ("motion",),
+    "rehearse": ("motion", "speed"),
+    "run": ("motion", "speed"),
+    "identify": ("recording", "validation", "method"),
+    "simulate": ("motion",),
+    "report": ("run",),
+    "export": ("run",),
+}
+
+
+def _formats(form: dict[str, str]) -> list[str]:
+    return [name.removeprefix("format-") for name in form if name.startswith("format-")]
+
+
+def _confirmation(service: Service, who: Access, arm: str, form: dict[str, str], problem: str) -> Response:
+    if form.get("kind") not in MOVES:
+        raise UsageError("choose a motion on the page of the arm")
+    given = arms.challenge(service, who, arm)
+    fields = {"kind": form["kind"], "motion": form.get("motion", ""), "speed": form.get("speed", "")}
+    motion = known_motions.known_motion(service.db, fields["motion"]) if fields["motion"] else None
+    status = 409 if problem else 200
+    # A rehearsal begins with the hand on its button: its lease would lapse before a page could be loaded.
+    if form["kind"] == "rehearse":
+        return page("rehearse", who, status, arm=given.arm, given=given, fields=fields, motion=motion)
+    return page("confirm", who, status, arm=given.arm, given=given, fields=fields, motion=motion, problem=problem)
+
+
+def _require_name(arm: str, form: dict[str, str]) -> None:
+    if form.get("name", "").strip() != arm:
+        raise UsageError(f"{arm}: type the arm's name to say that you mean this arm; nothing was changed")

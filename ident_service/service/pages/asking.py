@@ -1,0 +1,94 @@
+"""What page routes share: forms, and what goes wrong as a page.
+
+A form comes from a page of ours or not at all: its Origin must be there and ours (`api/doors.py`), besides the cookie
+that other sites do not send.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Coroutine
+from http import HTTPStatus
+from typing import Annotated, Any
+from urllib.parse import parse_qsl, quote
+
+from fastapi import Depends, HTTPException, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import RedirectResponse
+from fastapi.routing import APIRoute
+from pydantic import ValidationError
+
+from ident_service.errors import IdentError
+from ident_service.service.api.asking import COOKIE, service_of
+from ident_service.service.api.mistakes import status_of
+from ident_service.service.pages.render import page
+
+_MOST_FIELDS = 64
+
+
+async def form_of(request: Request) -> dict[str, str]:
+    """The fields of a form, the last of each name; its size is bounded at the door.
+
+    Raises:
+        HTTPException: 403 where it does not say which page it comes from, 400 where it is none.
+    """
+    if "origin" not in request.headers:
+        raise HTTPException(403, "a form says which page it comes from; use the pages of this service")
+    try:
+        return dict(
+            parse_qsl((await request.body()).decode("utf-8"), keep_blank_values=True, max_num_fields=_MOST_FIELDS)
+        )
+    except ValueError:
+        raise HTTPException(400, "this is not a form of ours") from None
+
+
+Form = Annotated[dict[str, str], Depends(form_of)]
+
+
+class PageRoute(APIRoute):
+    """A route whose failures are pages; who is not known is led to the way in."""
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        """The handler, wrapped."""
+        handler = super().get_route_handler()
+
+        async def handle(request: Request) -> Response:
+            try:
+                return await handler(request)
+            except HTTPException as error:
+                if error.status_code == HTTPStatus.UNAUTHORIZED:
+                    return RedirectResponse(_way_in(request), 303)
+                return failure(request, error.status_code, str(error.detail))
+            except (RequestValidationError, ValidationError) as error:
+                said = "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()[:5])
+                return failure(request, 422, said)
+            except IdentError as error:
+                return failure(request, status_of(error), str(error))
+
+        return handle
+
+
+def failure(request: Request, status: int, words: str) -> Response:
+    """What went wrong, as a page."""
+    service = service_of(request)
+    cookie = request.cookies.get(COOKIE)
+    who = None if cookie is None else service.gate.by_session(cookie)
+    title = HTTPStatus(status).phrase
+    words = words.replace(f"{service.state}/", "").encode("utf-8", "replace").decode()
+    return page("failure", who, status, title=title, words=words)
+
+
+def seen(address: str) -> RedirectResponse:
+    """After a form: look there."""
+    return RedirectResponse(address, 303)
+
+
+def inside(address: str) -> str:
+    """An address of ours, the first page for any other."""
+    good = address.startswith("/") and not address.startswith("//") and "\\" not in address and address.isprintable()
+    return address if good else "/"
+
+
+def _way_in(request: Request) -> str:
+    where = request.url.path if request.method == "GET" else "/"
+    query = f"?{request.url.query}" if request.method == "GET" and request.url.query else ""
+    return f"/login?next={quote(where + query, safe='')}"

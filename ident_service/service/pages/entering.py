@@ -1,0 +1,66 @@
+"""The way in and out, what pages load, and the stop that needs no script."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import Annotated
+from urllib.parse import urlsplit
+
+from fastapi import APIRouter, HTTPException, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
+
+from ident_service.service.api import about
+from ident_service.service.api.asking import Cookie, Serving
+from ident_service.service.api.jobs import Near, stop_all
+from ident_service.service.pages.asking import Form, PageRoute, inside, seen
+from ident_service.service.pages.render import STATIC, mark, page, static
+
+router = APIRouter(include_in_schema=False, route_class=PageRoute)
+Next = Annotated[str, Query(alias="next", max_length=500)]
+
+
+@router.get("/login")
+def show_login(where: Next = "/") -> Response:
+    """Ask for a token."""
+    return page("login", None, where=inside(where), problem="")
+
+
+@router.post("/login")
+def log_in(service: Serving, request: Request, form: Form) -> Response:
+    """Exchange it for a session."""
+    where, answer = inside(form.get("next", "/")), seen(inside(form.get("next", "/")))
+    try:
+        about.login(service, request, answer, about.Login(token=form.get("token", "").strip()[:200] or "none"))
+    except HTTPException as error:
+        words = "This token does not count." if error.status_code == 401 else str(error.detail)
+        return page("login", None, error.status_code, where=where, problem=words)
+    return answer
+
+
+@router.post("/logout")
+def log_out(service: Serving, form: Form, cookie: Cookie = None) -> Response:
+    """End the session."""
+    del form  # that it came from a page of ours is all that counts
+    answer = seen("/login")
+    about.logout(service, answer, cookie)
+    return answer
+
+
+@router.get("/static/{version}/{name}")
+def load(version: str, name: str) -> Response:
+    """A style sheet or script."""
+    if name not in STATIC or version != mark():
+        raise HTTPException(404, "no such file; load the page again")
+    kept = {"Cache-Control": "public, max-age=31536000, immutable"}
+    return Response(static()[name], media_type=STATIC[name], headers=kept)
+
+
+@router.post("/stop")
+async def stop(service: Serving, request: Request, near: Near, cookie: Cookie = None) -> Response:
+    """Bring all arms to a controlled stop; who may is who may ask the API to."""
+    done = await stop_all(service, near)
+    back = inside(urlsplit(request.headers.get("referer", "")).path or "/")
+    who = None
+    with suppress(Exception):  # whoever it was: the arms stop
+        who = None if cookie is None else await run_in_threadpool(service.gate.by_session, cookie)
+    return page("stopped", who, arms=done.arms, jobs=done.jobs, back="/" if back == "/stop" else back)

@@ -1,0 +1,85 @@
+"""From a template and values to an answer: everything that stands in a value is escaped, nothing stands inline.
+
+A page's own policy allows scripts, styles and connections of this service only. Its referrer policy tells our own
+origin, because a browser that is to say nothing sends `Origin: null` with a form, which the doors refuse.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from datetime import UTC, datetime
+from functools import lru_cache
+from importlib.resources import files
+from typing import Any, Final
+
+from fastapi.responses import HTMLResponse
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from ident_service import __version__
+from ident_service.service.registry.tokens import Access
+
+STATIC: Final = {"page.css": "text/css", "page.js": "text/javascript", "live.js": "text/javascript"}
+_HEADERS: Final = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
+    "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'",
+    "Referrer-Policy": "same-origin",
+}
+
+
+def page(name: str, who: Access | None, status: int = 200, **values: Any) -> HTMLResponse:
+    """A page.
+
+    Args:
+        name: of the template, without its ending.
+        who: looks at it; None for nobody that we know.
+        status: of the answer.
+        values: of the template; every one that it names must be there.
+    """
+    text = _environment().get_template(f"{name}.html").render(who=who, version=__version__, mark=mark(), **values)
+    return HTMLResponse(text, status, headers=_HEADERS)
+
+
+@lru_cache(maxsize=1)
+def static() -> dict[str, bytes]:
+    """Name to content of what pages load."""
+    place = files(__package__).joinpath("static")
+    return {name: place.joinpath(name).read_bytes() for name in STATIC}
+
+
+@lru_cache(maxsize=1)
+def mark() -> str:
+    """What changes in the addresses of these files when they do, so that browsers may keep them."""
+    return hashlib.sha256(b"".join(static().values())).hexdigest()[:12]
+
+
+@lru_cache(maxsize=1)
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader(str(__package__)),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(when=_when, lasting=_lasting, short=_short)
+    return environment
+
+
+def _when(seconds: float | None) -> str:
+    """A time [s since 1970] in UTC, for people."""
+    if seconds is None:
+        return "\u2014"
+    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+
+
+def _lasting(seconds: float | None) -> str:
+    """A duration [s] for people."""
+    if seconds is None:
+        return "\u2014"
+    minutes, rest = divmod(round(seconds), 60)
+    return " ".join([*([f"{minutes} min"] if minutes else []), *([f"{rest} s"] if rest or not minutes else [])])
+
+
+def _short(sha256: str) -> str:
+    """The beginning of a hash."""
+    return sha256[:12]

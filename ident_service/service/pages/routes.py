@@ -1,0 +1,9 @@
+"""All routes of the page; none is in the API's description."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from ident_service.service.pages import arm_pages, entering, job_pages, run_pages
+
+PAGES: Final = (entering.router, arm_pages.router, job_pages.router, run_pages.router)

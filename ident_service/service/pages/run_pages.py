@@ -1,0 +1,59 @@
+"""Pages of runs: history, one run with its files and what can be done with it, comparison; and the audit trail."""
+
+from __future__ import annotations
+
+from typing import Annotated, Final
+
+from fastapi import APIRouter, Query, Response
+from fastapi.responses import HTMLResponse
+
+from ident_service.errors import UsageError
+from ident_service.service.api import runs
+from ident_service.service.api.asking import Serving, Viewer
+from ident_service.service.jobs.asked import ArmName, Id
+from ident_service.service.jobs.commands import REPORTS
+from ident_service.service.pages.asking import PageRoute
+from ident_service.service.pages.render import page
+from ident_service.service.registry import runs as known
+from ident_service.service.registry.audit import trail
+
+router = APIRouter(include_in_schema=False, route_class=PageRoute)
+# Of a page whose own style stands in it, and that needs nothing else.
+_POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'; sandbox"
+
+
+@router.get("/runs")
+def list_runs(service: Serving, who: Viewer, arm: ArmName | None = None) -> Response:
+    """Runs, the newest first."""
+    sets = {row["run"]: row for row in service.db.rows("SELECT * FROM parameter_sets")}
+    return page("runs", who, arm=arm, runs=known.runs(service.db, arm, most=200), sets=sets)
+
+
+@router.get("/runs/{run}")
+def show_run(service: Serving, who: Viewer, run: Id) -> Response:
+    """One run."""
+    answer = runs.get_run(service, who, run)
+    sets = service.db.rows("SELECT run FROM parameter_sets WHERE arm = ? AND run <> ?", answer.arm, answer.id)
+    reported = (service.state / REPORTS / f"{answer.id}.html").is_file()
+    return page("run", who, run=answer, reported=reported, others=[row["run"] for row in sets])
+
+
+@router.get("/compare")
+def compare(service: Serving, who: Viewer, reference: Id, other: Id) -> Response:
+    """The comparison of two runs' parameters, as `ident compare` writes it."""
+    # Loaded when they are asked for: the service starts without.
+    from ident_service.results.comparison.page import comparison_html
+    from ident_service.service.comparison import compare_files
+
+    if reference == other:
+        raise UsageError("choose two different runs to compare")
+    comparison, _ = compare_files([known.run_folder(service.db, service.state, one) for one in (reference, other)])
+    text = comparison_html(comparison).replace(f"{service.state / known.RUNS}/", "")
+    return HTMLResponse(text, headers={"Content-Security-Policy": _POLICY})
+
+
+@router.get("/audit")
+def audit(service: Serving, who: Viewer, before: Annotated[int, Query(ge=0, lt=2**62)] | None = None) -> Response:
+    """Who did what, the newest first."""
+    lines = trail(service.db, before=before, most=100)
+    return page("audit", who, lines=lines, more=len(lines) == 100)

@@ -1,0 +1,32 @@
+// On every page: Escape asks for a stop. The button is a form and works without this file.
+"use strict";
+
+// A browser keeps few connections to one service, and a stop must not wait behind streams of ours.
+const streams = new Set();
+
+function closeStreams() {
+  for (const stream of streams) stream.close();
+  streams.clear();
+}
+
+addEventListener("pagehide", closeStreams);
+document.addEventListener("submit", closeStreams);
+
+document.addEventListener("keydown", (event) => {
+  if (event.key !== "Escape" || event.repeat) return;
+  event.preventDefault();
+  const status = document.getElementById("stop-status");
+  status.textContent = "Stop asked …";
+  closeStreams();
+  fetch("/api/v1/stop", { method: "POST" })
+    .then((answer) => {
+      if (!answer.ok) throw new Error(String(answer.status));
+      return answer.json();
+    })
+    .then((done) => {
+      const what = done.arms.length ? done.arms.join(", ") : done.jobs.length ? "motions that had not begun" : "";
+      status.textContent = what ? `Asked to stop: ${what}.` : "Nothing was moving.";
+    })
+    .then(() => document.dispatchEvent(new Event("stop-asked")))
+    .catch(() => document.getElementById("stop").submit());
+});

@@ -1,0 +1,188 @@
+"""Arms by name: the shipped ones, and descriptions that were uploaded, each kept in a folder named after its hash.
+
+An uploaded description is read by the loader that reads every other, from a folder of its own which nothing in it may
+lead out of: files that it names are uploaded with it, and what it `extends` is a shipped arm.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from ident_service.config.load import load_arm
+from ident_service.config.schema import ArmConfig
+from ident_service.config.shipped import shipped_arms
+from ident_service.config.source import read_alone
+from ident_service.errors import ConfigError, Problem, UnknownId, UsageError
+from ident_service.results.files import appearing_folder
+from ident_service.service.registry.audit import note
+from ident_service.service.registry.database import Database, Row
+
+DESCRIPTIONS: Final = "descriptions"
+ARM_FILE: Final = "arm.yaml"
+MOST_BYTES: Final = 8 * 2**20  # of a description and its files together
+_MOST_FILES = 16
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+
+
+@dataclass(frozen=True)
+class KnownArm:
+    """An arm that the service knows.
+
+    Attributes:
+        name: which is its id.
+        path: of its description, to give to the commands.
+        config: its description, read just now.
+        source: `shipped` or `uploaded`.
+    """
+
+    name: str
+    path: Path
+    config: ArmConfig
+    source: str
+
+
+def resources(config: ArmConfig) -> tuple[str, ...]:
+    """What a motion of this arm has for itself: the arm, and every bus that it hangs on."""
+    buses = getattr(config.driver, "buses", ())
+    # Nobody shares a bus in lock step: it is within one process.
+    wires = {f"bus {bus.interface} {bus.channel}" for bus in buses if bus.interface != "lock_step"}
+    return (f"arm {config.name}", *sorted(wires))
+
+
+def know_shipped(db: Database) -> None:
+    """Enter the shipped arms; an uploaded one of the same name stays.
+
+    Their descriptions are read when they are asked for: reading all of them takes longer than a start may.
+    """
+    with db.transaction():
+        for name in shipped_arms():
+            db.write(
+                "INSERT OR IGNORE INTO arms VALUES (?, '', '', 'shipped', NULL, ?, 0, ?, 'service')",
+                *(name, json.dumps([f"arm {name}"]), time.time()),
+            )
+
+
+def arm_names(db: Database) -> list[Row]:
+    """Name and source of every arm."""
+    return db.rows("SELECT name, source, description, sha256, added, added_by FROM arms ORDER BY name")
+
+
+def known_arm(db: Database, state: Path, name: str) -> KnownArm:
+    """The arm of this name.
+
+    Raises:
+        UnknownId: there is none.
+        ConfigError: its description has become unreadable.
+    """
+    row = db.row("SELECT * FROM arms WHERE name = ?", name)
+    if row is None:
+        raise UnknownId(f"no arm {name!r} is known; the list of arms names them")
+    path = shipped_arms().get(name) if row["source"] == "shipped" else state / row["folder"] / ARM_FILE
+    if path is None:
+        raise UsageError(f"the arm {name!r} was shipped with other software than this; upload its description")
+    config = load_arm(path)
+    if row["sha256"] != config.sha256:
+        db.write(
+            "UPDATE arms SET sha256 = ?, description = ?, resources = ? WHERE name = ?",
+            *(config.sha256, config.description, json.dumps(resources(config)), name),
+        )
+    return KnownArm(name, path, config, row["source"])
+
+
+def add_arm(db: Database, state: Path, text: str, files: Mapping[str, str], by: str) -> KnownArm:
+    """Take an uploaded description; a later one of the same name replaces it, and the earlier one stays on the disk.
+
+    Args:
+        db: the registry.
+        state: the state folder.
+        text: the YAML.
+        files: name to content of the files that it names.
+        by: who.
+
+    Raises:
+        UsageError: too large, or files whose names are none.
+        ConfigError: every mistake in it, each with line and column.
+    """
+    if len(text) + sum(len(content) for content in files.values()) > MOST_BYTES:
+        raise UsageError(f"a description and its files have {MOST_BYTES} bytes at most")
+    if len(files) > _MOST_FILES:
+        raise UsageError(f"a description comes with {_MOST_FILES} files at most")
+    for name in files:
+        if not _NAME.fullmatch(name) or name == ARM_FILE:
+            raise UsageError(f"{name!r}: a file's name is a plain one, and not {ARM_FILE}")
+    place = state / DESCRIPTIONS
+    # Below its own name only when it has been found good.
+    staging = place / f".{time.time_ns():x}.partial"
+    try:
+        staging.mkdir(parents=True)
+        for name, content in {ARM_FILE: text, **files}.items():
+            (staging / name).write_text(content, encoding="utf-8", errors="strict")
+        _require_confined(staging)
+        config = load_arm(staging / ARM_FILE)
+        folder = place / f"{config.name}-{config.sha256[:16]}"
+        if not folder.exists():
+            with appearing_folder(folder) as built:
+                for path in staging.iterdir():
+                    shutil.copyfile(path, built / path.name)
+    except ConfigError as error:
+        # The place of the upload means nothing to whoever sent it.
+        raise ConfigError(
+            [
+                Problem(Path(one.path.name), one.line, one.column, one.message.replace(f"{staging.resolve()}/", ""))
+                for one in error.problems
+            ]
+        ) from None
+    except UnicodeEncodeError:
+        raise UsageError("the description is not text that can be written as UTF-8") from None
+    except OSError as error:
+        raise UsageError(f"{place}: cannot be written: {error.strerror}") from None
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+    with db.transaction():
+        db.write(
+            "INSERT INTO arms VALUES (?, ?, ?, 'uploaded', ?, ?, 0, ?, ?) ON CONFLICT (name) DO UPDATE SET "
+            "sha256 = excluded.sha256, description = excluded.description, source = excluded.source, "
+            "folder = excluded.folder, resources = excluded.resources, added = excluded.added, "
+            "added_by = excluded.added_by",
+            *(config.name, config.sha256, config.description, str(folder.relative_to(state))),
+            *(json.dumps(resources(config)), time.time(), by),
+        )
+        note(db, by, "arm added", config.name, sha256=config.sha256)
+    return KnownArm(config.name, folder / ARM_FILE, config, "uploaded")
+
+
+def _require_confined(folder: Path) -> None:
+    """Refuse a description in which any text leads to a file outside its folder, whatever key it stands at."""
+    path = folder / ARM_FILE
+    tree = read_alone(path)
+    problems = []
+    for where, value in _texts(tree.value, ()):
+        if where == ("extends",):
+            if value not in shipped_arms():
+                problems.append(tree.problem(where, "extends: an uploaded description extends a shipped arm", path))
+            continue
+        if len(value) > 1000 or "\0" in value:
+            continue  # no file has such a name
+        target = folder / value
+        if (Path(value).is_absolute() or ".." in Path(value).parts) and target.is_file():
+            problems.append(tree.problem(where, f"{'.'.join(map(str, where))}: leads out of the upload", path))
+    if problems:
+        raise ConfigError(problems)
+
+
+def _texts(value: Any, where: tuple[str | int, ...]) -> Iterator[tuple[tuple[str | int, ...], str]]:
+    if isinstance(value, str):
+        yield where, value
+    elif isinstance(value, Mapping):
+        for key, part in value.items():
+            yield from _texts(part, (*where, key))
+    elif isinstance(value, tuple):
+        for number, part in enumerate(value):
+            yield from _texts(part, (*where, number))

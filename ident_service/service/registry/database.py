@@ -1,0 +1,134 @@
+"""The registry's database: opened, migrated, and used in short transactions from any thread.
+
+Write-ahead logging with full synchronisation: what a transaction has written is on the disk when it ends, and a kill at
+any moment loses nothing of it. Other processes of the same machine (`ident accept`) may use the file at the same time.
+"""
+
+from __future__ import annotations
+
+import re
+import sqlite3
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Self
+
+from ident_service.errors import UsageError
+from ident_service.service.registry.migrations import MIGRATIONS
+
+FILE: Final = "registry.sqlite"
+_BUSY = 10.0  # s that another process may keep it
+Row = Mapping[str, Any]
+
+
+class Database:
+    """One connection, used by one thread at a time."""
+
+    def __init__(self, state: Path, migrations: Sequence[str] = MIGRATIONS) -> None:
+        """Open the registry of a state folder; made and migrated where necessary.
+
+        Raises:
+            UsageError: it cannot be made, is damaged, or was written by newer software.
+        """
+        self._path, self._lock = state / FILE, threading.RLock()
+        self._depth = 0
+        try:
+            state.mkdir(parents=True, exist_ok=True)
+            self._connection = sqlite3.connect(
+                self._path, timeout=_BUSY, isolation_level=None, check_same_thread=False, cached_statements=256
+            )
+        except (OSError, sqlite3.Error) as error:
+            raise UsageError(f"{self._path}: cannot be opened: {error}; give another state folder") from None
+        self._connection.row_factory = sqlite3.Row
+        try:
+            for pragma in ("journal_mode = WAL", "synchronous = FULL", "foreign_keys = ON"):
+                self._connection.execute(f"PRAGMA {pragma}")
+            self._migrate(migrations)
+            self._path.chmod(0o600)
+        except sqlite3.Error as error:
+            self.close()
+            raise UsageError(f"{self._path}: {error}; the file is damaged or in use, put a copy of it back") from None
+        except UsageError:
+            self.close()
+            raise
+
+    def _migrate(self, migrations: Sequence[str]) -> None:
+        with self.transaction():
+            version = int(self._connection.execute("PRAGMA user_version").fetchone()[0])
+            if version > len(migrations):
+                raise UsageError(
+                    f"{self._path}: written by newer software (version {version}, this one knows {len(migrations)}); "
+                    "use that, or another state folder"
+                )
+            for number, script in enumerate(migrations[version:], version + 1):
+                for statement in _statements(script):
+                    self._connection.execute(statement)
+                self._connection.execute(f"PRAGMA user_version = {number:d}")
+
+    @contextmanager
+    def transaction(self) -> Iterator[None]:
+        """All that is written in the block, or nothing of it; blocks within blocks are one."""
+        with self._lock:
+            if self._depth:
+                yield
+                return
+            self._connection.execute("BEGIN IMMEDIATE")
+            self._depth = 1
+            try:
+                yield
+            except BaseException:
+                self._connection.execute("ROLLBACK")
+                raise
+            else:
+                self._connection.execute("COMMIT")
+            finally:
+                self._depth = 0
+
+    def write(self, sql: str, *values: Any) -> int:
+        """Execute one statement; how many rows it changed."""
+        with self.transaction():
+            return self._connection.execute(sql, values).rowcount
+
+    def rows(self, sql: str, *values: Any) -> list[Row]:
+        """All rows of a query, as mappings of column to value."""
+        with self._lock:
+            return [dict(row) for row in self._connection.execute(sql, values)]
+
+    def row(self, sql: str, *values: Any) -> Row | None:
+        """The first row of a query."""
+        return next(iter(self.rows(sql, *values)), None)
+
+    def sound(self) -> bool:
+        """Whether SQLite finds nothing wrong in the whole file."""
+        return self.rows("PRAGMA integrity_check") == [{"integrity_check": "ok"}] and not self.rows(
+            "PRAGMA foreign_key_check"
+        )
+
+    def close(self) -> None:
+        """Let the file go."""
+        with self._lock:
+            self._connection.close()
+
+    def __enter__(self) -> Self:
+        """Nothing more to do."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close."""
+        self.close()
+
+
+def _statements(script: str) -> Iterator[str]:
+    """The statements of a script one by one: `executescript` would end our transaction."""
+    statement = ""
+    for piece in re.findall(r"[^;]*;|[^;]+$", script):
+        statement += piece
+        if sqlite3.complete_statement(statement):
+            yield statement
+            statement = ""
+    if statement.strip():
+        yield statement

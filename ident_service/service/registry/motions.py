@@ -1,0 +1,77 @@
+"""Motions by id: designed here, or uploaded; each is one `motion.json` in a folder below the state folder."""
+
+from __future__ import annotations
+
+import hashlib
+import secrets
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+from ident_service.errors import UnknownId
+from ident_service.excitation.excitation import excitation_from_json, read_excitation
+from ident_service.results.files import appearing_folder, write_atomically
+from ident_service.results.manifest import file_sha256
+from ident_service.service.registry.audit import note
+from ident_service.service.registry.database import Database, Row
+
+MOTIONS: Final = "motions"
+MOTION_FILE: Final = "motion.json"
+
+
+def new_id(arm: str) -> str:
+    """An id that nothing has: when, for which arm, and some chance."""
+    return f"{datetime.now(UTC).strftime('%Y%m%dT%H%M%SZ')}-{arm}-{secrets.token_hex(3)}"
+
+
+def index_motion(db: Database, state: Path, motion: str, arm: str, by: str) -> None:
+    """Enter a motion that was designed for an arm into its folder.
+
+    Raises:
+        UsageError: it is not one.
+    """
+    path = state / MOTIONS / motion / MOTION_FILE
+    seen = read_excitation(path)
+    db.write(
+        "INSERT OR IGNORE INTO motions VALUES (?, ?, ?, ?, ?, ?, ?)",
+        *(motion, arm, seen.name, seen.duration, file_sha256(path), time.time(), by),
+    )
+
+
+def add_motion(db: Database, state: Path, arm: str, text: str, by: str) -> Row:
+    """Take an uploaded motion.
+
+    Raises:
+        UsageError: not a motion; the message says what is wrong with it.
+    """
+    excitation_from_json(text)
+    motion = new_id(arm)
+    with appearing_folder(state / MOTIONS / motion) as folder:
+        write_atomically(folder / MOTION_FILE, text)
+    with db.transaction():
+        index_motion(db, state, motion, arm, by)
+        note(db, by, "motion added", motion, arm=arm, sha256=hashlib.sha256(text.encode()).hexdigest())
+    return known_motion(db, motion)
+
+
+def known_motion(db: Database, motion: str) -> Row:
+    """The motion of this id.
+
+    Raises:
+        UnknownId: there is none.
+    """
+    row = db.row("SELECT * FROM motions WHERE id = ?", motion)
+    if row is None:
+        raise UnknownId(f"no motion {motion!r} is known; the list of motions names them")
+    return row
+
+
+def motions(db: Database, arm: str | None = None) -> list[Row]:
+    """All motions, or those of an arm, the newest first."""
+    return db.rows("SELECT * FROM motions WHERE ?1 IS NULL OR arm = ?1 ORDER BY added DESC, id", arm)
+
+
+def motion_path(db: Database, state: Path, motion: str) -> Path:
+    """Its file; by the id that the registry has, never by a word from outside."""
+    return state / MOTIONS / str(known_motion(db, motion)["id"]) / MOTION_FILE

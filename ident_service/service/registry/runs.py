@@ -1,0 +1,171 @@
+"""Runs by id, which is the name of their folder: what each holds, how it ended, and the recordings in it.
+
+The folder is the truth: rows are made from its manifest, and can be made again.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any, Final
+
+from ident_service.errors import IdentError, ParameterError, UnknownId, UsageError
+from ident_service.motion.ending import ENDED
+from ident_service.results.manifest import MANIFEST, file_sha256, named_files, verified_files
+from ident_service.service.registry.database import Database, Row
+
+RUNS: Final = "runs"
+KILLED: Final = "killed"
+_ARM, _PARAMETERS, _SCORE = "arm.json", "parameters.json", "score.json"
+_MOST_BYTES = 64 * 2**20
+_RECORDING = ".mcap"
+
+
+def index_run(db: Database, state: Path, run: str) -> Row:
+    """Enter a run's folder, or enter it again.
+
+    Raises:
+        UsageError: no such folder, or no arm in it.
+        ParameterError: its files are not what its manifest names.
+    """
+    folder = state / RUNS / run
+    # A run that was killed has no manifest; its folder says so by not having one.
+    whole = (folder / MANIFEST).is_file()
+    gone = frozenset(row["name"] for row in db.rows("SELECT name FROM recordings WHERE run = ? AND deleted > 0", run))
+    files = dict(verified_files(folder, but=gone)) if whole else {}
+    arm = _document(folder / _ARM)
+    ended = _document(folder / ENDED) if (folder / ENDED).is_file() else None
+    sizes = {name: (folder / name).stat().st_size for name in files if name.endswith(_RECORDING) and name not in gone}
+    table = _document(folder / _PARAMETERS) if _PARAMETERS in files else None
+    name = str(arm.get("name", ""))
+    if not name:
+        raise UsageError(f"{folder / _ARM}: names no arm")
+    with db.transaction():
+        values = (
+            *(_kind(files), name, None if table is None else table.get("arm", {}).get("sha256")),
+            *(_began(folder), _ending(files, ended), file_sha256(folder / MANIFEST) if whole else None, time.time()),
+        )
+        db.write(
+            "INSERT INTO runs VALUES (?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT (id) DO UPDATE SET kind = excluded.kind, "
+            "arm = excluded.arm, arm_sha256 = excluded.arm_sha256, ending = excluded.ending, "
+            "manifest_sha256 = excluded.manifest_sha256, indexed = excluded.indexed",
+            *(run, *values),
+        )
+        for recording, size in sizes.items():
+            db.write(
+                "INSERT OR REPLACE INTO recordings VALUES (?, ?, ?, ?, NULL)", run, recording, files[recording], size
+            )
+        if table is not None:
+            db.write(
+                "INSERT OR REPLACE INTO parameter_sets VALUES (?, ?, ?, ?, ?, ?)",
+                *(run, files[_PARAMETERS], name, str(table.get("method", "")), _feasible(table)),
+                table.get("fit", {}).get("relative_error_percent"),
+            )
+    return known_run(db, run)
+
+
+def rebuild_runs(db: Database, state: Path) -> list[str]:
+    """Enter every run folder that the registry does not know; what cannot be read is told, in words."""
+    known = {row["id"] for row in db.rows("SELECT id FROM runs")}
+    busy = {row["run"] for row in db.rows("SELECT run FROM jobs WHERE state = 'running' AND run IS NOT NULL")}
+    told = []
+    place = state / RUNS
+    for folder in sorted(place.iterdir()) if place.is_dir() else ():
+        if folder.name.startswith(".") or folder.name in known | busy or folder.is_symlink():
+            continue
+        try:
+            index_run(db, state, folder.name)
+        except (IdentError, OSError) as error:
+            told.append(f"{folder.name}: {error}")
+    return told
+
+
+def known_run(db: Database, run: str) -> Row:
+    """The run of this id.
+
+    Raises:
+        UnknownId: there is none.
+    """
+    row = db.row("SELECT * FROM runs WHERE id = ?", run)
+    if row is None:
+        raise UnknownId(f"no run {run!r} is known; the list of runs names them")
+    return row
+
+
+def runs(db: Database, arm: str | None = None, *, most: int = 100) -> list[Row]:
+    """Runs, or those of an arm, the newest first."""
+    return db.rows("SELECT * FROM runs WHERE ?1 IS NULL OR arm = ?1 ORDER BY created DESC, id LIMIT ?2", arm, most)
+
+
+def recordings(db: Database, run: str) -> list[Row]:
+    """The recordings of a run."""
+    return db.rows("SELECT name, sha256, bytes, deleted FROM recordings WHERE run = ? ORDER BY name", run)
+
+
+def parameter_set(db: Database, run: str) -> Row | None:
+    """What is known of the parameters that a run holds."""
+    return db.row("SELECT * FROM parameter_sets WHERE run = ?", run)
+
+
+def run_folder(db: Database, state: Path, run: str) -> Path:
+    """Its folder; by the id that the registry has, never by a word from outside."""
+    return state / RUNS / str(known_run(db, run)["id"])
+
+
+def run_files(db: Database, state: Path, run: str) -> dict[str, str]:
+    """Name to SHA-256 of the files that its manifest names and that are there."""
+    folder = run_folder(db, state, run)
+    if not (folder / MANIFEST).is_file():
+        return {}
+    return {name: sha256 for name, sha256 in named_files(folder).items() if _own(folder / name)}
+
+
+def run_file(db: Database, state: Path, run: str, name: str) -> Path:
+    """A file that the manifest of a run names.
+
+    Raises:
+        UnknownId: no such run, or no such file in it.
+    """
+    if name not in run_files(db, state, run):
+        raise UnknownId(f"the run {run} has no file {name!r}; its manifest names them")
+    return run_folder(db, state, run) / name
+
+
+def _own(path: Path) -> bool:
+    return path.is_file() and not path.is_symlink()
+
+
+def _document(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise ParameterError(f"{path}: larger than {_MOST_BYTES} bytes")
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:
+        raise ParameterError(f"{path}: not JSON: {error}") from None
+    if not isinstance(content, dict):
+        raise ParameterError(f"{path}: not a JSON object")
+    return content
+
+
+def _kind(files: dict[str, str]) -> str:
+    if _SCORE in files:
+        return "simulation"
+    return "identification" if _PARAMETERS in files else "motion"
+
+
+def _ending(files: dict[str, str], ended: dict[str, Any] | None) -> str:
+    if ended is not None:
+        return str(ended.get("error") or ended.get("state") or "unknown")
+    return "done" if _PARAMETERS in files else KILLED
+
+
+def _feasible(table: dict[str, Any]) -> int | None:
+    feasible = table.get("feasibility", {}).get("feasible")
+    return None if feasible is None else int(bool(feasible))
+
+
+def _began(folder: Path) -> float:
+    return min((path.stat().st_mtime for path in folder.iterdir()), default=time.time())

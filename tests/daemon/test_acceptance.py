@@ -1,0 +1,178 @@
+"""What a person accepts: whole folders, a current set under a path that stays, and what a kill in between leaves."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from ident_service.errors import ParameterError, UnknownId, UsageError
+from ident_service.results.manifest import MANIFEST, write_manifest
+from ident_service.service.acceptance import accept, acceptances, rollback, settle
+from ident_service.service.import_run import import_run
+from ident_service.service.registry.database import Database
+from ident_service.service.registry.runs import (
+    index_run,
+    known_run,
+    parameter_set,
+    rebuild_runs,
+    recordings,
+    run_file,
+    run_files,
+)
+from ident_service.service.retention import expendable, let_go
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def db(state: Path) -> Iterator[Database]:
+    with Database(state) as opened:
+        yield opened
+
+
+@pytest.fixture
+def folder(commissioned: Path, tmp_path: Path) -> Path:
+    """A copy of a run's folder, which may be changed."""
+    return Path(shutil.copytree(commissioned, tmp_path / "other-machine" / "20260101T000000Z-quick"))
+
+
+def current(state: Path) -> Path:
+    return state / "arms" / "quick" / "current" / "parameters.json"
+
+
+def test_a_kill_after_the_act_and_before_what_follows_is_made_good(db: Database, state: Path, folder: Path) -> None:
+    accept(db, state, folder, "good", "me")
+    first = current(state).read_bytes()
+    document = json.loads((folder / "parameters.json").read_text())
+    (folder / "parameters.json").write_text(json.dumps(document | {"method": "huber"}))
+    write_manifest(folder)
+    accept(db, state, folder, "better", "me")
+    # As a kill between the folder and what follows it leaves things:
+    current(state).write_bytes(first)
+    db.write("DELETE FROM acceptances WHERE number = 2")
+    settle(db, state)
+    assert json.loads(current(state).read_text())["method"] == "huber"
+    assert [row["number"] for row in db.rows("SELECT number FROM acceptances ORDER BY number")] == [1, 2]
+    # And before the act, half a folder is no act.
+    half = state / "arms" / "quick" / "accepted" / ".0003.abcd.partial"
+    half.mkdir()
+    settle(db, state)
+    assert len(acceptances(state, "quick")) == 2
+
+
+def test_what_is_not_whole_or_not_feasible_is_not_accepted(db: Database, state: Path, folder: Path) -> None:
+    (folder / "score.json").write_text("{}")
+    with pytest.raises(ParameterError, match="changed"):
+        accept(db, state, folder, "good", "me")
+    document = json.loads((folder / "parameters.json").read_text())
+    document["feasibility"]["feasible"] = False
+    (folder / "parameters.json").write_text(json.dumps(document))
+    write_manifest(folder)
+    with pytest.raises(ParameterError, match="no body can have"):
+        accept(db, state, folder, "good", "me")
+    for note in ("", " \n", "x" * 2001):
+        with pytest.raises(UsageError, match="note"):
+            accept(db, state, folder, note, "me")
+    assert not current(state).exists()
+    with pytest.raises(UsageError, match="nothing has been accepted"):
+        rollback(db, state, "quick", "back", "me")
+
+
+def test_a_set_that_was_changed_behind_our_back_is_not_rolled_back_to(db: Database, state: Path, folder: Path) -> None:
+    accept(db, state, folder, "one", "me")
+    accept(db, state, folder, "two", "me")
+    (state / "arms" / "quick" / "accepted" / "0001" / "parameters.json").write_text("{}")
+    with pytest.raises(ParameterError, match="was changed since"):
+        rollback(db, state, "quick", "back", "me")
+    with pytest.raises(UsageError, match="from 1 to 2"):
+        rollback(db, state, "quick", "back", "me", to=3)
+
+
+def test_a_folder_from_another_machine_is_imported_whole(db: Database, state: Path, folder: Path) -> None:
+    (folder / "stray").write_text("not in the manifest")
+    row = import_run(db, state, folder, "me")
+    assert (row["arm"], row["kind"], row["ending"]) == ("quick", "simulation", "done")
+    copy = state / "runs" / folder.name
+    assert not (copy / "stray").exists()
+    assert run_files(db, state, row["id"]) == json.loads((folder / MANIFEST).read_text())["files"]
+    assert import_run(db, state, folder, "me")["id"] == row["id"]  # again is no mistake
+    found = parameter_set(db, row["id"])
+    assert found is not None
+    assert found["feasible"] == 1
+    with pytest.raises(UnknownId):
+        run_file(db, state, row["id"], "../../token")
+    # The registry can be made again from the folders.
+    db.write("DELETE FROM runs")
+    assert rebuild_runs(db, state) == []
+    assert known_run(db, row["id"])["manifest_sha256"] == row["manifest_sha256"]
+
+
+def test_what_is_torn_foreign_or_leads_elsewhere_is_not_imported(db: Database, state: Path, folder: Path) -> None:
+    names = list(json.loads((folder / MANIFEST).read_text())["files"])
+    secret = folder.parent / "secret"
+    secret.write_text("of this machine")
+
+    def tried(words: str, *kinds: type[Exception]) -> None:
+        with pytest.raises(kinds or (ParameterError,), match=words):
+            import_run(db, state, folder, "me")
+        assert not (state / "runs" / folder.name).exists()
+
+    good = (folder / "report.txt").read_bytes()
+    (folder / "report.txt").write_bytes(good[:-1])
+    tried("changed, or is torn")
+    (folder / "report.txt").unlink()
+    tried("not there")
+    (folder / "report.txt").symlink_to(secret)
+    tried("a link")
+    (folder / "report.txt").unlink()
+    (folder / "report.txt").write_bytes(good)
+    whole = (folder / MANIFEST).read_text()
+    for name in ("../secret", "/etc/hostname", "..", "a/b", MANIFEST):
+        (folder / MANIFEST).write_text(whole.replace('"report.txt"', json.dumps(name)))
+        tried("not the manifest of a run")
+    (folder / MANIFEST).write_text(whole.replace("ident-run", "other"))
+    tried("not the manifest of a run")
+    (folder / MANIFEST).write_text("[" * 100_000)
+    tried("not a manifest")
+    (folder / MANIFEST).unlink()
+    tried("no manifest", UsageError)
+    assert names
+    link = folder.parent / "link"
+    link.symlink_to(folder)
+    with pytest.raises(UsageError, match="a link"):
+        import_run(db, state, link, "me")
+
+
+def test_another_run_of_the_same_name_stays(db: Database, state: Path, folder: Path) -> None:
+    import_run(db, state, folder, "me")
+    (folder / "report.txt").write_text("another")
+    write_manifest(folder)
+    with pytest.raises(UsageError, match="another run of this name"):
+        import_run(db, state, folder, "me")
+    assert (state / "runs" / folder.name / "report.txt").read_text() != "another"
+
+
+def test_only_recordings_that_nobody_accepted_are_let_go(db: Database, state: Path, folder: Path) -> None:
+    for day in range(1, 6):
+        named = folder.rename(folder.with_name(f"2026010{day}T000000Z-quick"))
+        import_run(db, state, named, "me")
+        db.write("UPDATE runs SET created = ? WHERE id = ?", float(day), named.name)
+        folder = named
+    accept(db, state, state / "runs" / "20260101T000000Z-quick", "kept for ever", "me")
+    gone = expendable(db, state, 2)
+    assert {one.run[:8] for one in gone} == {"20260102", "20260103"}
+    assert {one.name for one in gone} == {"identification.mcap", "validation.mcap"}
+    assert all((state / "runs" / one.run / one.name).is_file() for one in gone)  # a dry run
+    assert let_go(db, state, 2, "me") == gone
+    assert not any((state / "runs" / one.run / one.name).exists() for one in gone)
+    assert expendable(db, state, 2) == []
+    # What stays is still what the manifest names, and the row keeps the hash of what went.
+    row = index_run(db, state, gone[0].run)
+    assert row["ending"] == "done"
+    assert all(one["deleted"] and len(one["sha256"]) == 64 for one in recordings(db, gone[0].run))
+    assert (state / "runs" / gone[0].run / "parameters.json").is_file()
+    assert "identification.mcap" not in run_files(db, state, gone[0].run)

@@ -1,0 +1,248 @@
+"""The ladder through the API, on the small simulated arm in virtual time: real processes, real folders."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+from pathlib import Path
+
+import pytest
+from daemon.conftest import Asked, quick_text, serving
+
+from ident_service.motion.control_file import in_use
+from ident_service.service.arm_state import control_path
+from ident_service.service.jobs.asked import Run
+from ident_service.service.registry.audit import trail
+
+pytestmark = pytest.mark.slow
+ARM = "quick"
+
+
+@pytest.fixture
+def arm(daemon: Asked) -> str:
+    """An arm that was uploaded."""
+    answer = daemon.post("/api/v1/arms", {"description": quick_text(ARM)})
+    assert answer.status_code == 201, answer.text
+    assert answer.json()["name"] == ARM
+    return ARM
+
+
+def run_of(daemon: Asked, kind: str = "simulate") -> str:
+    """A job that makes a run, done."""
+    ended = daemon.follow(daemon.begin({"kind": kind, "arm": ARM})["id"])
+    assert ended["state"] == "done", ended
+    return str(ended["run"])
+
+
+def checked(daemon: Asked) -> None:
+    """The arm has a ticket."""
+    job = daemon.begin({"kind": "check", "arm": ARM}, confirmed=True)
+    assert daemon.follow(job["id"], lease=True)["state"] == "done"
+
+
+@pytest.mark.timeout(300)
+def test_from_an_upload_to_accepted_parameters_and_back(daemon: Asked, arm: str, state: Path) -> None:
+    runs = [run_of(daemon), run_of(daemon)]
+    current = state / "arms" / ARM / "current" / "parameters.json"
+    assert not current.exists()
+    refused = daemon.post(f"/api/v1/arms/{ARM}/acceptances", {"run": runs[0], "note": "  "})
+    assert refused.status_code == 400
+    taken = []
+    for run in runs:
+        seen = daemon.get(f"/api/v1/runs/{run}").json()
+        assert (seen["kind"], seen["ending"], seen["parameters"]["feasible"]) == ("simulation", "done", True)
+        answer = daemon.post(f"/api/v1/arms/{ARM}/acceptances", {"run": run, "note": "drawn twice"})
+        assert answer.status_code == 201, answer.text
+        taken.append(daemon.get(f"/api/v1/runs/{run}/files/parameters.json").content)
+        assert current.read_bytes() == taken[-1]
+        assert answer.json()["parameters_sha256"] == hashlib.sha256(taken[-1]).hexdigest()
+    assert taken[0] != taken[1]  # when they were made differs, at least
+    answer = daemon.post(f"/api/v1/arms/{ARM}/rollback", {"note": "the second was too warm"})
+    assert (answer.status_code, answer.json()["number"], answer.json()["origin"]) == (201, 3, 1)
+    assert current.read_bytes() == taken[0]
+    assert daemon.post(f"/api/v1/arms/{ARM}/rollback", {"note": "again"}).status_code == 400  # nothing before it
+    assert daemon.post(f"/api/v1/arms/{ARM}/rollback", {"note": "forth", "to": 2}).status_code == 201
+    assert current.read_bytes() == taken[1]
+    acts = daemon.get(f"/api/v1/arms/{ARM}/acceptances").json()
+    assert [(act["number"], act["origin"], act["who"]) for act in acts] == [
+        (1, 1, "owner"),
+        (2, 2, "owner"),
+        (3, 1, "owner"),
+        (4, 2, "owner"),
+    ]
+    assert daemon.get(f"/api/v1/arms/{ARM}").json()["accepted"] == acts[-1]
+    page = daemon.get(f"/api/v1/runs/{runs[0]}/report.html")
+    assert page.status_code == 200
+    assert page.text.lstrip().lower().startswith("<!doctype html")
+    assert "sandbox" in page.headers["content-security-policy"]
+    for asked in (
+        {"kind": "report", "run": runs[0]},
+        {"kind": "export", "run": runs[0], "formats": ["urdf", "csv"]},
+        {"kind": "compare", "run": runs[0], "other": runs[1]},
+    ):
+        made = daemon.follow(daemon.begin(asked)["id"])
+        assert made["state"] == "done", made
+    assert (state / "reports" / f"{runs[0]}.html").is_file()
+    proven = daemon.follow(daemon.begin({"kind": "verify", "run": runs[0]})["id"])
+    assert proven["state"] == "done", proven
+    assert [line["what"] for line in daemon.get("/api/v1/audit?most=500").json()].count("accepted") == 2
+    wrong = daemon.post("/api/v1/arms/planar2/acceptances", {"run": runs[0], "note": "of another arm"})
+    assert wrong.status_code == 400
+
+
+@pytest.mark.timeout(300)
+def test_check_run_identify(daemon: Asked, arm: str) -> None:
+    # Without a ticket the run is refused, by the same words as at a terminal.
+    early = daemon.begin({"kind": "run", "arm": ARM}, confirmed=True)
+    ended = daemon.follow(early["id"], lease=True)
+    assert (ended["state"], ended["exit_code"]) == ("refused", 3)
+    assert "`ident check`" in ended["detail"]
+    for kind in ("check", "run"):
+        job = daemon.begin({"kind": kind, "arm": ARM}, confirmed=True)
+        ended = daemon.follow(job["id"], lease=True)
+        assert ended["state"] == "done", ended
+    run = daemon.get(f"/api/v1/runs/{ended['run']}").json()
+    assert run["ending"] == "done"
+    ((recording),) = run["recordings"]
+    content = daemon.get(f"/api/v1/runs/{run['id']}/files/run.mcap").content
+    assert hashlib.sha256(content).hexdigest() == recording["sha256"] == run["files"]["run.mcap"]
+    job = daemon.begin({"kind": "identify", "arm": ARM, "recordings": [{"run": run["id"]}]})
+    ended = daemon.follow(job["id"])
+    assert ended["state"] == "done", ended
+    result = daemon.get(f"/api/v1/jobs/{job['id']}/result").json()["answer"]
+    assert result["feasible"] is True
+    assert daemon.get(f"/api/v1/runs/{ended['run']}").json()["parameters"]["sha256"]
+    log = daemon.get(f"/api/v1/jobs/{early['id']}/log").text
+    assert "not checked yet" in log
+
+
+@pytest.mark.parametrize(
+    ("asked", "state_of_it", "key"),
+    [
+        ({"kind": "base"}, "done", "base_parameters"),
+        ({"kind": "watch", "seconds": 0.1}, "done", "joints"),
+        ({"kind": "recover"}, "done", "steps"),
+        ({"kind": "preview"}, "done", "warnings"),
+    ],
+)
+def test_what_only_looks_needs_no_word(
+    daemon: Asked, arm: str, asked: dict[str, object], state_of_it: str, key: str
+) -> None:
+    job = daemon.begin({**asked, "arm": arm})
+    ended = daemon.follow(job["id"])
+    assert ended["state"] == state_of_it, ended
+    assert key in daemon.get(f"/api/v1/jobs/{job['id']}/result").json()["answer"]
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("how", ["cancel", "stop", "silence", "shutdown"])
+def test_a_motion_ends_with_its_arm_at_rest(state: Path, how: str) -> None:
+    factor = 0.5 if how == "silence" else 15.0
+    with serving(state) as daemon:
+        daemon.post("/api/v1/arms", {"description": quick_text(ARM)})
+        assert (
+            daemon.follow(daemon.begin({"kind": "check", "arm": ARM}, confirmed=True)["id"], lease=True)["state"]
+            == "done"
+        )
+    with serving(state, lease_factor=factor) as daemon:
+        job = daemon.begin({"kind": "run", "arm": ARM}, confirmed=True)
+        if how != "silence":
+            daemon.follow(job["id"], lease=True, until=lambda _: in_use(control_path(state, ARM)))
+        if how == "cancel":
+            assert daemon.post(f"/api/v1/jobs/{job['id']}/cancel").status_code == 200
+        elif how == "stop":
+            daemon.headers.clear()
+            assert job["id"] in daemon.post(f"/api/v1/arms/{ARM}/stop").json()["jobs"]
+            daemon.as_token((state / "token").read_text().strip())
+        if how != "shutdown":
+            ended = daemon.follow(job["id"])
+    if how == "shutdown":
+        with serving(state) as daemon:
+            ended = daemon.get(f"/api/v1/jobs/{job['id']}").json()
+    words = {
+        "cancel": "cancelled by owner",
+        "stop": "anybody asked",
+        "silence": "nobody renewed",
+        "shutdown": "service",
+    }
+    assert ended["state"] == "cancelled"
+    assert words.get(how, "the service ends") in ended["detail"]
+    assert not in_use(control_path(state, ARM))
+    assert not (state / "arms" / ARM / "moving.json").exists()
+    ending = state / "runs" / ended["run"] / "ended.json"
+    if ending.exists():  # a lease may lapse before the arm is taken
+        assert json.loads(ending.read_text())["state"] == "stopped"
+    else:
+        assert how == "silence"
+
+
+@pytest.mark.timeout(300)
+def test_one_motion_at_a_time_and_a_lease_while_it_waits(state: Path) -> None:
+    with serving(state) as daemon:
+        daemon.post("/api/v1/arms", {"description": quick_text(ARM)})
+        first = daemon.begin({"kind": "check", "arm": ARM}, confirmed=True)
+        second = daemon.begin({"kind": "check", "arm": ARM}, confirmed=True)
+        elsewhere = daemon.begin({"kind": "check", "arm": "planar2"}, confirmed=True)
+        seen = set()
+        while daemon.get(f"/api/v1/jobs/{first['id']}").json()["state"] in ("queued", "running"):
+            for job in (first, second, elsewhere):
+                daemon.post(f"/api/v1/jobs/{job['id']}/lease")
+            states = [daemon.get(f"/api/v1/jobs/{job['id']}").json()["state"] for job in (first, second, elsewhere)]
+            if states[0] == "running":
+                seen.add(tuple(states))
+            time.sleep(0.05)
+        assert ("running", "queued", "running") in seen
+        assert ("running", "running", "running") not in seen
+        assert daemon.follow(second["id"], lease=True)["state"] == "done"
+        daemon.follow(elsewhere["id"])
+        # Whoever waits and falls silent does not move an arm later.
+        blocker = daemon.begin({"kind": "check", "arm": ARM}, confirmed=True)
+        silent = daemon.begin({"kind": "home", "arm": ARM}, confirmed=True)
+        daemon.service.engine._factor = 0.1
+        ended = daemon.follow(silent["id"])
+        assert (ended["state"], ended["started"]) == ("cancelled", None)
+        assert "nothing has moved" in ended["detail"]
+        daemon.follow(blocker["id"])
+
+
+@pytest.mark.timeout(300)
+def test_the_services_own_lease_carries_a_run_that_nobody_watches(daemon: Asked, arm: str) -> None:
+    assert (
+        daemon.follow(daemon.begin({"kind": "check", "arm": ARM}, confirmed=True)["id"], lease=True)["state"] == "done"
+    )
+    row = daemon.service.engine.create(Run(kind="run", arm=ARM), "service", own_lease=True)
+    assert daemon.follow(row["id"])["state"] == "done"
+
+
+def test_events_tell_a_job_to_its_end(daemon: Asked, arm: str) -> None:
+    job = daemon.begin({"kind": "check", "arm": ARM}, confirmed=True)
+    daemon.service.engine.renew(job["id"])
+    answer = daemon.get(f"/api/v1/jobs/{job['id']}/events")  # lasts as long as the job
+    assert answer.headers["content-type"].startswith("text/event-stream")
+    told = [json.loads(line[6:])["state"] for line in answer.text.splitlines() if line.startswith("data: ")]
+    assert told[-1] == "done"
+    assert told == sorted(told, key=["queued", "running", "done"].index)
+
+
+def test_a_computation_is_cancelled_and_leaves_nothing(daemon: Asked, arm: str, state: Path) -> None:
+    job = daemon.begin({"kind": "simulate", "arm": ARM})
+    daemon.follow(job["id"], until=lambda seen: (seen["progress"] or {}).get("phase", "").startswith("identification"))
+    daemon.post(f"/api/v1/jobs/{job['id']}/cancel")
+    ended = daemon.follow(job["id"])
+    assert (ended["state"], "cancelled by owner" in ended["detail"]) == ("cancelled", True)
+    assert not list((state / "runs").iterdir())
+
+
+def test_what_dies_without_a_word_has_failed(daemon: Asked, arm: str) -> None:
+    job = daemon.begin({"kind": "simulate", "arm": ARM})
+    asked = "SELECT process FROM jobs WHERE id = ? AND process <> ''"
+    daemon.follow(job["id"], until=lambda _: daemon.service.db.row(asked, job["id"]) is not None)
+    row = daemon.service.db.row(asked, job["id"])
+    assert row is not None
+    os.kill(int(row["process"].split()[0]), 9)
+    ended = daemon.follow(job["id"])
+    assert ended["state"] == "failed"
+    assert "signal 9" in ended["detail"]
+    assert [line["detail"]["state"] for line in trail(daemon.service.db) if line["what"] == "job ended"] == ["failed"]

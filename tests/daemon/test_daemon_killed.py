@@ -1,0 +1,147 @@
+"""kill -9 of the daemon at random moments of a job: nothing is lost, the arm rests, the job tells the truth."""
+
+from __future__ import annotations
+
+import json
+import random
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from daemon.conftest import quick_text, serving
+from daemon.served import daemon_process
+
+from ident_service.errors import MotionRefused
+from ident_service.motion.control_file import in_use
+from ident_service.record.open import open_recording
+from ident_service.results.manifest import verified_files
+from ident_service.service.arm_state import control_path
+from ident_service.service.client import Client
+from ident_service.service.registry.database import Database
+
+ARM = "quick"
+KINDS = ("run", "run", "check", "simulate")
+
+
+def begin(client: Client, kind: str) -> str:
+    """A job, confirmed where it moves."""
+    body: dict[str, object] = {"job": {"kind": kind, "arm": ARM}}
+    if kind != "simulate":
+        word = client.post(f"/api/v1/arms/{ARM}/challenge")["challenge"]
+        body["confirm"] = {"name": ARM, "challenge": word}
+    return str(client.post("/api/v1/jobs", body)["id"])
+
+
+def carried(client: Client, job: str, seconds: float) -> bool:
+    """Renew a job's lease for some time; whether it lives still."""
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        if client.get(f"/api/v1/jobs/{job}")["state"] not in ("queued", "running"):
+            return False
+        _renewed(client, job)
+        time.sleep(0.1)
+    return True
+
+
+def checked(client: Client) -> None:
+    """The arm has a ticket."""
+    job = begin(client, "check")
+    ended = not carried(client, job, 240.0)
+    seen = client.get(f"/api/v1/jobs/{job}")
+    assert ended, seen
+    assert seen["state"] == "done", seen
+
+
+def _renewed(client: Client, job: str) -> None:
+    try:
+        client.post(f"/api/v1/jobs/{job}/lease")
+    except MotionRefused as error:
+        if "no lease to renew" not in str(error):
+            raise
+
+
+def kill_once(state: Path, seed: int) -> str:
+    """One kill; what became of the job."""
+    chance = random.Random(seed)  # noqa: S311 - a seeded choice
+    kind = chance.choice(KINDS)
+    with daemon_process(state) as (process, client):
+        client.post("/api/v1/arms", {"description": quick_text(ARM)})
+        if kind == "run":
+            checked(client)
+        job, waiting = begin(client, kind), begin(client, "home")
+        alive = carried(client, job, chance.uniform(0.0, 9.0))
+        process.kill()
+        process.wait()
+    with Database(state) as db:
+        assert db.sound()
+        before = {row["id"]: row["state"] for row in db.rows("SELECT id, state FROM jobs")}
+    assert not alive or before[job] in ("running", "done")
+    with serving(state) as again:
+        # What waited to move an arm is not begun by a restart.
+        now = again.get(f"/api/v1/jobs/{waiting}").json()["state"]
+        assert now == ("interrupted" if before[waiting] in ("queued", "running") else before[waiting])
+        until = time.monotonic() + 90.0
+        while True:
+            seen = again.get(f"/api/v1/jobs/{job}").json()
+            looked_for = "being looked for" in seen["detail"] or seen["state"] in ("queued", "running")
+            if not looked_for:
+                break
+            assert time.monotonic() < until, seen
+            time.sleep(0.1)
+        if before[job] == "running":
+            assert seen["state"] == "interrupted"
+        elif before[job] == "queued":
+            assert seen["state"] in ("interrupted", "done")
+        else:
+            assert seen["state"] == before[job]
+        # At rest: nobody has the arm, and a motion that ended by itself left no mark.
+        assert not in_use(control_path(state, ARM))
+        assert not (state / "arms" / ARM / "moving.json").exists()
+        assert again.get(f"/api/v1/arms/{ARM}").json()["faults"] == []
+        if kind == "run" and seen["run"] is not None and (folder := state / "runs" / seen["run"]).is_dir():
+            ended = json.loads((folder / "ended.json").read_text())
+            assert ended["state"] in ("stopped", "done")
+            assert f"the motion ended: {ended['state']}" in seen["detail"] or seen["state"] != "interrupted"
+            verified_files(folder)
+            assert sum(len(block.stamp_ns) for block in open_recording(folder / "run.mcap").blocks()) > 0
+            assert again.get(f"/api/v1/runs/{seen['run']}").json()["ending"] == ended["state"]
+        lines = again.get("/api/v1/audit?most=500").json()
+        assert [line["about"] for line in lines if line["what"] == "job created"].count(job) == 1
+    with Database(state) as db:
+        assert db.sound()
+        assert not db.rows("SELECT id FROM jobs WHERE state IN ('queued', 'running')")
+    return f"{kind}: {seen['state']}: {seen['detail']}"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("seed", [1, 5, 8])
+def test_a_daemon_that_is_killed(state: Path, seed: int) -> None:
+    assert kill_once(state, seed)
+
+
+@pytest.mark.campaign
+@pytest.mark.timeout(7200)
+def test_thirty_kills(state: Path) -> None:
+    told = [kill_once(state.with_name(f"state{seed}"), seed) for seed in range(100, 130)]
+    assert sum(line.startswith("run: interrupted") for line in told) >= 5, told
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_daemon_that_is_asked_to_end_stops_its_arm_first(state: Path) -> None:
+    with daemon_process(state) as (process, client):
+        client.post("/api/v1/arms", {"description": quick_text(ARM)})
+        checked(client)
+        job = begin(client, "run")
+        while not in_use(control_path(state, ARM)):
+            assert carried(client, job, 0.2)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 0
+    assert not in_use(control_path(state, ARM))
+    assert not (state / "serve.url").exists()
+    with Database(state) as db:
+        (row,) = db.rows("SELECT state, run FROM jobs WHERE id = ?", job)
+    assert row["state"] == "cancelled"
+    assert json.loads((state / "runs" / row["run"] / "ended.json").read_text())["state"] == "stopped"

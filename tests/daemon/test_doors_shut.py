@@ -1,0 +1,310 @@
+"""Every door of the service that must stay shut, tried."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import httpx
+import pytest
+from daemon.conftest import URL, Asked, serving
+
+from ident_service.config.load import shipped_arms
+from ident_service.errors import UsageError
+from ident_service.motion.control_file import ControlFile
+from ident_service.service.api.doors import MOST_BODY, MOST_UPLOAD
+from ident_service.service.api.gate import CHALLENGE_SECONDS, Gate, Throttle, Throttled
+from ident_service.service.api.settings import Settings
+from ident_service.service.arm_state import control_path
+from ident_service.service.registry.audit import trail
+from ident_service.service.registry.database import Database
+from ident_service.service.registry.tokens import add_token, revoke_token
+
+OPEN = {("GET", "/healthz"), ("POST", "/api/v1/login"), ("POST", "/api/v1/logout")}
+STOPS = {("POST", "/api/v1/stop"), ("POST", "/api/v1/arms/{arm}/stop")}
+FILLED = {"arm": "planar2", "job": "j", "run": "r", "motion": "m", "name": "n", "code": "c"}
+MOTION = {"kind": "run", "arm": "planar2"}
+FAR = "203.0.113.9"
+
+
+def routes(daemon: Asked) -> list[tuple[str, str]]:
+    """Method and path of every operation of the description."""
+    document = daemon.get("/api/v1/openapi.json").json()
+    return [(method.upper(), path) for path, item in document["paths"].items() for method in item]
+
+
+def refusal(answer: httpx.Response, status: int, words: str = "") -> None:
+    """The answer is a refusal of the one shape."""
+    assert answer.status_code == status, answer.text
+    document = answer.json()
+    assert set(document) == {"error"}
+    assert set(document["error"]) == {"kind", "message"}
+    assert re.search(words, document["error"]["message"]), document
+
+
+def test_nothing_answers_without_a_token_but_health_and_stop(daemon: Asked) -> None:
+    tried = 0
+    daemon.headers.clear()
+    for method, path in routes(daemon):
+        if (method, path) in OPEN | STOPS:
+            continue
+        tried += 1
+        answer = daemon.ask(method, path.format(**FILLED), json={})
+        refusal(answer, 401)
+        assert answer.headers["www-authenticate"] == "Bearer"
+    assert tried > 20
+
+
+@pytest.mark.parametrize("secret", ["", "x", "ident_", "ident_" + "A" * 43, "\xff"])
+def test_a_token_that_is_nobodys_opens_nothing(daemon: Asked, secret: str) -> None:
+    refusal(daemon.get("/api/v1/arms", headers={"Authorization": f"Bearer {secret}".encode("latin-1")}), 401)
+
+
+def test_a_viewer_changes_nothing(daemon: Asked, viewer: str) -> None:
+    daemon.as_token(viewer)
+    bodies = {
+        "/api/v1/arms": {"description": "x"},
+        "/api/v1/motions": {"arm": "planar2", "motion": "{}"},
+        "/api/v1/jobs": {"job": {"kind": "simulate", "arm": "planar2"}},
+        "/api/v1/arms/{arm}/acceptances": {"run": "r", "note": "n"},
+        "/api/v1/arms/{arm}/rollback": {"note": "n"},
+    }
+    tried = 0
+    for method, path in routes(daemon):
+        if method == "GET" or (method, path) in OPEN | STOPS:
+            continue
+        tried += 1
+        refusal(daemon.ask(method, path.format(**FILLED), json=bodies.get(path)), 403, "operator")
+    assert tried >= 10
+    assert daemon.get("/api/v1/arms").status_code == 200
+    assert daemon.get("/api/v1/jobs").json() == []
+
+
+def test_a_revoked_token_and_its_session_count_no_more(daemon: Asked) -> None:
+    db = daemon.service.db
+    secret = add_token(db, "ann", "operator", "test")
+    daemon.headers.clear()
+    answer = daemon.post("/api/v1/login", {"token": secret})
+    cookie = answer.cookies["ident_session"]
+    header = {"Cookie": f"ident_session={cookie}"}
+    assert daemon.get("/api/v1/whoami", headers=header).json() == {"name": "ann", "role": "operator"}
+    revoke_token(db, "ann", "test")
+    refusal(daemon.get("/api/v1/whoami", headers=header), 401)
+    refusal(daemon.post("/api/v1/login", {"token": secret}), 401)
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "127.0.0.1.evil.example", "", "localhost@evil.example", "127.0.0.1:x"]
+)
+def test_another_host_is_not_ours(daemon: Asked, host: str) -> None:
+    refusal(daemon.get("/healthz", headers={"Host": host}), 421)
+    refusal(daemon.post("/api/v1/stop", headers={"Host": host}), 421)
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:8470", "localhost", "LOCALHOST:1", "[::1]:8470"])
+def test_our_own_names_are(daemon: Asked, host: str) -> None:
+    assert daemon.get("/healthz", headers={"Host": host}).status_code == 200
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "https://127.0.0.1:8470", "http://127.0.0.1:8471"])
+def test_a_page_of_another_origin_asks_nothing_of_us(daemon: Asked, origin: str) -> None:
+    for path in ("/api/v1/jobs", "/api/v1/stop", "/api/v1/login"):
+        refusal(daemon.post(path, {}, headers={"Origin": origin}), 403)
+    refusal(daemon.post("/api/v1/stop", headers={"Sec-Fetch-Site": "cross-site"}), 403)
+    assert daemon.post("/api/v1/stop", headers={"Origin": URL, "Sec-Fetch-Site": "same-origin"}).status_code == 200
+
+
+def test_a_session_alone_changes_nothing_without_its_page(daemon: Asked) -> None:
+    secret = daemon.headers.pop("Authorization").removeprefix("Bearer ")
+    answer = daemon.post("/api/v1/login", {"token": secret})
+    flags = answer.headers["set-cookie"].lower()
+    assert "httponly" in flags
+    assert "samesite=strict" in flags
+    header = {"Cookie": f"ident_session={answer.cookies['ident_session']}"}
+    assert daemon.get("/api/v1/arms", headers=header).status_code == 200
+    path = "/api/v1/arms/planar2/challenge"
+    refusal(daemon.post(path, headers=header), 403)
+    assert daemon.post(path, headers={**header, "Origin": URL}).status_code == 201
+    daemon.post("/api/v1/logout", headers={**header, "Origin": URL})
+    refusal(daemon.get("/api/v1/arms", headers=header), 401)
+
+
+def test_failed_logins_are_throttled_and_stop_is_not(daemon: Asked) -> None:
+    good = dict(daemon.headers)
+    other = add_token(daemon.service.db, "late", "operator", "test")
+    assert daemon.get("/api/v1/arms").status_code == 200  # from here this token is known
+    daemon.headers.clear()
+    codes = [daemon.post("/api/v1/login", {"token": f"wrong{k}"}).status_code for k in range(12)]
+    assert codes == [401] * 10 + [429] * 2
+    # Even a good one that was never seen from here is not heard: guesses are not told from it.
+    answer = daemon.post("/api/v1/login", {"token": other})
+    refusal(answer, 429)
+    assert 0 < int(answer.headers["retry-after"]) <= 60
+    assert daemon.get("/api/v1/arms", headers=good).status_code == 200
+    assert daemon.post("/api/v1/stop").status_code == 200
+    assert daemon.post("/api/v1/login", {"token": other}, address="198.51.100.7").status_code == 200
+
+
+def test_the_throttle_counts_addresses_and_all_of_them() -> None:
+    now = [0.0]
+    throttle = Throttle(lambda: now[0])
+    for k in range(100):
+        throttle.require(f"10.0.0.{k}")
+        throttle.failed(f"10.0.0.{k}")
+    with pytest.raises(Throttled) as caught:
+        throttle.require("10.0.1.1")
+    assert caught.value.seconds == 60.0
+    now[0] = 60.1
+    throttle.require("10.0.1.1")
+
+
+@pytest.mark.parametrize(("path", "most"), [("/api/v1/jobs", MOST_BODY), ("/api/v1/arms", MOST_UPLOAD)])
+def test_a_body_is_counted_as_it_comes(daemon: Asked, path: str, most: int) -> None:
+    def pieces() -> object:
+        sent = 0
+
+        async def stream() -> object:
+            nonlocal sent
+            while sent <= most:
+                sent += 65_536
+                yield b" " * 65_536
+
+        return stream()
+
+    # Without a Content-Length, and with one that is not true.
+    refusal(daemon.ask("POST", path, content=pieces()), 413, str(most))
+    refusal(daemon.ask("POST", path, content=pieces(), headers={"Content-Length": "10"}), 413)
+
+
+@pytest.mark.parametrize(
+    "word",
+    ["..", "../token", "..%2f..%2ftoken", "%2e%2e%2ftoken", "/etc/passwd", "a/b", "a\\..\\b", ".hid", "a%00b"],
+)
+def test_no_id_is_a_path(daemon: Asked, word: str) -> None:
+    for place in ("runs/{}", "runs/{}/files/arm.json", "runs/x/files/{}", "jobs/{}/log", "motions/{}", "arms/{}"):
+        answer = daemon.get("/api/v1/" + place.format(word))
+        assert answer.status_code in (404, 422), (place, answer.text)
+        assert "ident_" not in answer.text.replace("ident_session", "")
+    for job in ({"kind": "report", "run": word}, {"kind": "identify", "arm": "planar2", "recordings": [{"run": word}]}):
+        assert daemon.post("/api/v1/jobs", {"job": job}).status_code in (404, 422)
+
+
+@pytest.mark.parametrize("reach", ["/etc/passwd", "../../token", "../../registry.sqlite", "../../../outside.urdf"])
+def test_an_upload_leads_nowhere(daemon: Asked, state: Path, reach: str) -> None:
+    (state.parent / "outside.urdf").write_text("<robot name='outside'/>")
+    for text in (
+        f"format: ident-arm\nversion: 1\nname: spy\nkinematics: {{urdf: {reach}}}\n",
+        f"extends: {reach}\nname: spy\n",
+        f"format: ident-arm\nversion: 1\nname: spy\nkinematics: {{urdf: own.urdf}}\nprior: {reach}\n",
+    ):
+        answer = daemon.post("/api/v1/arms", {"description": text, "files": {"own.urdf": "<robot name='x'/>"}})
+        refusal(answer, 422, "leads out of the upload|extends a shipped arm|extends: an uploaded")
+        assert "root:" not in answer.text
+        assert str(state) not in answer.text
+    assert not any(row["name"] == "spy" for row in daemon.get("/api/v1/arms").json())
+
+
+@pytest.mark.parametrize("name", ["../x", "arm.yaml", "a/b", "", ".x", "a" * 200])
+def test_an_uploaded_file_has_a_plain_name(daemon: Asked, name: str) -> None:
+    text = shipped_arms()["planar2"].read_text()
+    assert daemon.post("/api/v1/arms", {"description": text, "files": {name: "x"}}).status_code in (400, 422)
+
+
+def test_a_motion_needs_the_typed_name_and_a_fresh_challenge(daemon: Asked, viewer: str) -> None:
+    def asked(confirm: object) -> httpx.Response:
+        return daemon.post("/api/v1/jobs", {"job": MOTION, "confirm": confirm})
+
+    for kind in ("check", "rehearse", "run", "home"):
+        refusal(daemon.post("/api/v1/jobs", {"job": {"kind": kind, "arm": "planar2"}}), 409, "challenge")
+    refusal(asked({"name": "planar2", "challenge": ""}), 409)
+    refusal(asked({"name": "planar2", "challenge": "made up"}), 409)
+    refusal(asked({"name": "planar2", "challenge": daemon.challenge("sixaxis")}), 409)
+    word = daemon.challenge("planar2")
+    refusal(asked({"name": "Planar2", "challenge": word}), 409)
+    refusal(asked({"name": "planar2", "challenge": word}), 409)  # the wrong name has used it up
+    word = daemon.challenge("planar2")
+    owner = dict(daemon.headers)
+    daemon.as_token(add_token(daemon.service.db, "other", "operator", "test"))
+    refusal(asked({"name": "planar2", "challenge": word}), 409)  # given to somebody else
+    daemon.headers.update(owner)
+    assert daemon.get("/api/v1/jobs").json() == []
+
+
+def test_a_request_that_comes_twice_moves_the_arm_once(daemon: Asked) -> None:
+    body = {"job": MOTION, "confirm": {"name": "planar2", "challenge": daemon.challenge("planar2")}}
+    assert daemon.post("/api/v1/jobs", body).status_code == 201
+    refusal(daemon.post("/api/v1/jobs", body), 409, "used once")
+    assert len(daemon.get("/api/v1/jobs").json()) == 1
+    daemon.post("/api/v1/stop")
+
+
+def test_a_challenge_does_not_count_for_long(tmp_path: Path) -> None:
+    now = [0.0]
+    with Database(tmp_path) as db:
+        gate = Gate(db, lambda: now[0])
+        word = gate.challenge("a", "me")
+        now[0] = CHALLENGE_SECONDS - 0.1
+        assert gate.confirm(word, "a", "me")
+        assert not gate.confirm(word, "a", "me")
+        word = gate.challenge("a", "me")
+        now[0] += CHALLENGE_SECONDS + 0.1
+        assert not gate.confirm(word, "a", "me")
+
+
+def test_stop_needs_no_token_here_and_any_token_from_elsewhere(daemon: Asked, viewer: str, state: Path) -> None:
+    with ControlFile.take(control_path(state, "planar2"), None) as mover:
+        daemon.headers.clear()
+        refusal(daemon.post("/api/v1/stop", address=FAR), 401)
+        refusal(daemon.post("/api/v1/stop", headers={"Authorization": "Bearer wrong"}, address=FAR), 401)
+        assert not mover.stop
+        answer = daemon.post("/api/v1/arms/planar2/stop", headers={"Authorization": f"Bearer {viewer}"}, address=FAR)
+        assert answer.json() == {"arms": ["planar2"], "jobs": []}
+        assert mover.stop
+    with ControlFile.take(control_path(state, "planar2"), None) as mover:
+        # A token that counts no more keeps nobody from a stop on the arm's own machine.
+        assert daemon.post("/api/v1/stop", headers={"Authorization": "Bearer wrong"}).json()["arms"] == ["planar2"]
+        assert mover.stop
+    assert {line["who"] for line in trail(daemon.service.db) if line["what"] == "stop"} == {"looks", "anybody"}
+
+
+def test_only_whoever_asked_renews_a_lease(daemon: Asked) -> None:
+    job = daemon.begin(MOTION, confirmed=True)
+    daemon.as_token(add_token(daemon.service.db, "other", "operator", "test"))
+    refusal(daemon.post(f"/api/v1/jobs/{job['id']}/lease"), 403, "whoever asked")
+    daemon.post("/api/v1/stop")
+
+
+def test_no_answer_names_a_place_or_lets_itself_be_framed_or_kept(daemon: Asked, state: Path) -> None:
+    job = daemon.begin({"kind": "simulate", "arm": "wam7"})  # not a simulated arm
+    ended = daemon.follow(job["id"])
+    assert ended["state"] == "failed"
+    assert "no simulated driver" in ended["detail"]
+    for path in (f"jobs/{job['id']}", f"jobs/{job['id']}/result", "jobs", "arms/planar2", "audit"):
+        answer = daemon.get(f"/api/v1/{path}")
+        assert answer.status_code == 200
+        assert str(state) not in answer.text
+        assert answer.headers["cache-control"] == "no-store"
+        assert answer.headers["x-content-type-options"] == "nosniff"
+        assert "frame-ancestors 'none'" in answer.headers["content-security-policy"]
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1", "robot.example"])  # noqa: S104 - refused
+def test_a_network_is_not_served_without_tls(tmp_path: Path, host: str) -> None:
+    with pytest.raises(UsageError, match="--tls-cert"):
+        Settings(tmp_path, host=host)
+    (tmp_path / "cert").touch()
+    with pytest.raises(UsageError, match="both"):
+        Settings(tmp_path, host=host, tls_cert=tmp_path / "cert")
+
+
+def test_from_a_network_no_loopback_name_counts(state: Path) -> None:
+    (state.parent / "pem").touch()
+    pem = state.parent / "pem"
+    with serving(state, host="0.0.0.0", tls_cert=pem, tls_key=pem, names=("robot.example",)) as daemon:  # noqa: S104
+        refusal(daemon.get("/healthz"), 421)
+        answer = daemon.get("/healthz", headers={"Host": "robot.example:8470"})
+        assert answer.status_code == 200
+        assert "strict-transport-security" in answer.headers
+        # And nobody stops without a token there, whatever address a proxy has.
+        daemon.headers.clear()
+        refusal(daemon.post("/api/v1/stop", headers={"Host": "robot.example"}), 401)

@@ -1,0 +1,185 @@
+"""The registry: migrated forwards only, whole transactions or none, an audit trail that stays."""
+
+from __future__ import annotations
+
+import sqlite3
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from ident_service.errors import UnknownId, UsageError
+from ident_service.service.registry import jobs
+from ident_service.service.registry.audit import note, trail
+from ident_service.service.registry.database import FILE, Database
+from ident_service.service.registry.migrations import MIGRATIONS
+from ident_service.service.registry.tokens import (
+    TOKEN_FILE,
+    access,
+    add_token,
+    first_token,
+    read_token,
+    revoke_token,
+    tokens,
+)
+
+
+def test_a_database_is_migrated_step_by_step_and_keeps_what_it_had(tmp_path: Path) -> None:
+    steps = ("CREATE TABLE a (x INTEGER); INSERT INTO a VALUES (7);", "ALTER TABLE a ADD COLUMN y INTEGER DEFAULT 8;")
+    with Database(tmp_path, steps[:1]) as db:
+        assert db.rows("SELECT * FROM a") == [{"x": 7}]
+    with Database(tmp_path, steps) as db:
+        assert db.rows("SELECT * FROM a") == [{"x": 7, "y": 8}]
+        assert db.row("PRAGMA user_version") == {"user_version": 2}
+    with Database(tmp_path, steps) as db:
+        assert db.rows("SELECT * FROM a") == [{"x": 7, "y": 8}]
+
+
+def test_a_step_that_fails_changes_nothing(tmp_path: Path) -> None:
+    good = "CREATE TABLE a (x INTEGER);"
+    with Database(tmp_path, (good,)) as db:
+        db.write("INSERT INTO a VALUES (1)")
+    with pytest.raises(UsageError, match="no such table"):
+        Database(tmp_path, (good, "CREATE TABLE b (x INTEGER); INSERT INTO nowhere VALUES (1);"))
+    with Database(tmp_path, (good,)) as db:
+        assert db.rows("SELECT name FROM sqlite_master WHERE name = 'b'") == []
+
+
+def test_a_newer_database_is_refused_and_left_alone(tmp_path: Path) -> None:
+    Database(tmp_path).close()
+    with sqlite3.connect(tmp_path / FILE) as raw:
+        raw.execute(f"PRAGMA user_version = {len(MIGRATIONS) + 1}")
+    raw.close()
+    before = (tmp_path / FILE).read_bytes()
+    with pytest.raises(UsageError, match="written by newer software"):
+        Database(tmp_path)
+    assert (tmp_path / FILE).read_bytes() == before
+
+
+def test_what_is_no_database_is_refused_in_words(tmp_path: Path) -> None:
+    (tmp_path / FILE).write_bytes(b"not a database, but long enough to be taken for one" * 100)
+    with pytest.raises(UsageError, match=FILE):
+        Database(tmp_path)
+
+
+def test_a_transaction_is_whole_or_nothing(tmp_path: Path) -> None:
+    with Database(tmp_path) as db:
+
+        def half() -> None:
+            with db.transaction():
+                note(db, "me", "began", "x")
+                with db.transaction():
+                    note(db, "me", "inner", "x")
+                raise ZeroDivisionError
+
+        with pytest.raises(ZeroDivisionError):
+            half()
+        assert trail(db) == []
+
+
+def test_the_audit_trail_can_be_neither_changed_nor_shortened(tmp_path: Path) -> None:
+    with Database(tmp_path) as db:
+        note(db, "me", "did", "x", how="so")
+        for sql in ("UPDATE audit SET who = 'you'", "DELETE FROM audit"):
+            with pytest.raises(sqlite3.IntegrityError, match="append-only"):
+                db.write(sql)
+        (line,) = trail(db)
+        assert (line["who"], line["what"], line["about"], line["detail"]) == ("me", "did", "x", {"how": "so"})
+
+
+def test_threads_do_not_lose_each_others_rows(tmp_path: Path) -> None:
+    with Database(tmp_path) as db:
+        threads = [
+            threading.Thread(target=lambda k=k: [note(db, f"t{k}", "did", str(i)) for i in range(25)]) for k in range(4)
+        ]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        counted = db.rows("SELECT who, COUNT(*) AS n FROM audit GROUP BY who ORDER BY who")
+        assert counted == [{"who": f"t{k}", "n": 25} for k in range(4)]
+
+
+def test_what_was_written_survives_a_kill(tmp_path: Path) -> None:
+    script = (
+        "import os, sys; from pathlib import Path\n"
+        "from ident_service.service.registry.database import Database\n"
+        "from ident_service.service.registry.audit import note\n"
+        "db = Database(Path(sys.argv[1]))\n"
+        "note(db, 'me', 'written', 'x')\n"
+        "with db.transaction():\n"
+        "    note(db, 'me', 'not yet', 'x')\n"
+        "    os.kill(os.getpid(), 9)\n"
+    )
+    assert subprocess.run([sys.executable, "-c", script, tmp_path], check=False).returncode == -9
+    with Database(tmp_path) as db:
+        assert [line["what"] for line in trail(db)] == ["written"]
+        assert db.sound()
+
+
+def test_a_job_ends_once(tmp_path: Path) -> None:
+    with Database(tmp_path) as db:
+        jobs.add_job(db, "j", "run", "a", {}, [], "me", motion=True, run=None)
+        assert jobs.started(db, "j", "")
+        assert not jobs.started(db, "j", "")
+        assert jobs.ended(db, "j", "faulted", "why", 4)
+        assert not jobs.ended(db, "j", "done", "")
+        assert jobs.known_job(db, "j")["state"] == "faulted"
+        with pytest.raises(UnknownId):
+            jobs.known_job(db, "k")
+
+
+def test_typical_durations_are_medians_of_what_came_to_its_end(tmp_path: Path) -> None:
+    with Database(tmp_path) as db:
+        assert jobs.typical_seconds(db, "run", "a") is None
+        for number, (seconds, state) in enumerate([(10, "done"), (12, "done"), (500, "done"), (1, "failed")]):
+            jobs.add_job(db, str(number), "run", "a", {}, [], "me", motion=True, run=None)
+            db.write("UPDATE jobs SET state = ?, started = 0, ended = ? WHERE id = ?", state, seconds, str(number))
+        assert jobs.typical_seconds(db, "run", "a") == 12
+        assert jobs.typical_seconds(db, "run", "b") is None
+
+
+def test_only_the_hash_of_a_token_is_kept(tmp_path: Path) -> None:
+    with Database(tmp_path) as db:
+        secret = add_token(db, "ann", "viewer", "me")
+        found = access(db, secret)
+        assert found is not None
+        assert (found.name, found.role) == ("ann", "viewer")
+        assert access(db, secret[:-1]) is None
+        with pytest.raises(UsageError, match="there is"):
+            add_token(db, "ann", "operator", "me")
+        revoke_token(db, "ann", "me")
+        assert access(db, secret) is None
+        with pytest.raises(UsageError, match="there is, or was"):
+            add_token(db, "ann", "operator", "me")
+    assert all(secret.encode() not in path.read_bytes() for path in tmp_path.iterdir())
+
+
+def test_the_first_token_is_its_owners_alone(tmp_path: Path) -> None:
+    with Database(tmp_path) as db:
+        path = first_token(db, tmp_path)
+        assert path.stat().st_mode & 0o777 == 0o600
+        secret = read_token(path)
+        assert secret is not None
+        found = access(db, secret)
+        assert found is not None
+        assert found.role == "operator"
+        assert first_token(db, tmp_path) == path
+        assert read_token(path) == secret
+        # One that counts no more is replaced, and the trail names both.
+        revoke_token(db, found.name, "me")
+        first_token(db, tmp_path)
+        assert read_token(path) != secret
+        assert len(tokens(db)) == 2
+        path.chmod(0o644)
+        with pytest.raises(UsageError, match="others can read it"):
+            read_token(path)
+
+
+def test_a_token_file_is_not_read_through_a_link(tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").write_text("ident_x")
+    (tmp_path / TOKEN_FILE).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(UsageError, match="cannot be read"):
+        read_token(tmp_path / TOKEN_FILE)

@@ -1,0 +1,223 @@
+"""A person's way in a browser: from the first page to the exported URDF, a stop in the middle, and back.
+
+The arm is simulated, in virtual time; service, jobs, motions and browser are real.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+from page.conftest import Reached, log_in
+from playwright.sync_api import Browser, Page, expect
+
+from ident_service.motion.control_file import in_use
+from ident_service.service.arm_state import control_path
+from ident_service.service.registry import jobs as rows
+from ident_service.service.registry.tokens import add_token
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
+ARM = "planar2"
+
+
+def arm_page(page: Page, reached: Reached) -> None:
+    page.goto(f"{reached.url}/arms/{ARM}")
+    page.get_by_role("heading", name=ARM, level=1).wait_for()
+
+
+def begin(page: Page, reached: Reached, step: str) -> None:
+    """Ask for a motion and confirm it, by keyboard alone from the button on."""
+    arm_page(page, reached)
+    if not page.get_by_role("button", name=step, exact=True).is_visible():
+        page.locator("summary", has_text=step).first.click()
+    page.get_by_role("button", name=step, exact=True).press("Enter")
+    expect(page.get_by_label("Type the arm's name")).to_be_focused()
+    page.keyboard.type(ARM)
+    page.keyboard.press("Enter")
+    page.wait_for_url("**/jobs/*")
+
+
+def ended(page: Page) -> str:
+    """The state of the job that the page shows, when it has ended."""
+    page.get_by_role("link", name=f"Back to {ARM}").wait_for(timeout=180_000)
+    return page.locator("#state").inner_text()
+
+
+def current_step(page: Page, reached: Reached) -> str:
+    arm_page(page, reached)
+    return page.locator('[aria-current="step"] h3').inner_text().split()[0]
+
+
+def test_from_the_first_page_to_the_urdf_and_back(browser: Browser, reached: Reached, state: Path) -> None:
+    page = log_in(browser, reached)
+    problems = list[str]()
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.get_by_role("link", name=ARM, exact=True).click()
+    assert current_step(page, reached) == "Check"
+    begin(page, reached, "Check")
+    assert ended(page) == "done"
+    assert current_step(page, reached) == "Rehearse"
+
+    begin(page, reached, "Run")
+    page.get_by_role("heading", name="The arm now").wait_for()
+    rows_shown = page.locator("#values tr")
+    expect(rows_shown).to_have_count(2)
+    seen = set()
+    while page.locator("#live").count() and len(seen) < 4:
+        seen.add(page.locator("#values").inner_text())
+        page.wait_for_timeout(400)
+    assert len(seen) >= 4  # values that move
+    drawn = page.evaluate(
+        "() => { const c = document.getElementById('plot-position');"
+        " return c.getContext('2d').getImageData(0, 0, c.width, c.height).data.some((v) => v); }"
+    )
+    assert drawn
+    assert ended(page) == "done"
+    assert current_step(page, reached) == "Identify"
+
+    page.get_by_role("button", name="Identify", exact=True).click()
+    assert ended(page) == "done"
+    assert current_step(page, reached) == "Report"
+    page.get_by_role("button", name="Make the report").click()
+    assert ended(page) == "done"
+    page.get_by_role("link", name="Read the report").click()
+    page.get_by_role("heading", level=1).wait_for()
+    assert ARM in page.title() or ARM in page.content()
+    assert current_step(page, reached) == "Accept"
+
+    accept(page, "the first")
+    assert current_step(page, reached) == "Export"
+    page.get_by_role("button", name="Export", exact=True).click()
+    assert ended(page) == "done"
+    with page.expect_download() as waiting:
+        page.get_by_role("link", name=f"{ARM}.urdf").click()
+    urdf = ET.parse(waiting.value.path()).getroot()  # noqa: S314 - our own
+    masses = [float(str(one.get("value"))) for one in urdf.iter("mass")]
+    assert len(masses) >= 2
+    assert 0.5 < sum(masses) < 4.0  # the description's own bound; the truth is 3.23 kg
+    assert current_step(page, reached) == "Re-identify"
+
+    # Identified once more, accepted, and rolled back.
+    page.locator("summary", has_text="Identify again").click()
+    page.get_by_role("button", name="Identify", exact=True).click()
+    assert ended(page) == "done"
+    arm_page(page, reached)
+    accept(page, "the second")
+    current = state / "arms" / ARM / "current" / "parameters.json"
+    second = hashlib.sha256(current.read_bytes()).hexdigest()
+    page.locator("summary", has_text="Roll back").click()
+    page.locator("#back-note").fill("<b>the second</b> was too warm")
+    page.locator("#back-name").fill(ARM)
+    page.get_by_role("button", name="Roll back", exact=True).click()
+    page.wait_for_url("**#accepted")
+    expect(page.get_by_role("region", name="Acceptances").locator("tbody tr")).to_have_count(3)
+    expect(page.get_by_text("<b>the second</b> was too warm")).to_be_visible()
+    assert hashlib.sha256(current.read_bytes()).hexdigest() != second
+
+    page.get_by_role("button", name="Compare").click()
+    page.get_by_role("heading", name="Comparison").wait_for()
+    assert problems == []
+
+
+def accept(page: Page, note: str) -> None:
+    if not page.locator("#accept-note").is_visible():
+        page.locator("summary", has_text="Accept ").first.click()
+    page.locator("#accept-note").fill(note)
+    page.locator("#accept-name").fill(ARM)
+    page.get_by_role("button", name="Accept", exact=True).click()
+    page.wait_for_url("**#accepted")
+
+
+def moving(page: Page, reached: Reached, state: Path) -> None:
+    """A run on its way."""
+    begin(page, reached, "Check")
+    assert ended(page) == "done"
+    begin(page, reached, "Run")
+    page.get_by_role("heading", name="The arm now").wait_for()
+    assert in_use(control_path(state, ARM))
+
+
+@pytest.mark.parametrize("how", ["escape", "button", "without scripts", "leaving"])
+def test_a_stop_in_the_middle(browser: Browser, reached: Reached, state: Path, how: str) -> None:
+    page = log_in(browser, reached)
+    moving(page, reached, state)
+    if how == "escape":
+        page.keyboard.press("Escape")
+    elif how == "button":
+        page.get_by_role("button", name="Stop all arms").click()
+        page.get_by_role("heading", name="Stop asked").wait_for()
+        expect(page.locator("main")).to_contain_text(f"Asked to stop: {ARM}")
+    elif how == "without scripts":
+        secret = add_token(reached.service.db, "looks", "viewer", "test")
+        dead = log_in(browser, reached, secret, scripts=False)
+        assert dead.locator("#stop button").get_attribute("accesskey") == "s"  # which only a real keyboard presses
+        for key in ("Tab", "Tab", "Enter"):
+            dead.keyboard.press(key)
+        dead.get_by_role("heading", name="Stop asked").wait_for()
+    else:
+        reached.service.engine._factor = 1.0
+        page.goto(f"{reached.url}/audit")
+    job = rows.jobs(reached.service.db, arm=ARM, most=1)[0]["id"]
+    until = time.monotonic() + 60.0
+    while (row := rows.known_job(reached.service.db, job))["state"] in rows.LIVE:
+        assert time.monotonic() < until
+        time.sleep(0.1)
+    assert row["state"] == "cancelled"
+    words = {"escape": "owner asked", "button": "owner asked", "without scripts": "looks asked", "leaving": "renewed"}
+    assert words[how] in row["detail"]
+    assert not in_use(control_path(state, ARM))
+
+
+def test_a_rehearsal_moves_while_a_key_is_held(browser: Browser, reached: Reached, state: Path) -> None:
+    page = log_in(browser, reached)
+    begin(page, reached, "Check")
+    assert ended(page) == "done"
+    arm_page(page, reached)
+    page.get_by_role("button", name="Rehearse", exact=True).click()
+    page.get_by_label("Type the arm's name").fill(ARM)
+    page.keyboard.press("Tab")
+    expect(page.locator("#hold")).to_be_focused()
+    assert not rows.jobs(reached.service.db, arm=ARM, states=rows.LIVE)
+    page.keyboard.down(" ")
+    expect(page.locator("#hold")).to_have_attribute("aria-pressed", "true")
+    page.get_by_role("heading", name="The arm now").wait_for()
+    assert in_use(control_path(state, ARM))
+    page.keyboard.up(" ")
+    assert ended(page) == "cancelled"
+    assert not in_use(control_path(state, ARM))
+
+
+def test_a_rehearsal_with_another_name_moves_nothing(browser: Browser, reached: Reached) -> None:
+    page = log_in(browser, reached)
+    arm_page(page, reached)
+    page.get_by_role("button", name="Rehearse", exact=True).click()
+    page.get_by_label("Type the arm's name").fill("planar3")
+    page.locator("#hold").press(" ")
+    expect(page.locator("#detail")).to_contain_text("Nothing has moved")
+    assert not rows.jobs(reached.service.db, arm=ARM)
+
+
+@pytest.mark.parametrize("width", [1280, 400])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_nothing_is_wider_than_the_window_and_stop_is_in_it(
+    browser: Browser, reached: Reached, width: int, scheme: str
+) -> None:
+    page = log_in(browser, reached)
+    page.set_viewport_size({"width": width, "height": 800})
+    page.emulate_media(color_scheme="dark" if scheme == "dark" else "light")
+    for address in ("/", f"/arms/{ARM}", "/jobs", "/runs", "/audit", "/new"):
+        page.goto(reached.url + address)
+        assert page.evaluate("document.documentElement.scrollWidth") <= width, address
+        box = page.get_by_role("button", name="Stop all arms").bounding_box()
+        assert box is not None
+        assert box["y"] >= 0
+        assert box["y"] + box["height"] <= 800
+        assert box["x"] + box["width"] <= width
+        assert box["height"] >= 44
+        page.keyboard.press("Tab")
+        expect(page.get_by_role("link", name="Skip to the content")).to_be_focused()
+        page.keyboard.press("Tab")
+        expect(page.get_by_role("button", name="Stop all arms")).to_be_focused()

@@ -1,0 +1,227 @@
+"""What is read of a run while it is recorded, held against what was written."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ident_service.config.load import load_arm, shipped_arms
+from ident_service.errors import RecordingError
+from ident_service.estimation.growing import GrowingInformation
+from ident_service.model.arm_model import arm_model
+from ident_service.model.regressor import joint_regressor
+from ident_service.record.cycle import Cycle
+from ident_service.record.recording import Block
+from ident_service.record.tail import RecordingTail
+from ident_service.record.writer import RecordingWriter
+from ident_service.service.live import BIN_NS, LiveRun
+
+NAMES = ("shoulder", "elbow")
+STEP_NS = 2_000_000
+START_NS = 5_000_000_000
+
+
+def cycle(k: int) -> Cycle:
+    """One whose values say which it is."""
+    ones = np.ones(2)
+    return Cycle(
+        cycle=k,
+        stamp_ns=START_NS + k * STEP_NS,
+        position=np.array([k, -k]) * 1e-3,
+        velocity=None,
+        torque=np.array([k, 2.0 * k]),
+        valid=ones.astype(bool),
+        age=ones.astype(np.uint32) * 0,
+        reference_position=np.array([k, -k]) * 1e-3 + (0.5 if k == 333 else 0.01) * np.array([1.0, -1.0]),
+        reference_velocity=0.0 * ones,
+        lateness_ns=0,
+        compute_ns=0,
+        lost=0,
+    )
+
+
+def everything(tail: RecordingTail, most: int = 1 << 20) -> list[float]:
+    """Torque of the first joint of all samples that can be had now."""
+    found = list[float]()
+    while (samples := tail.read(most)) is not None:
+        assert samples.position.shape == samples.reference.shape == (len(samples.stamp_ns), 2)
+        np.testing.assert_array_equal(samples.stamp_ns, START_NS + np.rint(samples.torque[:, 0]) * STEP_NS)
+        np.testing.assert_array_equal(samples.torque[:, 1], 2.0 * samples.torque[:, 0])
+        found += samples.torque[:, 0].tolist()
+    return found
+
+
+@pytest.mark.parametrize("most", [1 << 20, 4096, 16])
+def test_a_tail_gives_each_flushed_sample_once(tmp_path: Path, most: int) -> None:
+    with RecordingWriter(tmp_path / "run.mcap", NAMES, "<robot/>", 0) as writer:
+        tail = RecordingTail(writer.partial)
+        assert tail.read(most) is None
+        seen, counts = list[float](), []
+        for k in range(1000):
+            writer.sample(cycle(k))
+            if k % 100 == 99:
+                seen += everything(tail, most)
+                counts.append(len(seen))
+                # A chunk of 0.1 s at most is not flushed yet.
+                assert k - len(seen) <= 51
+        assert counts == sorted(set(counts))
+    # The file has another name now; the tail reads on.
+    seen += everything(tail, most)
+    assert seen == list(range(1000))
+    assert tail.joint_names == NAMES
+    assert tail.ended
+    tail.close()
+
+
+def test_a_torn_end_waits_and_damage_is_told(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "run.mcap", NAMES, "<robot/>", 0) as writer:
+        for k in range(500):
+            writer.sample(cycle(k))
+    whole = (tmp_path / "run.mcap").read_bytes()
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(whole[: len(whole) // 2])
+    tail = RecordingTail(torn)
+    first = everything(tail)
+    assert 0 < len(first) < 500
+    torn.write_bytes(whole)
+    assert first + everything(tail) == list(range(500))
+    tail.close()
+    damaged = bytearray(whole)
+    damaged[len(whole) // 2] ^= 0xFF
+    torn.write_bytes(damaged)
+    tail = RecordingTail(torn)
+    with pytest.raises(RecordingError):
+        everything(tail)
+    tail.close()
+    torn.write_bytes(whole[:8] + b"\x06" + (1 << 40).to_bytes(8, "little") + b"x")
+    tail = RecordingTail(torn)
+    with pytest.raises(RecordingError, match="above the limit"):
+        tail.read()
+    tail.close()
+
+
+def test_watching_thins_samples_and_keeps_the_largest_error(tmp_path: Path) -> None:
+    clock = [0.0]
+    live = LiveRun(tmp_path, lambda: clock[0])
+    assert live.since(0) == []
+    with RecordingWriter(tmp_path / "run.mcap", NAMES, "<robot/>", 0) as writer:
+        for k in range(1000):
+            writer.sample(cycle(k))
+        times, errors, last = list[float](), list[float](), 0
+        for _ in range(20):
+            clock[0] += 1.0
+            frames = live.since(last)
+            for frame in frames:
+                assert frame.number == last + 1
+                last = frame.number
+                piece = json.loads(frame.data)
+                assert piece["joints"] == list(NAMES)
+                times += piece["time"]
+                errors += piece["error"][0]
+                assert piece["torque"][1] == [2.0 * one for one in piece["torque"][0]]
+        number = live.since(0)[-1].number
+        clock[0] += 0.01
+        writer.sample(cycle(1000))
+        assert live.since(0)[-1].number == number  # nobody looks twice within a moment
+    assert len(times) == pytest.approx(1000 * STEP_NS / BIN_NS, rel=0.1)
+    assert sorted(set(times)) == times
+    assert max(errors) == pytest.approx(0.5)  # of one sample in ten that a point stands for
+    assert min(errors) == pytest.approx(0.01)
+    live.close()
+    assert live.since(0)[-1].number == number
+
+
+def test_a_run_that_cannot_be_read_says_so_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "run.mcap.partial").write_bytes(b"\x89MCAP0\r\n" + b"\x06" + (1 << 40).to_bytes(8, "little") + b"x" * 9)
+    clock = [0.0]
+    live = LiveRun(tmp_path, lambda: clock[0])
+    for _ in range(3):
+        clock[0] += 1.0
+        assert live.since(0) == []
+    assert "above the limit" in live.broken
+    assert len(caplog.records) == 1
+    live.close()
+
+
+def growing_run(seconds: float, noise: float) -> tuple[GrowingInformation, np.ndarray, list[np.ndarray]]:
+    """Doubt of a motion of the planar arm that comes in pieces; the true base parameters; deviations on the way."""
+    model = arm_model(load_arm(shipped_arms()["planar2"]))
+    growing = GrowingInformation(model)
+    rng, step = np.random.default_rng(3), 0.002
+    time_s = np.arange(0.0, seconds, step)
+    w = 2 * np.pi * np.array([[0.31], [0.47]])
+    q = np.stack([0.9 * np.sin(w[0] * time_s), 1.1 * np.sin(w[1] * time_s + 1.0)], axis=1)
+    dq = np.stack([0.9 * w[0] * np.cos(w[0] * time_s), 1.1 * w[1] * np.cos(w[1] * time_s + 1.0)], axis=1)
+    ddq = -q * (w.T**2)
+    beta = rng.uniform(0.3, 1.0, growing.base.size)
+    H = joint_regressor(model.chain, model.layout, q, dq, ddq, growing.base.base)
+    torque = np.stack([rows.T @ beta for rows in H], axis=1)
+    # What is held from stamp to stamp acts half a step later than a sample would.
+    held = torque + 0.5 * step * np.gradient(torque, step, axis=0)
+    held += noise * rng.standard_normal(torque.shape)
+    stamp = np.rint(time_s * 1e9).astype(np.int64)
+    told = []
+    for start in range(0, len(stamp), 400):
+        part = slice(start, start + 400)
+        growing.add(Block(stamp[part], q[part], held[part]))
+        if growing.step():
+            doubt = growing.doubt()
+            assert doubt is not None
+            told.append(doubt.deviations)
+    return growing, beta, told
+
+
+def test_doubt_shrinks_as_the_arm_moves_and_is_honest() -> None:
+    growing, beta, told = growing_run(40.0, 0.2)
+    doubt = growing.doubt()
+    assert doubt is not None
+    assert len(told) >= 5
+    assert doubt.seconds > 30.0
+    known = [np.isfinite(one).all() for one in told]
+    assert known[-1]
+    assert known == sorted(known)
+    assert (told[-1] < 0.6 * told[known.index(True)]).all()
+    for earlier, later in zip(told[known.index(True) :], told[known.index(True) + 1 :], strict=False):
+        assert (later < 1.15 * earlier).all()
+    assert (np.abs(doubt.beta - beta) < 6.0 * doubt.deviations + 0.02).all()
+    assert set(doubt.verdicts) <= {"identified", "weak", "unidentified"}
+
+
+def test_what_is_remembered_stays_bounded() -> None:
+    growing, _, _ = growing_run(60.0, 0.1)
+    assert sum(len(block.stamp_ns) for block in growing._waiting) < 5.0 / 0.002
+
+
+def test_nothing_is_known_before_the_arm_has_moved() -> None:
+    growing = GrowingInformation(arm_model(load_arm(shipped_arms()["planar2"])))
+    assert not growing.step()
+    assert growing.doubt() is None
+    stamp = np.arange(0, 10_000_000_000, 2_000_000)
+    growing.add(Block(stamp, np.zeros((len(stamp), 2)), np.zeros((len(stamp), 2))))
+    growing.step()
+    doubt = growing.doubt()
+    assert doubt is None or not np.isfinite(doubt.deviations).any()
+
+
+def test_a_watched_run_tells_its_doubt(tmp_path: Path) -> None:
+    config = load_arm(shipped_arms()["planar2"])
+    (tmp_path / "arm.json").write_text(config.model_dump_json())
+    live = LiveRun(tmp_path)
+    rng = np.random.default_rng(1)
+    with RecordingWriter(tmp_path / "run.mcap", NAMES, "<robot/>", 0) as writer:
+        for k in range(5000):
+            at = k * STEP_NS * 1e-9
+            q = np.array([np.sin(1.9 * at), np.sin(2.9 * at)])
+            writer.sample(cycle(k)._replace(position=q, torque=rng.standard_normal(2) + q))
+        until = time.monotonic() + 60.0
+        while not (found := [frame for frame in live.since(0) if frame.kind == "doubt"]):
+            assert time.monotonic() < until
+            time.sleep(0.1)
+    told = json.loads(found[0].data)
+    assert len(told["parameters"]) == 13
+    assert all(one["deviation"] is None or one["deviation"] > 0 for one in told["parameters"])
+    live.close()

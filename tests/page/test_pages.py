@@ -1,0 +1,302 @@
+"""Pages as text: who may see them, nothing unescaped, and what a screen reader needs."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from daemon.conftest import URL, Asked, quick_text, serving
+from fastapi.routing import APIRoute
+
+from ident_service.config.load import load_arm
+from ident_service.service.arm_state import arm_folder, fault_file
+from ident_service.service.commission import simulate
+from ident_service.service.import_run import import_run
+from ident_service.service.pages.render import STATIC, mark, static
+from ident_service.service.pages.routes import PAGES
+from ident_service.service.registry import jobs as rows
+from ident_service.service.registry.tokens import add_token
+
+ARM = "quick"
+EVIL = "<script>alert('x')</script>\"'&"
+FORM = {"Content-Type": "application/x-www-form-urlencoded", "Origin": URL}
+VOID = {"meta", "link", "input", "br", "hr", "img"}
+
+
+@pytest.fixture(scope="session")
+def commissioned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a whole job on a small arm."""
+    folder = tmp_path_factory.mktemp("commissioned")
+    (folder / "quick.yaml").write_text(quick_text(ARM))
+    simulate(load_arm(folder / "quick.yaml"), folder / "first-run")
+    return folder / "first-run"
+
+
+@pytest.fixture
+def daemon(state: Path, commissioned: Path) -> Iterator[Asked]:
+    """A service with one of everything, hostile words wherever words may stand."""
+    with serving(state) as asked:
+        evil = quick_text(ARM).replace("planar arm of two links, gravity in its plane", repr(EVIL.replace("'", "")))
+        answer = asked.post("/api/v1/arms", {"description": evil})
+        assert answer.status_code == 201, answer.text
+        db = asked.service.db
+        import_run(db, state, commissioned, "test")
+        answer = asked.post(f"/api/v1/arms/{ARM}/acceptances", {"run": commissioned.name, "note": EVIL})
+        assert answer.status_code == 201, answer.text
+        arm_folder(state, ARM).mkdir(parents=True, exist_ok=True)
+        fault_file(state, ARM).latch("FOLLOWING_ERROR", EVIL)
+        rows.add_job(db, "j1", "run", ARM, {"kind": "run"}, [], "test", motion=True, run="none")
+        rows.ended(db, "j1", "failed", EVIL)
+        (state / "jobs" / "j1").mkdir(parents=True)
+        (state / "jobs" / "j1" / "log").write_text(EVIL)
+        asked.headers.clear()
+        yield asked
+
+
+def enter(daemon: Asked, role: str) -> None:
+    """Go on with a session of this role."""
+    secret = add_token(daemon.service.db, role, role, "test")  # type: ignore[arg-type]
+    answer = daemon.post("/login", content=f"token={secret}&next=%2Fjobs", headers=FORM)
+    assert (answer.status_code, answer.headers["location"]) == (303, "/jobs")
+    cookie = answer.headers["set-cookie"]
+    assert "HttpOnly" in cookie
+    assert "SameSite=strict" in cookie
+    daemon.headers["Cookie"] = cookie.split(";")[0]
+
+
+def addresses(commissioned: Path) -> list[str]:
+    return ["/", f"/arms/{ARM}", "/arms/planar2", "/jobs", "/jobs/j1", "/runs", f"/runs?arm={ARM}",
+            f"/runs/{commissioned.name}", "/audit"]  # fmt: skip
+
+
+class Reader(HTMLParser):
+    """Collects what the checks ask about."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.open: list[str] = []
+        self.unbalanced: list[str] = []
+        self.labelled: list[bool] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        self.labelled.append("label" in self.open)
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if not self.open or self.open.pop() != tag:
+            self.unbalanced.append(tag)
+
+
+def complaints(text: str) -> list[str]:
+    """What stands against a page."""
+    page = Reader(text)
+    named = [tag for tag, _ in page.tags]
+    ids = [attrs["id"] for _, attrs in page.tags if "id" in attrs]
+    found = [f"unbalanced {tag}" for tag in page.unbalanced + page.open]
+    found += [f"{named.count(tag)} {tag}" for tag in ("h1", "main", "header", "title") if named.count(tag) != 1]
+    found += [f"id {one} twice" for one in set(ids) if ids.count(one) > 1]
+    targets = {attrs.get("for") for tag, attrs in page.tags if tag == "label"}
+    for (tag, attrs), inside in zip(page.tags, page.labelled, strict=True):
+        asks = tag in ("input", "select", "textarea", "progress") and attrs.get("type") != "hidden"
+        if asks and not inside and attrs.get("id") not in targets:
+            found.append(f"no label: {attrs}")
+        found += [f"inline {key} at {tag}" for key in attrs if key == "style" or key.startswith("on")]
+        if tag == "script" and "src" not in attrs:
+            found.append("inline script")
+        for key in ("aria-labelledby", "aria-describedby"):
+            if key in attrs and attrs[key] not in ids:
+                found.append(f"{key} names nothing: {attrs[key]}")
+        if tag == "th" and "scope" not in attrs:
+            found.append("a th without scope")
+    levels = [int(tag[1]) for tag in named if re.fullmatch("h[1-6]", tag)]
+    found += [f"h{b} after h{a}" for a, b in pairwise(levels) if b > a + 1]
+    if ("html", {"lang": "en"}) not in page.tags:
+        found.append("no language")
+    if not any(tag == "form" and attrs.get("action") == "/stop" for tag, attrs in page.tags):
+        found.append("no stop")
+    return found
+
+
+def test_complaints_are_found() -> None:
+    bad = '<html><h1>a</h1><h3>b</h3><input id=x><p onclick="x">c<script>1</script><b aria-labelledby=y>'
+    words = " ".join(complaints(bad))
+    for part in ("unbalanced", "0 main", "h3 after h1", "no label", "inline onclick", "inline script", "y", "no stop"):
+        assert part in words
+
+
+@pytest.mark.parametrize("role", ["viewer", "operator"])
+def test_every_page_answers_whole_and_escaped(daemon: Asked, commissioned: Path, role: str) -> None:
+    enter(daemon, role)
+    shown = 0
+    for address in addresses(commissioned):
+        answer = daemon.get(address)
+        assert answer.status_code == 200, (address, answer.text)
+        assert complaints(answer.text) == [], address
+        assert "<script>" not in answer.text
+        shown += answer.text.count("&lt;script&gt;")
+        assert f"{role} <small>({role})</small>" in answer.text
+        policy = answer.headers["content-security-policy"]
+        assert "unsafe" not in policy
+        assert "default-src 'none'" in policy
+        assert answer.headers["referrer-policy"] == "same-origin"
+        assert str(daemon.service.state) not in answer.text
+        posting = [attrs for tag, attrs in Reader(answer.text).tags if tag == "form" and attrs.get("method") == "post"]
+        if role == "viewer":  # nothing but stop and the way out
+            assert {attrs["action"] for attrs in posting} == {"/stop", "/logout"}, address
+    assert shown >= 6  # description, fault, note, detail, log, audit
+
+
+def test_strangers_are_led_to_the_way_in(daemon: Asked, commissioned: Path) -> None:
+    for address in [*addresses(commissioned), "/new", "/jobs/j1/live", f"/compare?reference=a&other={ARM}"]:
+        answer = daemon.get(address)
+        assert answer.status_code == 303, address
+        assert answer.headers["location"].startswith("/login?next=%2F")
+    filled = {"arm": ARM, "job": "j1", "run": commissioned.name, "name": "n", "version": "v"}
+    open_to_all = {"/login", "/logout", "/static/{version}/{name}", "/stop"}
+    tried = 0
+    for route in (route for router in PAGES for route in router.routes if isinstance(route, APIRoute)):
+        for method in () if route.path in open_to_all else route.methods:
+            tried += 1
+            answer = daemon.ask(method, route.path.format(**filled), headers=FORM)
+            assert (answer.status_code, "/login" in answer.headers.get("location", "")) == (303, True), route.path
+    assert tried >= 20
+    for address in ("/new", f"/arms/{ARM}/move", f"/arms/{ARM}/accept", "/jobs/j1/cancel"):
+        answer = daemon.post(address, content="a=b", headers=FORM)
+        assert (answer.status_code, answer.headers["location"]) == (303, "/login?next=%2F"), address
+    answer = daemon.get("/login?next=//elsewhere.example/")
+    assert complaints(answer.text) == []
+    assert 'name="next" value="/"' in answer.text
+    answer = daemon.post("/login", content=f"token={EVIL}", headers=FORM)
+    assert answer.status_code == 401
+    assert "set-cookie" not in answer.headers
+
+
+def test_a_viewer_may_do_nothing_with_forms(daemon: Asked, commissioned: Path) -> None:
+    enter(daemon, "viewer")
+    sent = f"kind=run&run={commissioned.name}&note=n&name={ARM}&code=FOLLOWING_ERROR"
+    for name in ("confirm", "move", "jobs", "ack", "accept", "rollback", "pause"):
+        answer = daemon.post(f"/arms/{ARM}/{name}", content=sent, headers=FORM)
+        assert answer.status_code == 403, name
+        assert complaints(answer.text) == []
+    assert daemon.post("/jobs/j1/cancel", content="", headers=FORM).status_code == 403
+    assert daemon.get("/new").status_code == 403
+    assert list(fault_file(daemon.service.state, ARM).latched()) == ["FOLLOWING_ERROR"]
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [{"Origin": "http://elsewhere.example"}, {"Origin": "null"}, {"Sec-Fetch-Site": "cross-site"}, {}],
+    ids=["foreign", "null", "cross-site", "none"],
+)
+def test_a_form_of_another_page_does_nothing(daemon: Asked, headers: dict[str, str]) -> None:
+    enter(daemon, "operator")
+    sent = {"Content-Type": FORM["Content-Type"], **headers}
+    answer = daemon.post(f"/arms/{ARM}/ack", content="code=FOLLOWING_ERROR", headers=sent)
+    assert answer.status_code == 403
+    assert list(fault_file(daemon.service.state, ARM).latched()) == ["FOLLOWING_ERROR"]
+    answer = daemon.post(f"/arms/{ARM}/ack", content="code=FOLLOWING_ERROR", headers=FORM)
+    assert answer.status_code == 303
+    assert not fault_file(daemon.service.state, ARM).latched()
+
+
+def test_a_motion_needs_the_typed_name_and_a_fresh_page(daemon: Asked) -> None:
+    enter(daemon, "operator")
+    fault_file(daemon.service.state, ARM).acknowledge("FOLLOWING_ERROR")
+
+    def challenge() -> str:
+        answer = daemon.post(f"/arms/{ARM}/confirm", content="kind=check", headers=FORM)
+        assert complaints(answer.text) == []
+        found = re.search(r'name="challenge" value="([^"]+)"', answer.text)
+        assert found is not None
+        return found[1]
+
+    word = challenge()
+    for sent in (f"name=planar2&challenge={word}", f"name={ARM}&challenge={word}", f"name={ARM}&challenge=x"):
+        answer = daemon.post(f"/arms/{ARM}/move", content=f"kind=check&{sent}", headers=FORM)
+        assert (answer.status_code, "Nothing has moved" in answer.text) == (409, True)
+        assert complaints(answer.text) == []
+    assert not rows.jobs(daemon.service.db, arm=ARM, states=rows.LIVE)
+    answer = daemon.post(f"/arms/{ARM}/move", content=f"kind=check&name={ARM}&challenge={challenge()}", headers=FORM)
+    assert answer.status_code == 303
+    where = answer.headers["location"]
+    page = daemon.get(where)
+    assert 'data-lease="keep"' in page.text
+    assert complaints(page.text) == []
+    # Whoever comes to the job by another way only looks, and so does another person.
+    assert "data-lease" not in daemon.get(where.split("?")[0]).text
+    enter(daemon, "viewer")
+    assert "data-lease" not in daemon.get(where).text
+    daemon.post("/stop", content="", headers=FORM)
+
+
+def test_a_rehearsal_begins_on_its_own_page_only(daemon: Asked) -> None:
+    enter(daemon, "operator")
+    answer = daemon.post(f"/arms/{ARM}/confirm", content="kind=rehearse&speed=0.2", headers=FORM)
+    assert (answer.status_code, complaints(answer.text)) == (200, [])
+    assert 'id="hold"' in answer.text
+    answer = daemon.post(f"/arms/{ARM}/move", content=f"kind=rehearse&name={ARM}", headers=FORM)
+    assert (answer.status_code, "held" in answer.text) == (400, True)
+
+
+def test_stop_needs_nobody_here_and_somebody_elsewhere(daemon: Asked) -> None:
+    answer = daemon.post("/stop", headers={"Origin": URL})
+    assert (answer.status_code, complaints(answer.text)) == (200, [])
+    assert daemon.post("/stop", headers={"Origin": URL}, address="203.0.113.9").status_code == 303
+    assert daemon.post("/stop", headers={"Origin": "http://elsewhere.example"}).status_code == 403
+    enter(daemon, "viewer")
+    assert daemon.post("/stop", headers={"Origin": URL}, address="203.0.113.9").status_code == 200
+
+
+def test_accepting_asks_for_the_name_and_mistakes_are_pages(daemon: Asked, commissioned: Path) -> None:
+    enter(daemon, "operator")
+    sent = f"run={commissioned.name}&note=again"
+    answer = daemon.post(f"/arms/{ARM}/accept", content=f"{sent}&name=planar2", headers=FORM)
+    assert (answer.status_code, complaints(answer.text)) == (400, [])
+    assert len(daemon.get(f"/api/v1/arms/{ARM}/acceptances").json()) == 1
+    answer = daemon.post(f"/arms/{ARM}/accept", content=f"{sent}&name={ARM}", headers=FORM)
+    assert answer.status_code == 303
+    assert len(daemon.get(f"/api/v1/arms/{ARM}/acceptances").json()) == 2
+    for address in ("/arms/nobody", "/jobs/none", "/runs/none", "/runs/..%2f..", "/static/x/page.js", "/exports/j1/x"):
+        answer = daemon.get(address)
+        assert answer.status_code in (404, 422), address
+        if "Not Found" not in answer.text[:40]:
+            assert "<script>" not in answer.text
+    for body in (b"\xff=\xff", b"&".join(b"a%d=b" % k for k in range(100))):
+        answer = daemon.post("/new", content=body, headers=FORM)
+        assert answer.status_code in (400, 422)
+        assert complaints(answer.text) == []
+    answer = daemon.post("/new", content="description=%3Cscript%3E", headers=FORM)
+    assert answer.status_code == 422
+    assert "<script>" not in answer.text
+
+
+def test_two_runs_are_compared(daemon: Asked, commissioned: Path, tmp_path: Path) -> None:
+    second = tmp_path / "second-run"
+    shutil.copytree(commissioned, second)
+    import_run(daemon.service.db, daemon.service.state, second, "test")
+    enter(daemon, "viewer")
+    answer = daemon.get(f"/compare?reference={commissioned.name}&other=second-run")
+    assert answer.status_code == 200
+    assert "unchanged" in answer.text
+    assert str(daemon.service.state) not in answer.text
+    assert daemon.get(f"/compare?reference={commissioned.name}&other={commissioned.name}").status_code == 400
+
+
+def test_scripts_and_styles_are_ours_and_kept(daemon: Asked) -> None:
+    for name in STATIC:
+        answer = daemon.get(f"/static/{mark()}/{name}")
+        assert (answer.status_code, answer.content) == (200, static()[name])
+        assert "immutable" in answer.headers["cache-control"]
+    for content in static().values():
+        assert not re.search(rb"https?://(?!www\.w3\.org/2000/svg)", content)
+        assert b"innerHTML" not in content
