@@ -30,6 +30,7 @@ from ident_service.results.summary import parameter_table, summary
 PARAMETERS, URDF, REPORT, MANIFEST = "parameters.json", "identified.urdf", "report.txt", "manifest.json"
 ARM = "arm.json"
 _MAX_BYTES = 64 * 2**20
+_REMEDY = "identify again, or copy the folder again"
 
 
 @dataclass(frozen=True)
@@ -80,19 +81,23 @@ def _verified(folder: Path) -> Mapping[str, str]:
         raise ParameterError(f"{path}: larger than {_MAX_BYTES} bytes")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        kind, files = content["format"], content["files"]
-        known = kind == "ident-run" and all(
-            isinstance(value, str) and Path(name).name == name for name, value in files.items()
-        )
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ParameterError(f"{path}: not a manifest: {error}") from None
-    if not known:
-        raise ParameterError(f"{path}: not the manifest of a run")
+        kind, files = content["format"], dict(content["files"].items())
+    except KeyError as error:
+        raise ParameterError(f"{path}: not a manifest: it has no {error}; {_REMEDY}") from None
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise ParameterError(f"{path}: not a manifest: {error}; {_REMEDY}") from None
+    if kind != "ident-run":
+        raise ParameterError(f"{path}: not the manifest of a run: its format is {kind!r:.60}, not 'ident-run'")
+    for name, wanted in files.items():
+        if Path(name).name != name:
+            raise ParameterError(f"{path}: not the manifest of a run: {name!r:.60} is no name of a file; {_REMEDY}")
+        if not isinstance(wanted, str):
+            raise ParameterError(f"{path}: not the manifest of a run: the hash of {name!r:.60} is no text; {_REMEDY}")
     for name, wanted in files.items():
         if not (folder / name).is_file():
-            raise ParameterError(f"{folder / name}: named by the manifest, but not there")
+            raise ParameterError(f"{folder / name}: named by the manifest, but not there; {_REMEDY}")
         if _sha256(folder / name) != wanted:
-            raise ParameterError(f"{folder / name}: not what the manifest names; it was changed, or is torn")
+            raise ParameterError(f"{folder / name}: not what the manifest names; it was changed, or is torn; {_REMEDY}")
     return dict(files)
 
 

@@ -15,7 +15,10 @@ from report.conftest import Made, made
 from report.pages import Node, parsed, sections
 from results.svg import Svg
 
+from ident_service.config.recording import RecordingFormat
 from ident_service.config.simulation import SimulatedDriver
+from ident_service.results.drawing import Axes, Canvas
+from ident_service.results.drawing_chart import draw_frame, range_around
 from ident_service.results.report.figures import figures
 from ident_service.results.report.page import report_html
 
@@ -159,6 +162,37 @@ def test_without_friction_or_spectra_that_is_said(good: Made) -> None:
     }
     assert "No recording is long enough for a spectrum." in found["residual"]
     assert "The arm's model has no friction" in found["friction"]
+
+
+def test_uneven_stamps_are_told_in_shares_of_a_period(good: Made) -> None:
+    first, *others = good.evidence.timing
+    worst = 0.35 / first.rate
+    uneven = replace(first, largest=worst, edges=np.linspace(0.0, worst, len(first.edges)))
+    evidence = replace(good.evidence, timing=(uneven, *others))
+    quality = [{"recording": first.recording, "jitter_seconds": {"standard_deviation": 0.0086 / first.rate}}]
+    parameters = replace(good.parameters, content=good.parameters.content | {"recording_quality": quality})
+    arrival = good.config.model_copy(update={"recording": RecordingFormat(stamps="arrival")})
+    for config in (arrival, good.config):
+        found = sections(report_html(evidence, parameters, config, {}))
+        words = found["timing"].words
+        assert "1.4 ms off (35 % of a period); their standard deviation is 0.86 % of a period." in words
+        assert "its standard deviation within 5 % of the period (4 ms), beyond which the warnings name it" in words
+        assert "within a few percent" not in words
+        assert ("takes stamps for times of arrival" in words) is (config is arrival)
+        assert "how far off single steps are stands under Timing" in found["warnings"].words
+
+
+@pytest.mark.parametrize("size", [1e-3, 0.7, 4.1, 9.0, 39.0, 41.0, 1234.5])
+@pytest.mark.parametrize("height", [74.0, 150.0, 200.0])
+def test_an_axis_around_zero_has_three_numbers_or_more(size: float, height: float) -> None:
+    canvas = Canvas(500.0, 300.0)
+    low, high = range_around(np.array([-size, 0.97 * size]))
+    draw_frame(canvas, Axes(60.0, 20.0, 400.0, height, 0.0, 1.0, low, high), x="", y="torque [N m]")
+    texts = Svg.of(canvas.svg("", "")).all("text", "soft")
+    ticks = [float((text.text or "").replace("\u2212", "-")) for text in texts]
+    assert len(ticks) >= 3
+    assert len(ticks) <= 9
+    assert low < min(ticks) < 0.0 < max(ticks) < high
 
 
 EVIL = "<script>alert(1)</script>\"'&</style>]]>--"
