@@ -115,10 +115,14 @@ def test_an_ellipsoid_larger_than_the_picture_is_named_and_not_drawn(good: Made)
         kept = tuple(replace(body, axes=own) for body, own in axes)
         return body_figures(replace(good.evidence, posed=replace(posed_, bodies=kept)))
 
+    for figure in drawn(0.0005 * np.eye(3)):
+        assert "Too small to be seen (shorter than 0.0" in figure.caption
+        assert f"the ellipsoid of {joint}." in figure.caption
     for fitting, figure in zip(drawn(small), drawn(flat), strict=True):
         outlines = svg_of(fitting).points("polygon", "body")
         assert len(outlines) == 2
         assert "not drawn" not in fitting.caption
+        assert "Too small" not in fitting.caption
         (kept,) = svg_of(figure).points("polygon", "body")
         np.testing.assert_array_equal(kept, outlines[1])
         assert f"and not drawn: the ellipsoid of {joint} (3600 m). It is one body of many" in figure.caption

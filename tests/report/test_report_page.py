@@ -176,7 +176,7 @@ def test_uneven_stamps_are_told_in_shares_of_a_period(good: Made) -> None:
         found = sections(report_html(evidence, parameters, config, {}))
         words = found["timing"].words
         assert "1.4 ms off (35 % of a period); their standard deviation is 0.86 % of a period." in words
-        assert "its standard deviation within 5 % of the period (4 ms), beyond which the warnings name it" in words
+        assert "within 5 % (standard deviation; beyond, the warnings name it) of the period (4 ms)" in words
         assert "within a few percent" not in words
         assert ("takes stamps for times of arrival" in words) is (config is arrival)
         assert "how far off single steps are stands under Timing" in found["warnings"].words

@@ -134,10 +134,9 @@ def test_unidentified_parameters_come_with_the_least_sure_first(good: Made) -> N
 
 def test_the_comparison_says_which_rows_it_is_of(good: Made) -> None:
     evidence = own(good, identification=2.67, validation=(4.61,), moving=0.73, moving_validation=(0.84,))
-    assert (
-        "away from standstill it predicts other motions about as well as its own (of all rows 1.7 times the error)."
-        in said(good, evidence)
-    )
+    words = said(good, evidence)
+    assert "away from standstill it predicts other motions about as well as its own" in words
+    assert "its own (over all rows, 1.7 times its own error)." in words
 
 
 def test_an_infeasible_estimate(bare: Made) -> None:

@@ -14,6 +14,7 @@ _VIEWS = (("side", (0, 2)), ("above", (0, 1)))
 _AROUND = 0.35  # how much is shown around the arm, as a share of its extent
 _OUTLINE = 72  # corners of an ellipse
 _NAMES = "xyz"
+_SMALLEST = 0.01  # share of the picture below which nothing is seen beside the dot of the centre
 _GOOD = (
     "Each ellipsoid has the mass, centre and inertia of a link. Good: ellipsoids as large as the links they lie on. "
     "Bad: flat, huge or far from their link, which means that the motion says little of how the mass is spread."
@@ -126,6 +127,9 @@ def _words(joints: tuple[str, ...], posed: Posed, outside: list[bool], longest: 
             f" Longer than the picture ({number(longest)} m) and not drawn: the ellipsoid of {', '.join(large)}. "
             "It is one body of many that move alike; --prior draws the choice to bodies that are known."
         )
+    tiny = _SMALLEST * longest
+    if small := [name for name, size in zip(joints, lengths, strict=True) if 0.0 < size < tiny]:
+        words += f" Too small to be seen (shorter than {number(tiny)} m): the ellipsoid of {', '.join(small)}."
     if far := [name for name, away in zip(joints, outside, strict=True) if away]:
         words += f" The centre of {', '.join(far)} lies outside of the picture."
     return words

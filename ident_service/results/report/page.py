@@ -116,9 +116,9 @@ _TITLES = {
 def _sections(
     evidence: Evidence, parameters: ParameterFile, drawn: Figures, config: ArmConfig, sha256: Mapping[str, str]
 ) -> Iterable[str]:
-    simulated = isinstance(config.driver, SimulatedDriver)
+    *found, steps = verdict(evidence, parameters, simulated=isinstance(config.driver, SimulatedDriver))
     content = {
-        "verdict": [paragraph(" ".join(verdict(evidence, parameters, simulated=simulated)), "verdict")],
+        "verdict": [paragraph(" ".join(found), "verdict"), paragraph(steps, "verdict")],
         "warnings": _warnings(evidence, parameters),
         "parameters": _parameters(evidence, parameters),
         "torque": _torque(evidence, parameters, drawn),

@@ -152,7 +152,7 @@ def friction_table(evidence: Evidence, parameters: ParameterFile) -> str:
         ]
         rows.append([Cell(name), *cells])
     heads = ["joint", *(what for what, *_ in shown)]
-    return table("Shape of the friction that the curves below have, found from the recordings or given", heads, rows)
+    return table("Shape of the friction beside its parameters, found from the recordings or given", heads, rows)
 
 
 def axis_table(evidence: Evidence) -> str:

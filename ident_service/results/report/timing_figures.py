@@ -36,14 +36,16 @@ def _figure(place: int, timing: Timing, deviation: float | None) -> Figure:
             x, right, y = float(axes.x(scale * begin)), float(axes.x(scale * end)), float(axes.y(log))
             canvas.rectangle("good", x + 0.5, y, max(right - x - 1.0, 1.0), bottom - y)
     words = timing_words(timing, deviation)
+    within = "a few percent"
+    if not late:
+        within = f"{100 * MUCH_JITTER:g} % (standard deviation; beyond, the warnings name it)"
     return Figure(
         slug=f"timing-{place}",
         title=f"Timing of {timing.recording}",
         description=words,
         caption=(
-            f"{words} Good: one narrow heap at the left, its standard deviation within {100 * MUCH_JITTER:g} % of the "
-            f"period ({number(scale / timing.rate)} {unit}), beyond which the warnings name it. Bad: a tail as long as "
-            "the period, or a second heap."
+            f"{words} Good: one narrow heap at the left, within {within} of the period "
+            f"({number(scale / timing.rate)} {unit}). Bad: a tail as long as the period, or a second heap."
         ),
         canvas=canvas,
     )

@@ -85,7 +85,7 @@ def _prediction(evidence: Evidence) -> str:
     if own.moving is None or own.identification is None:
         return f"{words}."
     times = max(own.validation) / max(own.identification, 1e-12)
-    return f"{words}{f' (of all rows {number(times, 2)} times the error)' if times > _MUCH_WORSE else ''}."
+    return f"{words}{f' (over all rows, {number(times, 2)} times its own error)' if times > _MUCH_WORSE else ''}."
 
 
 def _joints(evidence: Evidence, parameters: ParameterFile) -> list[str]:
@@ -103,8 +103,8 @@ def _joints(evidence: Evidence, parameters: ParameterFile) -> list[str]:
         )
     if still := [one for one in poor if not one.in_motion]:
         sentences.append(
-            f"Near standstill, where friction has no known size, it exceeds {POOR:g} % of the joint's own torque at "
-            f"{joints_in_words(still)}."
+            f"Near standstill, where friction has no known size, the error exceeds {POOR:g} % of the joint's own torque "
+            f"at {joints_in_words(still)}."
         )
     return sentences
 
