@@ -103,8 +103,8 @@ def _joints(evidence: Evidence, parameters: ParameterFile) -> list[str]:
         )
     if still := [one for one in poor if not one.in_motion]:
         sentences.append(
-            f"Near standstill, where friction has no known size, the error exceeds {POOR:g} % of the joint's own torque "
-            f"at {joints_in_words(still)}."
+            "Over all rows, with those near standstill where friction has no known size, the error exceeds "
+            f"{POOR:g} % of the joint's own torque at {joints_in_words(still)}."
         )
     return sentences
 
