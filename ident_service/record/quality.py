@@ -25,7 +25,7 @@ SATURATED: Final = 0.999  # of the limit
 PLATEAU: Final = 5  # samples exactly at the extreme value in a row look like a limit where none is known
 STANDSTILL: Final = 0.005  # [rad/s or m/s]
 STANDSTILL_OVER: Final = 0.02  # [s]
-_MUCH_JITTER: Final = 0.05  # of a period, standard deviation
+MUCH_JITTER: Final = 0.05  # of a period, standard deviation
 _MUCH_SATURATION: Final = 0.001
 _MUCH_STANDSTILL: Final = 0.5
 _LEAST_STEP: Final = 1e-12  # below is the rounding of numbers of the size of an angle
@@ -103,7 +103,7 @@ class Quality:
             found.append(f"{count}, the longest {self.longest_gap_s:.4g} s, {after:.4g} s after the first sample")
         if self.repeats:
             found.append(f"{self.repeats} samples repeat the one before; they are left out")
-        if self.jitter_std_s * self.rate_hz > _MUCH_JITTER:
+        if self.jitter_std_s * self.rate_hz > MUCH_JITTER:
             found.append(
                 f"stamps jitter by {self.jitter_std_s * 1e3:.3g} ms, "
                 f"{100.0 * self.jitter_std_s * self.rate_hz:.3g} % of a period"

@@ -13,6 +13,7 @@ from ident_service.results.drawing import Array, Axes, Canvas, number, round_val
 
 FONT = 12.0
 _LINE = 15.0
+_FEWEST, _MOST = 3, 6  # round numbers along an axis
 
 
 def range_around(*values: Array, least: float = 0.0, zero: bool = False, share: float = 0.06) -> tuple[float, float]:
@@ -87,7 +88,12 @@ def draw_key(canvas: Canvas, right: float, y: float, entries: Sequence[tuple[str
 def _ticks(low: float, high: float, log: bool, most: int) -> list[tuple[float, str]]:
     low, high = min(low, high), max(low, high)
     if not log:
-        return [(value, number(value, 6)) for value in round_values(low, high, most)]
+        values = round_values(low, high, most)
+        # Around zero the round step for a few values can be larger than the range on either side of it.
+        while len(values) < _FEWEST and most < 2 * _MOST:
+            most += 1
+            values = round_values(low, high, most)
+        return [(value, number(value, 6)) for value in values]
     step = max(1, int(np.ceil((high - low) / most)))
     first = int(np.ceil(low / step - 1e-9)) * step
     found = [(float(power), _power(power)) for power in range(first, int(np.floor(high + 1e-9)) + 1, step)]

@@ -14,8 +14,7 @@ from ident_service.errors import UsageError
 from ident_service.results.drawing import Canvas
 from ident_service.results.files import appearing_folder
 from ident_service.results.report.figures import figures
-from ident_service.results.report_files import read_evidence_of
-from ident_service.results.run_folder import read_results
+from ident_service.results.report_files import read_evidence_of, read_reported
 
 _SCALE = 3.0  # pixels of a PNG per pixel of the drawing; 560 become 1680, 300 dpi at 14 cm
 _FONTS = ("DejaVu Sans", "Liberation Sans", "Noto Sans", "Arial", "Helvetica")
@@ -37,7 +36,7 @@ def write_figures(run: Path, out: Path, form: Literal["svg", "png"]) -> list[str
         ParameterError, ConfigError: the folder is not what its manifest names.
     """
     rendered = _png() if form == "png" else str.encode
-    results = read_results(run)
+    results = read_reported(run)
     if out.exists() and out.samefile(run):
         raise UsageError(f"{out}: holds the results; give another folder")
     drawn = figures(read_evidence_of(results), results.parameters).all()

@@ -36,16 +36,19 @@ def named_files(folder: Path) -> Mapping[str, str]:
         raise ParameterError(f"{path}: larger than {_MAX_BYTES} bytes")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        kind, files = content["format"], content["files"]
-        known = kind == "ident-run" and all(
-            isinstance(value, str) and Path(name).name == name and name not in (".", "..", MANIFEST)
-            for name, value in files.items()
-        )
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ParameterError(f"{path}: not a manifest: {error}") from None
-    if not known:
-        raise ParameterError(f"{path}: not the manifest of a run")
-    return dict(files)
+        kind, files = content["format"], dict(content["files"].items())
+    except KeyError as error:
+        raise ParameterError(f"{path}: not a manifest: it has no {error}; {_REMEDY}") from None
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise ParameterError(f"{path}: not a manifest: {error}; {_REMEDY}") from None
+    if kind != "ident-run":
+        raise ParameterError(f"{path}: not the manifest of a run: its format is {kind!r:.60}, not 'ident-run'")
+    for name, wanted in files.items():
+        if Path(name).name != name or name in (".", "..", MANIFEST):
+            raise ParameterError(f"{path}: not the manifest of a run: {name!r:.60} is no name of a file; {_REMEDY}")
+        if not isinstance(wanted, str):
+            raise ParameterError(f"{path}: not the manifest of a run: the hash of {name!r:.60} is no text; {_REMEDY}")
+    return files
 
 
 def verified_files(folder: Path, *, but: frozenset[str] = frozenset()) -> Mapping[str, str]:
@@ -66,9 +69,9 @@ def verified_files(folder: Path, *, but: frozenset[str] = frozenset()) -> Mappin
         if not path.is_file():
             if name in but and not path.exists():
                 continue
-            raise ParameterError(f"{path}: named by the manifest, but not there")
+            raise ParameterError(f"{path}: named by the manifest, but not there; {_REMEDY}")
         if file_sha256(path) != wanted:
-            raise ParameterError(f"{path}: not what the manifest names; it was changed, or is torn")
+            raise ParameterError(f"{path}: not what the manifest names; it was changed, or is torn; {_REMEDY}")
     return files
 
 

@@ -19,6 +19,7 @@ from ident_service.results.report.page import report_html
 from ident_service.results.run_folder import PARAMETERS, Results, read_results
 
 REPORT_PAGE = "report.html"
+_PAYLOAD, _COMPARISON = "payload.json", "comparison.html"
 
 
 def write_report(
@@ -51,6 +52,21 @@ def write_report(
     page = report_html(read_evidence(folder / EVIDENCE), parameters, estimate.model.config, _others(hashes(folder)))
     write_atomically(folder / REPORT_PAGE, page)
     return [EVIDENCE, REPORT_PAGE]
+
+
+def read_reported(folder: Path) -> Results:
+    """Read a folder that a report can be made of.
+
+    Raises:
+        UsageError: it is a file, or holds a payload, which has no report.
+        UsageError, ParameterError, ConfigError: it is not what its manifest names.
+    """
+    if folder.is_file():
+        raise UsageError(f"{folder}: is a file; give its folder")
+    if (folder / _PAYLOAD).is_file() and not (folder / EVIDENCE).is_file():
+        found = f"{_COMPARISON} shows it" if (folder / _COMPARISON).is_file() else "payload.txt tells of it"
+        raise UsageError(f"{folder}: holds a payload, which has no report; {found}")
+    return read_results(folder)
 
 
 def read_evidence_of(results: Results) -> Evidence:
@@ -86,9 +102,11 @@ def make_report(folder: Path, out: Path | None = None) -> Path:
     Raises:
         UsageError, ParameterError, ConfigError: the folder is not what its manifest names, or has no evidence.
     """
-    results = read_results(folder)
+    results = read_reported(folder)
     if out is not None and out.is_dir():
         raise UsageError(f"{out}: is a folder; give the name of a file")
+    if out is not None and not out.parent.is_dir():
+        raise UsageError(f"{out}: there is no folder {out.parent}; make it first, or give another place")
     if out is not None and out.name in {*results.sha256, MANIFEST} - {REPORT_PAGE} and out.parent.samefile(folder):
         raise UsageError(f"{out}: is one of the results; give another name")
     page = report_html(read_evidence_of(results), results.parameters, results.config, _others(results.sha256))

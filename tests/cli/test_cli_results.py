@@ -58,6 +58,27 @@ def test_a_folder_without_evidence_says_what_to_do(folder: Path, ident: Ident) -
     assert not (folder.parent / "figures").exists()
 
 
+def test_what_is_no_folder_of_an_identification_says_what_it_is(folder: Path, ident: Ident, tmp_path: Path) -> None:
+    for verb in (("report",), ("figures", "--out", tmp_path / "figures")):
+        ended = ident(*verb, folder / "parameters.json")
+        assert (ended.code, ended.err) == (2, f"ident: {folder / 'parameters.json'}: is a file; give its folder\n")
+    page = tmp_path / "nowhere" / "page.html"
+    ended = ident("report", folder, "--out", page)
+    assert ended.code == 2
+    assert f"{page}: there is no folder {page.parent}; make it first" in ended.err
+    # What `ident payload` leaves: no evidence, and a comparison where the bare arm was known.
+    (folder / "evidence.json").unlink()
+    (folder / "payload.json").write_text("{}")
+    (folder / "comparison.html").write_text("")
+    write_manifest(folder)
+    for verb in (("report",), ("figures", "--out", tmp_path / "figures")):
+        ended = ident(*verb, folder)
+        assert ended.code == 2
+        assert ended.err == f"ident: {folder}: holds a payload, which has no report; comparison.html shows it\n"
+    (folder / "comparison.html").unlink()
+    assert "payload.txt tells of it" in ident("report", folder).err
+
+
 def test_a_changed_file_is_refused(folder: Path, ident: Ident) -> None:
     path = folder / "evidence.json"
     path.write_bytes(path.read_bytes()[:-100])

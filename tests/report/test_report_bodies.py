@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from helpers.random_arms import random_body, random_rotation
 from report.conftest import Made
+from results.svg import Svg
 
 from ident_service.model.kinematics import frame_origins, link_poses
 from ident_service.results.evidence.bodies import bounds_of, ellipsoid, posed
-from ident_service.results.report.body_figures import ellipse
+from ident_service.results.report.body_figures import body_figures, ellipse
+from ident_service.results.report.figure import Figure
 
 
 def inertial_of(mass: float, center: np.ndarray, about_center: np.ndarray) -> np.ndarray:
@@ -100,6 +102,35 @@ def test_a_bound_belongs_to_the_parameter_that_presses_against_it(good: Made) ->
     for names, expression in zip(bounds, estimate.base.expressions, strict=True):
         first = estimate.base.names[estimate.base.base[list(estimate.base.expressions).index(expression)]]
         assert names == ((name,) if first.endswith("2") and not first.startswith(("I", "f")) else ())
+
+
+def test_an_ellipsoid_larger_than_the_picture_is_named_and_not_drawn(good: Made) -> None:
+    posed_ = good.evidence.posed
+    assert posed_ is not None
+    joint, bodies = good.evidence.joints[0], posed_.bodies
+    small, flat = 0.05 * np.eye(3), np.diag([2.0, 2.0, 1800.0])
+
+    def drawn(first: np.ndarray) -> list[Figure]:
+        axes = zip(bodies, (first, small), strict=True)
+        kept = tuple(replace(body, axes=own) for body, own in axes)
+        return body_figures(replace(good.evidence, posed=replace(posed_, bodies=kept)))
+
+    for figure in drawn(0.0005 * np.eye(3)):
+        assert "Too small to be seen (shorter than 0.0" in figure.caption
+        assert f"the ellipsoid of {joint}." in figure.caption
+    for fitting, figure in zip(drawn(small), drawn(flat), strict=True):
+        outlines = svg_of(fitting).points("polygon", "body")
+        assert len(outlines) == 2
+        assert "not drawn" not in fitting.caption
+        assert "Too small" not in fitting.caption
+        (kept,) = svg_of(figure).points("polygon", "body")
+        np.testing.assert_array_equal(kept, outlines[1])
+        assert f"and not drawn: the ellipsoid of {joint} (3600 m). It is one body of many" in figure.caption
+        assert "--prior" in figure.description
+
+
+def svg_of(figure: Figure) -> Svg:
+    return Svg.of(figure.svg())
 
 
 def test_friction_points_are_the_friction_that_was_put_in(good: Made) -> None:

@@ -15,6 +15,10 @@ from report.conftest import Made, made
 from report.pages import Node, parsed, sections
 from results.svg import Svg
 
+from ident_service.config.recording import RecordingFormat
+from ident_service.config.simulation import SimulatedDriver
+from ident_service.results.drawing import Axes, Canvas
+from ident_service.results.drawing_chart import draw_frame, range_around
 from ident_service.results.report.figures import figures
 from ident_service.results.report.page import report_html
 
@@ -87,25 +91,49 @@ def test_nothing_leaves_the_page(good: Made) -> None:
     assert "unsafe-eval" not in policy
 
 
-def test_the_parameter_table_is_the_parameter_file(good: Made) -> None:
-    table = sections(good.page)["parameters"].one("table")
-    heads = [head.words for head in table.one("thead").all("th")]
-    content = json.loads((good.folder / "parameters.json").read_text())["base_parameters"]
+def parameter_columns(page: str) -> tuple[list[str], list[list[Node]]]:
+    """Heads and rows of the parameter table."""
+    table = sections(page)["parameters"].one("table")
     rows = [[cell for cell in row.children if isinstance(cell, Node)] for row in table.one("tbody").all("tr")]
+    return [head.words for head in table.one("thead").all("th")], rows
 
-    def column(name: str) -> list[float]:
-        return [float(row[heads.index(name)].one("data").attributes["value"]) for row in rows]
 
+def numbers(heads: list[str], rows: list[list[Node]], name: str) -> list[float]:
+    return [float(row[heads.index(name)].one("data").attributes["value"]) for row in rows]
+
+
+def test_the_parameter_table_is_the_parameter_file(good: Made) -> None:
+    heads, rows = parameter_columns(good.page)
+    content = json.loads((good.folder / "parameters.json").read_text())["base_parameters"]
     assert [row[1].words for row in rows] == content["expressions"]
-    assert column("FBPE-OLS pseudo_inertia") == content["values"]
-    assert column("\u03c3") == content["standard_deviations"]
+    assert numbers(heads, rows, "FBPE-OLS pseudo_inertia (chosen)") == content["values"]
+    assert numbers(heads, rows, "\u03c3") == content["standard_deviations"]
     assert [row[heads.index("verdict")].words for row in rows] == content["verdicts"]
-    np.testing.assert_array_equal(column("OLS"), good.estimate.candidates[0].beta)
-    np.testing.assert_allclose(column("CAD"), good.estimate.base.K @ (1.1 * good.delta), rtol=1e-12)
+    np.testing.assert_array_equal(numbers(heads, rows, "OLS"), good.estimate.candidates[0].beta)
+    np.testing.assert_allclose(numbers(heads, rows, "CAD"), good.estimate.base.K @ (1.1 * good.delta), rtol=1e-12)
     for row in rows:
         cell = row[heads.index("OLS")]
         value = float(cell.one("data").attributes["value"])
         assert float(cell.words.replace("\u2212", "-")) == pytest.approx(value, rel=1e-4)
+
+
+def test_the_chosen_estimate_is_marked_where_no_set_holds_it(bare: Made) -> None:
+    heads, rows = parameter_columns(bare.page)
+    content = json.loads((bare.folder / "parameters.json").read_text())["base_parameters"]
+    assert heads[3:8] == ["OLS (chosen)", "\u03c3", "verdict", "CAD", "FBPE-OLS pseudo_inertia"]
+    assert numbers(heads, rows, "OLS (chosen)") == content["values"]
+    constrained = bare.evidence.estimates[bare.evidence.constrained]
+    assert numbers(heads, rows, "FBPE-OLS pseudo_inertia") == constrained.values.tolist()
+    # Torques that no body has: the two differ, so that one cannot pass for the other.
+    assert np.abs(constrained.values - content["values"]).max() > 1e-2
+    assert [row[heads.index("CAD")].words for row in rows] == ["\u2014"] * len(rows)
+
+
+def test_the_rule_of_the_verdicts_stands_at_the_table(good: Made) -> None:
+    words = sections(good.page)["parameters"].words
+    assert "below 10 % of the larger of the parameter's size and the reference of its unit" in words
+    assert "0.01 for kg m^2 and kg m, 0.1 for kg, N m s/rad, N m, N s/m and N" in words
+    assert "\u03c3 is that of the unconstrained fit" in words
 
 
 def test_a_bound_stands_where_it_binds(good: Made) -> None:
@@ -134,6 +162,37 @@ def test_without_friction_or_spectra_that_is_said(good: Made) -> None:
     }
     assert "No recording is long enough for a spectrum." in found["residual"]
     assert "The arm's model has no friction" in found["friction"]
+
+
+def test_uneven_stamps_are_told_in_shares_of_a_period(good: Made) -> None:
+    first, *others = good.evidence.timing
+    worst = 0.35 / first.rate
+    uneven = replace(first, largest=worst, edges=np.linspace(0.0, worst, len(first.edges)))
+    evidence = replace(good.evidence, timing=(uneven, *others))
+    quality = [{"recording": first.recording, "jitter_seconds": {"standard_deviation": 0.0086 / first.rate}}]
+    parameters = replace(good.parameters, content=good.parameters.content | {"recording_quality": quality})
+    arrival = good.config.model_copy(update={"recording": RecordingFormat(stamps="arrival")})
+    for config in (arrival, good.config):
+        found = sections(report_html(evidence, parameters, config, {}))
+        words = found["timing"].words
+        assert "1.4 ms off (35 % of a period); their standard deviation is 0.86 % of a period." in words
+        assert "within 5 % (standard deviation; beyond, the warnings name it) of the period (4 ms)" in words
+        assert "within a few percent" not in words
+        assert ("takes stamps for times of arrival" in words) is (config is arrival)
+        assert "how far off single steps are stands under Timing" in found["warnings"].words
+
+
+@pytest.mark.parametrize("size", [1e-3, 0.7, 4.1, 9.0, 39.0, 41.0, 1234.5])
+@pytest.mark.parametrize("height", [74.0, 150.0, 200.0])
+def test_an_axis_around_zero_has_three_numbers_or_more(size: float, height: float) -> None:
+    canvas = Canvas(500.0, 300.0)
+    low, high = range_around(np.array([-size, 0.97 * size]))
+    draw_frame(canvas, Axes(60.0, 20.0, 400.0, height, 0.0, 1.0, low, high), x="", y="torque [N m]")
+    texts = Svg.of(canvas.svg("", "")).all("text", "soft")
+    ticks = [float((text.text or "").replace("\u2212", "-")) for text in texts]
+    assert len(ticks) >= 3
+    assert len(ticks) <= 9
+    assert low < min(ticks) < 0.0 < max(ticks) < high
 
 
 EVIL = "<script>alert(1)</script>\"'&</style>]]>--"
@@ -213,7 +272,47 @@ def test_warnings_are_listed(tmp_path: Path) -> None:
     one = made(tmp_path / "results", warnings=("motion_1.csv: stamps jitter", "motion_1.csv: torn"))
     found = sections(one.page)
     assert [item.words for item in found["warnings"].all("li")] == list(one.evidence.warnings)
-    assert "mend what the warnings name" in found["verdict"].words
+    assert "None: no joint is off by more than 15 % of its own torque" in found["warnings"].words
+    assert "mend what the recordings' warnings name" in found["verdict"].words
+
+
+def test_warnings_name_what_stands_against_the_estimate(good: Made) -> None:
+    content = json.loads(json.dumps(good.parameters.content))
+    content["base_parameters"]["verdicts"] = ["unidentified", *["identified"] * (good.estimate.base.size - 1)]
+    content["fit"]["condition_number"] = 2500.0
+    content["validation"][0]["per_joint"][1]["relative_error_percent"] = 84.7
+    page = report_html(good.evidence, replace(good.parameters, content=content), good.config, {})
+    found = sections(page)["warnings"]
+    size, name = good.estimate.base.size, good.evidence.joints[1]
+    assert "None: gaps, saturation and standstill" in found.words
+    said = [item.words for item in found.all("li")]
+    assert said[0].startswith(f"Off by more than 15 % of their own torque, near standstill only: {name} (84.7 %; ")
+    assert said[1:] == [
+        f"1 of {size} base parameters are unidentified: these recordings do not tell them.",
+        "The regressor's condition number is 2500, above 1000: some sums of parameters hardly show.",
+    ]
+
+
+def test_a_simulated_arm_cannot_pass_for_a_real_one(good: Made) -> None:
+    simulated = good.config.model_copy(update={"driver": SimulatedDriver(kind="simulated")})
+    for config, told in ((simulated, True), (good.config, False)):
+        page = report_html(good.evidence, good.parameters, config, {})
+        for part in (parsed(page).one("header"), sections(page)["verdict"]):
+            assert ("not a commissioning of a real arm" in part.words) is told
+
+
+def test_the_friction_s_shape_is_in_its_section(good: Made) -> None:
+    content = json.loads(json.dumps(good.parameters.content))
+    content["friction"] = {"presliding": [0.0125, 0.0], "stribeck_velocity": [0.25, 0.031]}
+    table = sections(report_html(good.evidence, replace(good.parameters, content=content), good.config, {}))["friction"]
+    rows = [[child.words for child in row.children if isinstance(child, Node)] for row in table.all("tr")]
+    assert rows == [
+        ["joint", "pre-sliding way", "Stribeck velocity"],
+        ["joint_0", "0.0125 rad", "0.25 rad/s"],
+        ["joint_1", "0 rad", "0.031 rad/s"],
+    ]
+    # A model with neither has no table.
+    assert not sections(good.page)["friction"].all("table")
 
 
 def test_the_page_is_small(good: Made) -> None:

@@ -154,19 +154,28 @@ def test_a_folder_that_was_torn_or_changed_is_refused(folder: Path) -> None:
     with pytest.raises(ParameterError, match=r"identified\.urdf: not what the manifest names; it was changed, or is"):
         read_results(folder)
     (folder / "identified.urdf").unlink()
-    with pytest.raises(ParameterError, match=r"identified\.urdf: named by the manifest, but not there"):
+    with pytest.raises(
+        ParameterError, match=r"identified\.urdf: named by the manifest, but not there; identify again, or copy the"
+    ):
         read_results(folder)
 
 
 @pytest.mark.parametrize(
     ("manifest", "reason"),
     [
-        ("{", "not a manifest"),
+        ("{", "not a manifest: .*; identify again, or copy the folder again"),
         ("[]", "not a manifest"),
         ('{"format": "ident-run", "files": []}', "not a manifest"),
-        ('{"format": "other", "files": {}}', "not the manifest of a run"),
-        ('{"format": "ident-run", "files": {"../parameters.json": ""}}', "not the manifest of a run"),
-        ('{"format": "ident-run", "files": {"parameters.json": 3}}', "not the manifest of a run"),
+        ('{"format": "ident-run"}', "not a manifest: it has no 'files'; identify again, or copy"),
+        ('{"format": "other", "files": {}}', "not the manifest of a run: its format is 'other', not 'ident-run'"),
+        (
+            '{"format": "ident-run", "files": {"../parameters.json": ""}}',
+            r"'\.\./parameters\.json' is no name of a file",
+        ),
+        (
+            '{"format": "ident-run", "files": {"parameters.json": 3}}',
+            r"the hash of 'parameters\.json' is no text; ident",
+        ),
         ("[" * 100_000, "not a manifest"),
     ],
 )

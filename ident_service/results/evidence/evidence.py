@@ -29,6 +29,8 @@ class Estimated:
         validation: likewise on every recording that was never fitted to.
         moving: as `identification`, without rows of joints near standstill, whose friction nobody knows.
         moving_validation: likewise on every recording that was never fitted to.
+        moving_joints: as `moving` and `moving_validation`, joint by joint, each in percent of the joint's own torque;
+            one row for what was fitted to, then one per recording that was not; empty where it was not told.
     """
 
     name: str
@@ -38,6 +40,7 @@ class Estimated:
     validation: tuple[float, ...]
     moving: float | None = None
     moving_validation: tuple[float, ...] = ()
+    moving_joints: tuple[tuple[float, ...], ...] = ()
 
 
 @dataclass(frozen=True)

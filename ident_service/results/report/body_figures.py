@@ -14,6 +14,7 @@ _VIEWS = (("side", (0, 2)), ("above", (0, 1)))
 _AROUND = 0.35  # how much is shown around the arm, as a share of its extent
 _OUTLINE = 72  # corners of an ellipse
 _NAMES = "xyz"
+_SMALLEST = 0.01  # share of the picture below which nothing is seen beside the dot of the centre
 _GOOD = (
     "Each ellipsoid has the mass, centre and inertia of a link. Good: ellipsoids as large as the links they lie on. "
     "Bad: flat, huge or far from their link, which means that the motion says little of how the mass is spread."
@@ -56,7 +57,8 @@ def _figure(joints: tuple[str, ...], posed: Posed, name: str, view: tuple[int, i
     _frame(canvas, axes, view)
     draw_key(canvas, WIDTH - RIGHT, 16, [("area", "body", "link's body"), ("dot", "dot", "centre of mass")])
     canvas.clip(axes)
-    outside = [_draw(canvas, axes, view, body) for body in posed.bodies]
+    longest = 2.0 * float(np.hypot(*half))
+    outside = [_draw(canvas, axes, view, body, longest) for body in posed.bodies]
     for branch in posed.branches:
         points = posed.points[list(branch)]
         canvas.polyline("posture step7", axes.x(points[:, i]), axes.y(points[:, j]))
@@ -70,11 +72,12 @@ def _figure(joints: tuple[str, ...], posed: Posed, name: str, view: tuple[int, i
             x, y = float(axes.x(body.center[i])), float(axes.y(body.center[j]))
             canvas.text("ink halo", x + 7, y - 6, joints[link][:20], size=FONT, hint=f"{body.mass:.3g} kg")
     canvas.clip(None)
+    words = _words(joints, posed, outside, longest)
     return Figure(
         slug=f"bodies-{name}",
         title=f"The arm and the ellipsoids of its links, from {'the side' if name == 'side' else name}",
-        description=_words(joints, posed, outside),
-        caption=f"{_words(joints, posed, outside)} {_GOOD}",
+        description=words,
+        caption=f"{words} {_GOOD}",
         canvas=canvas,
     )
 
@@ -98,21 +101,35 @@ def _frame(canvas: Canvas, axes: Axes, view: tuple[int, int]) -> None:
     canvas.text("ink", axes.left, axes.top - 6, up, size=FONT)
 
 
-def _draw(canvas: Canvas, axes: Axes, view: tuple[int, int], body: Body) -> bool:
-    """Draw a body's outline; returns whether its centre lies outside of the view."""
+def _draw(canvas: Canvas, axes: Axes, view: tuple[int, int], body: Body, longest: float) -> bool:
+    """Draw a body's outline unless it is larger than the view; returns whether its centre lies outside of the view."""
     center = body.center[list(view)]
-    if body.axes is not None:
+    if body.axes is not None and _length(body.axes) <= longest:
         outline = center + ellipse(body.axes, view)
         canvas.polygon("body", axes.x(outline[:, 0]), axes.y(outline[:, 1]))
     inside = axes.low_x < center[0] < axes.high_x and axes.low_y < center[1] < axes.high_y
     return not inside
 
 
-def _words(joints: tuple[str, ...], posed: Posed, outside: list[bool]) -> str:
+def _length(axes: Array) -> float:
+    """Of an ellipsoid from end to end [m]."""
+    return 2.0 * float(np.linalg.norm(axes, axis=1).max())
+
+
+def _words(joints: tuple[str, ...], posed: Posed, outside: list[bool], longest: float) -> str:
     masses = ", ".join(f"{name} {number(body.mass)} kg" for name, body in zip(joints, posed.bodies, strict=True))
     words = f"One posture of the recordings. Masses, one feasible choice of many: {masses}."
     if gone := [name for name, body in zip(joints, posed.bodies, strict=True) if body.axes is None]:
         words += f" No mass distribution has the inertia of {', '.join(gone)}; only the centre is drawn."
+    lengths = [0.0 if body.axes is None else _length(body.axes) for body in posed.bodies]
+    if large := [f"{name} ({number(size)} m)" for name, size in zip(joints, lengths, strict=True) if size > longest]:
+        words += (
+            f" Longer than the picture ({number(longest)} m) and not drawn: the ellipsoid of {', '.join(large)}. "
+            "It is one body of many that move alike; --prior draws the choice to bodies that are known."
+        )
+    tiny = _SMALLEST * longest
+    if small := [name for name, size in zip(joints, lengths, strict=True) if 0.0 < size < tiny]:
+        words += f" Too small to be seen (shorter than {number(tiny)} m): the ellipsoid of {', '.join(small)}."
     if far := [name for name, away in zip(joints, outside, strict=True) if away]:
         words += f" The centre of {', '.join(far)} lies outside of the picture."
     return words

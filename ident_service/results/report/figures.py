@@ -50,5 +50,5 @@ def figures(evidence: Evidence, parameters: ParameterFile) -> Figures:
         friction=tuple(friction_figures(evidence)),
         doubt=tuple(figure for figure in doubt if figure is not None),
         bodies=tuple(body_figures(evidence)),
-        timing=tuple(timing_figures(evidence)),
+        timing=tuple(timing_figures(evidence, parameters)),
     )

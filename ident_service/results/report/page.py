@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 
 from ident_service.config.schema import ArmConfig
+from ident_service.config.simulation import SimulatedDriver
+from ident_service.record.quality import MUCH_JITTER
 from ident_service.results.drawing import number, plain
 from ident_service.results.drawing_style import sheet
 from ident_service.results.evidence.evidence import Evidence, Traced
@@ -26,17 +28,31 @@ from ident_service.results.parameter_file import ParameterFile
 from ident_service.results.report.figure import Figure, Zoom
 from ident_service.results.report.figures import Figures, figures
 from ident_service.results.report.markup import contents, items, paragraph, prose, section
+from ident_service.results.report.reservations import POOR, reservations
 from ident_service.results.report.tables import (
     axis_table,
     error_table,
     file_table,
+    friction_table,
     joint_table,
     margin_table,
     parameter_table,
+    verdict_rule,
 )
-from ident_service.results.report.verdict import verdict
+from ident_service.results.report.verdict import SIMULATED, verdict
 
-_NO_WARNING = "None: rate, jitter, gaps, saturation and standstill of the recordings are as they should be."
+_NO_WARNING = (
+    "None: gaps, saturation and standstill are as they should be, and the standard deviation of the steps between "
+    f"stamps is below {100 * MUCH_JITTER:g} % of a period; how far off single steps are stands under Timing."
+)
+_NOTHING_AGAINST = (
+    f"None: no joint is off by more than {POOR:g} % of its own torque, no condition is active and no parameter "
+    "is unidentified."
+)
+_ARRIVAL = (
+    "The arm's description takes stamps for times of arrival: between gaps samples count as evenly spaced, so uneven "
+    "steps of the stamps do not reach the estimate."
+)
 
 
 def report_html(evidence: Evidence, parameters: ParameterFile, config: ArmConfig, sha256: Mapping[str, str]) -> str:
@@ -52,6 +68,7 @@ def report_html(evidence: Evidence, parameters: ParameterFile, config: ArmConfig
         A whole HTML document.
     """
     drawn = figures(evidence, parameters)
+    simulated = isinstance(config.driver, SimulatedDriver)
     script, title = _asset("zoom.js"), f"Identification of {config.name}"
     policy = f"default-src 'none'; style-src 'unsafe-inline'; script-src '{_hash(script)}'; base-uri 'none'"
     head = (
@@ -64,9 +81,10 @@ def report_html(evidence: Evidence, parameters: ParameterFile, config: ArmConfig
     body = "\n".join(
         [
             f"<header><h1>{plain(title)}</h1>{paragraph(_subtitle(parameters, config))}",
+            paragraph(SIMULATED, "simulated") if simulated else "",
             f"{contents(_TITLES.items())}</header>",
             "<main>",
-            *_sections(evidence, parameters, drawn, sha256),
+            *_sections(evidence, parameters, drawn, config, sha256),
             "</main>",
             *(_data(place, one) for place, one in enumerate(evidence.recordings)),
             f"<script>{script}</script>",
@@ -96,27 +114,44 @@ _TITLES = {
 
 
 def _sections(
-    evidence: Evidence, parameters: ParameterFile, drawn: Figures, sha256: Mapping[str, str]
+    evidence: Evidence, parameters: ParameterFile, drawn: Figures, config: ArmConfig, sha256: Mapping[str, str]
 ) -> Iterable[str]:
+    *found, steps = verdict(evidence, parameters, simulated=isinstance(config.driver, SimulatedDriver))
     content = {
-        "verdict": [paragraph(" ".join(verdict(evidence, parameters)), "verdict")],
-        "warnings": [items(evidence.warnings) if evidence.warnings else paragraph(_NO_WARNING)],
+        "verdict": [paragraph(" ".join(found), "verdict"), paragraph(steps, "verdict")],
+        "warnings": _warnings(evidence, parameters),
         "parameters": _parameters(evidence, parameters),
         "torque": _torque(evidence, parameters, drawn),
         "residual": [_grid(drawn.residual, "No recording is long enough for a spectrum.")],
-        "friction": [_grid(drawn.friction, "The arm's model has no friction, so there is no curve to compare with.")],
+        "friction": [
+            friction_table(evidence, parameters),
+            _grid(drawn.friction, "The arm's model has no friction, so there is no curve to compare with."),
+        ],
         "doubt": [_grid(drawn.doubt, "The parameter file has no standard deviations.")],
         "bodies": _bodies(evidence, drawn),
-        "timing": [_grid(drawn.timing, ""), axis_table(evidence)],
+        "timing": [_arrival(config), _grid(drawn.timing, ""), axis_table(evidence)],
         "files": [*_run(parameters), file_table(evidence, parameters, sha256)],
     }
     for name, title in _TITLES.items():
         yield section(name, title, *content[name])
 
 
+def _warnings(evidence: Evidence, parameters: ParameterFile) -> Iterable[str]:
+    yield "<h3>Of the recordings</h3>"
+    yield items(evidence.warnings) if evidence.warnings else paragraph(_NO_WARNING)
+    yield "<h3>Of the estimate</h3>"
+    against = reservations(evidence, parameters)
+    yield items(against) if against else paragraph(_NOTHING_AGAINST)
+
+
+def _arrival(config: ArmConfig) -> str:
+    return paragraph(_ARRIVAL) if config.recording.stamps == "arrival" else ""
+
+
 def _parameters(evidence: Evidence, parameters: ParameterFile) -> Iterable[str]:
     if evidence.estimates[0].name != CAD:
         yield paragraph("The arm's description has no CAD values (prior), so there is nothing to compare with.")
+    yield paragraph(verdict_rule())
     yield parameter_table(evidence, parameters)
 
 

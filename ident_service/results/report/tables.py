@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ident_service.estimation.doubt import Verdict
+from ident_service.estimation.doubt import IDENTIFIED_BELOW, REFERENCE, WEAK_BELOW, Verdict
 from ident_service.results.drawing import number
-from ident_service.results.evidence.evidence import Condition, Evidence
+from ident_service.results.evidence.evidence import Array, Condition, Evidence
 from ident_service.results.evidence.making import CAD
 from ident_service.results.parameter_file import ParameterFile
 from ident_service.results.report.markup import Cell, table
@@ -19,31 +19,63 @@ _MARKS: dict[Verdict, str] = {"identified": "", "weak": "weak", "unidentified": 
 
 
 def parameter_table(evidence: Evidence, parameters: ParameterFile) -> str:
-    """Every base parameter: CAD, unconstrained, constrained, deviation, verdict, bound."""
+    """Every base parameter: the chosen estimate as the parameter file has it, deviation, verdict, the other estimates.
+
+    The deviation is the unconstrained fit's, whose column therefore stands beside it where another one was chosen.
+    """
     content = parameters.content["base_parameters"]
     size = len(parameters.values)
     deviations = content.get("standard_deviations", [None] * size)
     verdicts, units = content.get("verdicts", [""] * size), content.get("units", [""] * size)
-    first = evidence.estimates[0]
-    columns = [
-        first.values if first.name == CAD else None,
-        evidence.estimates[evidence.unconstrained].values,
-        evidence.estimates[evidence.constrained].values,
+    others = _others(evidence)
+    heads = [
+        "no.",
+        "base parameter",
+        "unit",
+        f"{evidence.estimates[evidence.chosen].name} (chosen)",
+        "\u03c3",
+        "verdict",
     ]
-    names = [CAD, *(evidence.estimates[k].name for k in (evidence.unconstrained, evidence.constrained))]
-    if evidence.chosen not in (evidence.unconstrained, evidence.constrained):
-        names.append("chosen")
-        columns.append(parameters.values)
-    heads = ["no.", "base parameter", "unit", *names, "\u03c3", "verdict", "bound"]
+    heads += [*(name for name, _ in others), "bound"]
     rows = []
     for k, expression in enumerate(content["expressions"]):
         cells = [Cell(str(k + 1)), Cell(expression, kind="expression"), Cell(units[k], kind="unit")]
-        cells += [_NOTHING if column is None else _number(float(column[k])) for column in columns]
+        cells.append(_number(float(parameters.values[k])))
         cells.append(Cell("not seen", kind="bad") if deviations[k] is None else _number(deviations[k], 2))
+        cells.append(Cell(verdicts[k], kind=_MARKS.get(verdicts[k], "")))
+        cells += [_NOTHING if values is None else _number(float(values[k])) for _, values in others]
         bounds = "; ".join(evidence.bounds[k])
-        cells += [Cell(verdicts[k], kind=_MARKS.get(verdicts[k], "")), Cell(bounds) if bounds else _NOTHING]
+        cells.append(Cell(bounds) if bounds else _NOTHING)
         rows.append(cells)
-    return table("Base parameters, \u03c3 being the standard deviation", heads, rows, kind="parameters")
+    caption = "Base parameters; \u03c3 is the standard deviation of the unconstrained fit"
+    return table(caption, heads, rows, kind="parameters")
+
+
+def _others(evidence: Evidence) -> list[tuple[str, Array | None]]:
+    """Name and values of the estimates to compare the chosen one with; CAD without values where there is none."""
+    first = evidence.estimates[0]
+    found: list[tuple[str, Array | None]] = [(CAD, first.values if first.name == CAD else None)]
+    places = sorted({evidence.unconstrained, evidence.constrained} - {evidence.chosen})
+    found += [(evidence.estimates[place].name, evidence.estimates[place].values) for place in places]
+    return found
+
+
+def verdict_rule() -> str:
+    """What the words of the verdict column stand for, and what the deviation beside them is of."""
+    units: dict[float, list[str]] = {}
+    for unit, reference in REFERENCE.items():
+        units.setdefault(reference, []).append(unit)
+    references = ", ".join(f"{number(value)} for {_and(names)}" for value, names in units.items())
+    return (
+        f"Identified: \u03c3 is below {100 * IDENTIFIED_BELOW:g} % of the larger of the parameter's size and the "
+        f"reference of its unit, below which it is as good as zero ({references}); weak: below {100 * WEAK_BELOW:g} %; "
+        "unidentified: above. \u03c3 is that of the unconstrained fit, also beside a value that a feasible set holds: "
+        "it says how far the recordings alone tell the parameter, not how far the value may be off inside the set."
+    )
+
+
+def _and(names: list[str]) -> str:
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
 def error_table(evidence: Evidence) -> str:
@@ -104,6 +136,23 @@ def _tightest(conditions: list[Condition]) -> list[Cell]:
     least = min(conditions, key=lambda one: one.scaled)
     kind = "bad" if least.scaled <= 0.0 else ""
     return [Cell(least.name), Cell(number(least.margin), least.margin, kind), Cell(number(least.scaled), least.scaled)]
+
+
+def friction_table(evidence: Evidence, parameters: ParameterFile) -> str:
+    """Per joint what shapes its friction curve beside the parameters; empty where nothing does."""
+    found = parameters.content.get("friction", {})
+    kinds = (("pre-sliding way", "presliding", "rad", "m"), ("Stribeck velocity", "stribeck_velocity", "rad/s", "m/s"))
+    shown = [(*kind, found[kind[1]]) for kind in kinds if any(found.get(kind[1], []))]
+    if not shown or any(len(values) != len(evidence.joints) for *_, values in shown):
+        return ""
+    rows = []
+    for k, (name, turns) in enumerate(zip(evidence.joints, evidence.revolute, strict=True)):
+        cells = [
+            Cell(f"{number(values[k])} {unit if turns else other}", values[k]) for _, _, unit, other, values in shown
+        ]
+        rows.append([Cell(name), *cells])
+    heads = ["joint", *(what for what, *_ in shown)]
+    return table("Shape of the friction beside its parameters, found from the recordings or given", heads, rows)
 
 
 def axis_table(evidence: Evidence) -> str:

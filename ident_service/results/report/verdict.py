@@ -2,23 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import numpy as np
 
 from ident_service.estimation.doubt import IDENTIFIED_BELOW, WEAK_BELOW
 from ident_service.results.drawing import number
 from ident_service.results.evidence.evidence import Evidence
 from ident_service.results.parameter_file import ParameterFile
+from ident_service.results.report.reservations import (
+    NAMED,
+    POOR,
+    active_conditions,
+    joints_in_words,
+    listed,
+    poor_joints,
+    shortened,
+    unidentified,
+)
 
 _MUCH_WORSE = 1.5  # times the error on what was fitted to
-_NAMED = 5
+SIMULATED = "The arm's driver is a simulated one: this is about a simulation, not a commissioning of a real arm."
 _PROOFS = {"witness": True, "dual": True, "undecided": False}
 
 
-def verdict(evidence: Evidence, parameters: ParameterFile) -> list[str]:
-    """Sentences: could a body have it, is that proven, how well it predicts, what is not known, what to do next."""
+def verdict(evidence: Evidence, parameters: ParameterFile, *, simulated: bool = False) -> list[str]:
+    """Sentences: could a body have it, is that proven, how well it predicts, what is not known, what to do next.
+
+    Args:
+        evidence: what was gathered while the estimate was at hand.
+        parameters: the parameter file that it belongs to.
+        simulated: whether the arm's driver is a simulated one.
+    """
     return [
+        *([SIMULATED] if simulated else []),
         *_feasibility(evidence, parameters),
         _prediction(evidence),
+        *_joints(evidence, parameters),
         _knowledge(parameters),
         _next(evidence, parameters),
     ]
@@ -30,7 +48,7 @@ def _feasibility(evidence: Evidence, parameters: ParameterFile) -> list[str]:
         return ["Whether a real body could have these parameters was not tested."]
     margin, kind = number(found["margin"]), found.get("certificate", {}).get("kind", "")
     proven = _PROOFS.get(kind, False)
-    tight = _list(found.get("tight", []))
+    tight = listed(found.get("tight", []))
     if parameters.feasible_set == "none":
         how = "They were not held in any feasible set."
     else:
@@ -41,7 +59,7 @@ def _feasibility(evidence: Evidence, parameters: ParameterFile) -> list[str]:
         if not (proven and found["feasible"]):
             sentences.append("That is not proven in exact arithmetic: they lie too close to the boundary.")
         if tight:
-            sentences.append(f"The data pull against: {tight}.")
+            sentences.append(f"{active_conditions(evidence, parameters)}, which the data pull against: {tight}.")
         return [*sentences, how]
     words = f"No real body has these parameters (margin {margin})"
     sentences = [words + (", which is proven in exact arithmetic." if proven else ", though this is not proven.")]
@@ -61,10 +79,34 @@ def _prediction(evidence: Evidence) -> str:
     errors = ", ".join(
         f"{_error(error, alone)} on {name}" for name, error, alone in zip(unseen, own.validation, moving, strict=True)
     )
-    words = f"On what it never saw its torque error is {errors}, against {fitted} on what it was fitted to"
-    if _worse(evidence):
-        return f"{words}: it predicts other motions markedly worse than its own."
-    return f"{words}: it predicts other motions about as well as its own."
+    words = f"On what it never saw its torque error is {errors}, against {fitted} on what it was fitted to: "
+    words += "it predicts other motions " if own.moving is None else "away from standstill it predicts other motions "
+    words += "markedly worse than its own" if _worse(evidence) else "about as well as its own"
+    if own.moving is None or own.identification is None:
+        return f"{words}."
+    times = max(own.validation) / max(own.identification, 1e-12)
+    return f"{words}{f' (over all rows, {number(times, 2)} times its own error)' if times > _MUCH_WORSE else ''}."
+
+
+def _joints(evidence: Evidence, parameters: ParameterFile) -> list[str]:
+    """Which joints the error of the whole arm hides."""
+    poor = poor_joints(evidence, parameters)
+    unseen = bool(evidence.estimates[evidence.chosen].validation)
+    where = "what it never saw" if unseen else "what it was fitted to"
+    if not poor:
+        return [f"No joint's error exceeds {POOR:g} % of its own torque on {where}."]
+    sentences = []
+    if moving := [one for one in poor if one.in_motion]:
+        sentences.append(
+            f"That is of the whole arm, in which the largest torques count most: on {where}, the error exceeds "
+            f"{POOR:g} % of the joint's own torque at {joints_in_words(moving)}."
+        )
+    if still := [one for one in poor if not one.in_motion]:
+        sentences.append(
+            "Over all rows, with those near standstill where friction has no known size, the error exceeds "
+            f"{POOR:g} % of the joint's own torque at {joints_in_words(still)}."
+        )
+    return sentences
 
 
 def _error(whole: float, moving: float | None) -> str:
@@ -87,10 +129,14 @@ def _knowledge(parameters: ParameterFile) -> str:
     counts = {word: verdicts.count(word) for word in ("identified", "weak", "unidentified")}
     words = f"Of {len(verdicts)} base parameters {counts['identified']} are identified to {100 * IDENTIFIED_BELOW:g} %"
     words += f", {counts['weak']} are weak (to {100 * WEAK_BELOW:g} %) and {counts['unidentified']} unidentified"
-    unknown = [table["expressions"][k] for k, word in enumerate(verdicts) if word == "unidentified"]
+    unknown = unidentified(parameters)
     if not unknown:
         return words + "."
-    return f"{words}: {_list(unknown)}."
+    shown = "; ".join(
+        f"{shortened(name)} ({'not seen' if np.isinf(share) else number(share, 2)})" for name, share in unknown[:NAMED]
+    )
+    more = f"; and {len(unknown) - NAMED} more" if len(unknown) > NAMED else ""
+    return f"{words}, the least sure first (\u03c3 over the larger of size and reference): {shown}{more}."
 
 
 def _next(evidence: Evidence, parameters: ParameterFile) -> str:
@@ -100,12 +146,22 @@ def _next(evidence: Evidence, parameters: ParameterFile) -> str:
     if found is not None and found["margin"] <= 0.0:
         steps.append("identify within a feasible set, and look first for wrong signs, units or joint directions")
     if evidence.warnings:
-        steps.append("mend what the warnings name and record again")
+        steps.append("mend what the recordings' warnings name and record again")
     own = evidence.estimates[evidence.chosen]
     if not own.validation:
         steps.append("record a second motion and give it with --validate")
     elif _worse(evidence):
         steps.append("look below at which joint's residual follows the motion, and identify from a richer one")
+    poor = poor_joints(evidence, parameters)
+    if moving := [one.name for one in poor if one.in_motion]:
+        steps.append(
+            f"do not rely on the predicted torque of {', '.join(moving)}: see below whether residual and friction ask "
+            "for another friction term, and record a motion that moves and loads them more"
+        )
+    if still := [one.name for one in poor if not one.in_motion]:
+        steps.append(f"use it where joints move, not for the torque near standstill of {', '.join(still)}")
+    if active_conditions(evidence, parameters):
+        steps.append("find out why the data pull against the active conditions: signs, units, friction, drive inertia")
     if "unidentified" in parameters.content["base_parameters"].get("verdicts", []):
         steps.append(
             "where the unidentified parameters matter, design a motion that teaches them (ident design --after)"
@@ -113,9 +169,3 @@ def _next(evidence: Evidence, parameters: ParameterFile) -> str:
     if not steps:
         return "Next: nothing stands against using it."
     return "Next: " + "; ".join(steps) + "."
-
-
-def _list(names: Sequence[str]) -> str:
-    shown = [name if len(name) <= 60 else name[:57] + "..." for name in names[:_NAMED]]
-    more = len(names) - len(shown)
-    return "; ".join(shown) + (f"; and {more} more" if more > 0 else "")
