@@ -1,0 +1,128 @@
+"""Friction with a memory: carried by what has a place for its state, and named where it is lost."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+
+import numpy as np
+import pytest
+from exports.export_bench import assert_same, identified, some_delta, states_of, true_arm
+
+from ident_service.config.load import load_arm
+from ident_service.errors import ModelError
+from ident_service.estimation.direction import direction as directions
+from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.model.dynamic_model import DynamicModel
+from ident_service.model.regressor import joint_regressor
+from ident_service.results.export import c_header as writer
+from ident_service.results.export.arm import IdentifiedArm
+from ident_service.results.export.c_header import c_header, c_prefix, read_c_header
+from ident_service.results.export.formats import export_texts
+
+Array = np.ndarray
+PERIOD = 1e-3
+WAYS = {"tx40": (0.02, 0.0, 0.05, 0.01, 0.03, 0.002), "planar2": (0.01, 0.0)}
+
+
+def with_ways(name: str) -> IdentifiedArm:
+    """An arm whose dry friction turns round over these ways; tx40 has a drive that moves two joints."""
+    config = load_arm(name)
+    shape = config.identification.friction.model_copy(
+        update={"presliding": WAYS[name], "stribeck_velocity": (0.2,) * len(WAYS[name])}
+    )
+    settings = config.identification.model_copy(update={"friction": shape})
+    model = arm_model(config.model_copy(update={"identification": settings}))
+    return identified(model, some_delta(model))
+
+
+def motion(model: ArmModel, samples: int = 400) -> tuple[Array, Array, Array]:
+    """Position, velocity and acceleration of joints that turn round again and again, with a pause."""
+    time = np.arange(samples) * PERIOD
+    rate = np.array([4.0 * np.cos(2.0 * np.pi * (5.0 + k) * time + k) for k in range(model.chain.joints)]).T
+    rate[100:140] = 0.0
+    return 0.3 + PERIOD * np.cumsum(rate, axis=0), rate, np.gradient(rate, PERIOD, axis=0)
+
+
+def predicted(arm: IdentifiedArm, states: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+    """Torques as the estimation has them, and the directions that it finds in the whole motion."""
+    chain, rate = arm.model.chain, states[1] @ arm.model.chain.coupling.T
+    way = directions(rate, PERIOD, np.array(WAYS[arm.model.config.name]))
+    H = joint_regressor(chain, arm.model.layout, *states, direction=way)
+    return np.einsum("jps,p->sj", H, arm.delta), way
+
+
+@pytest.mark.parametrize("name", sorted(WAYS))
+def test_the_state_of_the_model_gives_the_torques_that_were_fitted(name: str) -> None:
+    arm = with_ways(name)
+    assert arm.delta is not None
+    model, states = DynamicModel(arm.model, arm.delta), motion(arm.model)
+    meant, way = predicted(arm, states)
+    direction, found = np.sign(states[1][0] @ arm.model.chain.coupling.T), []
+    for q, dq, ddq in zip(*states, strict=True):
+        direction = model.turned(direction, PERIOD * dq)
+        found.append(model.inverse_dynamics(q, dq, ddq, direction))
+    np.testing.assert_allclose(direction, way[-1], rtol=0, atol=1e-12)
+    assert_same(np.array(found), meant)
+    # Without the state, the torques are others.
+    memoryless = np.array([model.inverse_dynamics(*state) for state in zip(*states, strict=True)])
+    assert np.abs(memoryless - meant).max() > 0.1 * np.abs(model.friction(states[1])).max()
+
+
+@pytest.mark.parametrize("name", sorted(WAYS))
+def test_the_header_s_state_gives_the_torques_that_were_fitted(name: str) -> None:
+    arm = with_ways(name)
+    states = q, dq, ddq = motion(arm.model, 200)
+    meant, way = predicted(arm, states)
+    text, prefix = c_header(arm), c_prefix(arm)
+    direction = np.sign(dq[0] @ arm.model.chain.coupling.T)
+    for k in range(len(dq)):
+        step = {"step": PERIOD * dq[k][:, None], "before": direction[:, None]}
+        direction = read_c_header(text, prefix, "turned", step)[:, 0]
+        np.testing.assert_allclose(direction, way[k], rtol=0, atol=1e-12)
+    found = read_c_header(text, prefix, "rigid_dynamics", {"q": q.T, "dq": dq.T, "ddq": ddq.T})
+    found += read_c_header(text, prefix, "turning_friction", {"dq": dq.T, "direction": way.T})
+    assert_same(found.T, meant)
+
+
+def test_a_header_that_turns_otherwise_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    arm, written = with_ways("planar2"), writer._written
+    assert "(-100.0)" in written(arm)
+    monkeypatch.setattr(writer, "_written", lambda one: written(one).replace("(-100.0)", "(-101.0)"))
+    with pytest.raises(ModelError, match="direction of friction read back from the C header differs"):
+        c_header(arm)
+
+
+def test_what_has_no_state_says_so_and_tables_have_the_ways() -> None:
+    arm = with_ways("planar2")
+    made = {one.format: one for one in export_texts(arm, ["urdf", "mjcf", "sdf", "json", "csv", "c"])}
+    way = "pre-sliding of dry friction (way: shoulder 0.01 rad): here it turns round at once"
+    for name in ("urdf", "mjcf", "sdf"):
+        (said,) = [one for one in made[name].not_carried if one.startswith("pre-sliding")]
+        assert said.startswith(way)
+        assert "the torque errors of the report are with pre-sliding" in said
+        assert "pre-sliding of dry friction (way: shoulder 0.01 rad)" in made[name].text
+    assert not [one for name in ("json", "csv", "c") for one in made[name].not_carried if "pre-sliding" in one]
+    assert "planar2_friction are without pre-sliding" in made["c"].notes[0]
+    assert json.loads(made["json"].text)["friction"]["presliding"] == [0.01, 0.0]
+    rows = list(csv.DictReader(io.StringIO(made["csv"].text)))
+    shape = [(row["name"], row["unit"], row["value"]) for row in rows if row["kind"] == "friction shape"]
+    assert shape == [("presliding1", "rad", "0.01"), ("presliding2", "rad", "0.0")]
+    bodiless = dataclasses.replace(arm, delta=None)
+    content = json.loads(export_texts(bodiless, ["json"])[0].text)
+    assert content["friction"]["presliding"] == [0.01, 0.0]
+    assert "pre-sliding" in export_texts(bodiless, ["c"])[0].notes[0]
+
+
+def test_arms_without_it_have_no_word_of_it() -> None:
+    for one in export_texts(true_arm("planar2"), ["urdf", "mjcf", "sdf", "csv", "c"]):
+        assert "sliding of dry" not in one.text
+        assert "_turned" not in one.text
+        assert "sliding" not in " ".join((*one.not_carried, *one.notes))
+    arm = true_arm("planar2")
+    assert arm.delta is not None
+    model, (_, dq, _) = DynamicModel(arm.model, arm.delta), states_of(arm.model.chain)
+    still = np.zeros_like(dq)
+    np.testing.assert_array_equal(model.friction(dq, model.turned(still, dq)), model.friction(dq))
