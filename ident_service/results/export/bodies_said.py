@@ -35,8 +35,8 @@ def _implausible(model: ArmModel, delta: Array) -> tuple[str, ...]:
             found.append(f"implausible: the link of {name} has a mass of {mass:.2g} kg")
         if distance > farthest:
             found.append(
-                f"implausible: the link of {name} has its centre of mass {distance:.2g} m from its joint, and the arm "
-                f"reaches {farthest:.2g} m"
+                f"implausible: the link of {name} has its centre of mass {distance:.3g} m from its joint, and the arm "
+                f"reaches {farthest:.3g} m"
             )
     return tuple(found)
 
