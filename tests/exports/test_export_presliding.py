@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import io
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from ident_service.estimation.direction import direction as directions
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.dynamic_model import DynamicModel
 from ident_service.model.regressor import joint_regressor
+from ident_service.results import load_model
 from ident_service.results.export import c_header as writer
 from ident_service.results.export.arm import IdentifiedArm
 from ident_service.results.export.c_header import c_header, c_prefix, read_c_header
@@ -126,3 +128,24 @@ def test_arms_without_it_have_no_word_of_it() -> None:
     model, (_, dq, _) = DynamicModel(arm.model, arm.delta), states_of(arm.model.chain)
     still = np.zeros_like(dq)
     np.testing.assert_array_equal(model.friction(dq, model.turned(still, dq)), model.friction(dq))
+
+
+def test_the_ways_of_a_parameter_file_go_into_the_model(tmp_path: Path) -> None:
+    arm = with_ways("planar2")
+    assert arm.delta is not None
+    content = {
+        "format": "ident-parameters",
+        "version": 1,
+        "base_parameters": {"expressions": list(arm.base.expressions), "values": arm.beta.tolist()},
+        "link_parameters": {"names": list(arm.model.layout.names), "values": arm.delta.tolist()},
+        "friction": {"presliding": [0.01, 0.0], "stribeck_velocity": []},
+    }
+    (tmp_path / "mine.json").write_text(json.dumps(content))
+    model = load_model(tmp_path / "mine.json", "planar2")
+    np.testing.assert_array_equal(model.presliding, [0.01, 0.0])
+    dq, direction = np.array([0.5, 0.5]), np.array([-1.0, 1.0])
+    fc = arm.model.layout.term_values("coulomb", arm.delta)
+    np.testing.assert_allclose(model.friction(dq) - model.friction(dq, direction), [2.0 * fc[0], 0.0], atol=1e-12)
+    # After its way, a third of the turn is still to come: 1 - 2/e.
+    turned = model.turned(direction, np.array([0.01, 0.0]))
+    np.testing.assert_allclose(turned, [1.0 - 2.0 / np.e, 0.0], atol=1e-12)

@@ -27,6 +27,7 @@ from ident_service.results.comparison.in_use import InUse, values_in_use
 from ident_service.results.comparison.sides import Side
 from ident_service.results.run_folder import ARM
 
+UNSAID = "-"
 Verdict = Literal["unchanged", "changed", "impossible"]
 
 
@@ -219,7 +220,7 @@ def _crossed(reference: Side, side: Side, places: tuple[NDArray[np.intp], NDArra
 def _provenance(reference: Side, side: Side) -> dict[str, tuple[str, str]]:
     known = [_flat(one) for one in (reference, side)]
     keys = list(dict.fromkeys([*known[0], *known[1]]))
-    both = {key: (known[0].get(key, "-"), known[1].get(key, "-")) for key in keys}
+    both = {key: (known[0].get(key, UNSAID), known[1].get(key, UNSAID)) for key in keys}
     return {key: pair for key, pair in both.items() if pair[0] != pair[1]}
 
 
@@ -252,7 +253,8 @@ def _notes(reference: Side, side: Side, free: bool, differing: Sequence[int], in
         notes.append(f"different arms: {names[0]} and {names[1]}")
     if reference.joints and side.joints and reference.joints != side.joints:
         notes.append(f"joints are called {', '.join(reference.joints)} and {', '.join(side.joints)}; compared in order")
-    if not free and any(content.get("feasible_set") in ("inertia", "pseudo_inertia") for content in both):
+    tested = reference.covariance is not None and side.covariance is not None
+    if tested and not free and any(content.get("feasible_set") in ("inertia", "pseudo_inertia") for content in both):
         notes.append("constrained values are compared, in the covariance of unconstrained ones: on the careful side")
     made = [f"{content.get('method', '?')}, {content.get('feasible_set', '?')}" for content in both]
     if made[0] != made[1] and (worst := in_use.worst()) is not None:

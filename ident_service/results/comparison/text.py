@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ident_service.estimation.drift import ALPHA, RELEVANT_RESIDUAL, RELEVANT_TORQUE
-from ident_service.results.comparison.comparison import Comparison, Pair
+from ident_service.estimation.drift import ALPHA, RELEVANT_RESIDUAL, RELEVANT_TORQUE, relevant
+from ident_service.results.comparison.comparison import UNSAID, Comparison, Pair
 from ident_service.results.comparison.findings import Finding, findings, joint_name
 from ident_service.results.comparison.sides import Side
 
@@ -60,7 +60,10 @@ def _pair(comparison: Comparison, pair: Pair) -> list[str]:
             lines += ["", f"left out, only in {title}:", *(f"  {one}" for one in shortened(left_out))]
     if pair.provenance:
         lines += ["", "what differs in how they came about (reference; compared):"]
-        lines += [f"  {key}: {_short(a, 60)}; {_short(b, 60)}" for key, (a, b) in pair.provenance.items()]
+        said = {key: both for key, both in pair.provenance.items() if UNSAID not in both}
+        lines += [f"  {key}: {_short(a, 60)}; {_short(b, 60)}" for key, (a, b) in said.items()]
+        if alone := [key for key in pair.provenance if key not in said]:
+            lines.append(f"  said of one alone: {', '.join(alone)}")
     lines += [f"note: {note}" for note in pair.notes]
     return [*lines, ""]
 
@@ -89,10 +92,18 @@ def contradiction(pair: Pair) -> str:
     if pair.crossed is not None:
         own, other = (error.joint_relative_percent[joint] for error in (pair.crossed.own, pair.crossed.reference))
         errors = f" (torque error {own:.3g} % with its own, {other:.3g} % with the reference's)"
+    found = pair.drift
+    tested = found is not None and found.torque_share is not None and found.residual_share is not None
+    if tested and relevant((found.torque_share, found.residual_share)):
+        why = "the tested values differ by as much, which may be chance: their doubt is as large"
+    else:
+        why = (
+            "the unconstrained values, which are tested, do not; what was made of them does (feasible set, "
+            "constraints, method, or a file that was edited)"
+        )
     return (
-        f"BUT the values in use change the torque of joint {joint_name(pair, joint + 1)} by {share:.2%}{errors}: the "
-        "unconstrained values, which are tested, are the same, and what was made of them is not (feasible set, "
-        "constraints, method, or a file that was edited). Do not take one set of parameters for the other"
+        f"BUT the values in use change the torque of joint {joint_name(pair, joint + 1)} by {share:.2%}{errors}: "
+        f"{why}. Do not take one set of parameters for the other"
     )
 
 
