@@ -153,12 +153,12 @@ def payload_text(payload: Payload, arm: KnownArm) -> str:
             f"the nearest real body (values that no motion shows: the smallest), p = {payload.body.p:.2g}, at most "
             f"{payload.body.torque_share[worst]:.2%} of the torque of joint {names[worst]} away",
         ]
-        body = zip(payload.base.names, _rounded(payload.body.delta[: len(INERTIAL)]), strict=False)
+        body = zip(payload.base.names, rounded(payload.body.delta[: len(INERTIAL)]), strict=False)
         lines.append("  " + "  ".join(f"{name} {value:.4g}" for name, value in body))
     return "\n".join(lines) + "\n"
 
 
-def _rounded(values: Array) -> Array:
+def rounded(values: Array) -> Array:
     """The ten of a body with zeros for what is rounding beside its inertia, its first moments or its mass."""
     shown = np.array(values, dtype=float)
     for quantity in (slice(0, 6), slice(6, 9), slice(9, 10)):

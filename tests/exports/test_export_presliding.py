@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import csv
+import ctypes
 import dataclasses
 import io
 import json
+import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
-from exports.export_bench import assert_same, identified, some_delta, states_of, true_arm
+from exports.export_bench import assert_same, compiler, identified, some_delta, states_of, true_arm
 
 from ident_service.config.load import load_arm
 from ident_service.errors import ModelError
@@ -149,3 +151,24 @@ def test_the_ways_of_a_parameter_file_go_into_the_model(tmp_path: Path) -> None:
     # After its way, a third of the turn is still to come: 1 - 2/e.
     turned = model.turned(direction, np.array([0.01, 0.0]))
     np.testing.assert_allclose(turned, [1.0 - 2.0 / np.e, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(("program", "standard", "ending"), [("gcc", "-std=c99", "c"), ("g++", "-std=c++11", "cpp")])
+def test_a_compiled_header_turns_in_place(tmp_path: Path, program: str, standard: str, ending: str) -> None:
+    (tmp_path / "arm.h").write_text(c_header(with_ways("tx40")))
+    linkage = 'extern "C" ' if ending == "cpp" else ""
+    call = "void turn(const double *step, double *direction)"
+    text = f"{linkage}{call};\n{linkage}{call} {{ tx40_turned(step, direction, direction); }}\n"
+    (tmp_path / f"arm.{ending}").write_text(f'#include "arm.h"\n{text}')
+    strict = ["-Wall", "-Wextra", "-Werror", "-pedantic", "-O2", "-fPIC", "-shared", "-Wno-unused-function"]
+    command = [compiler(program), standard, *strict, "-o", "arm.so", f"arm.{ending}", "-lm"]
+    subprocess.run(command, cwd=tmp_path, check=True, timeout=100)
+    library, model = ctypes.CDLL(str(tmp_path / "arm.so")), with_ways("tx40").model
+    rate, direction = motion(model)[1], np.ones(6)
+    pointer = ctypes.POINTER(ctypes.c_double)
+    for row in rate:
+        step = np.ascontiguousarray(PERIOD * row)
+        library.turn(step.ctypes.data_as(pointer), direction.ctypes.data_as(pointer))
+    drives = rate @ model.chain.coupling.T
+    meant = directions(drives, PERIOD, np.array(WAYS["tx40"]), np.ones(6))[-1]
+    np.testing.assert_allclose(direction, meant, rtol=0, atol=1e-12)
