@@ -92,9 +92,7 @@ def contradiction(pair: Pair) -> str:
     if pair.crossed is not None:
         own, other = (error.joint_relative_percent[joint] for error in (pair.crossed.own, pair.crossed.reference))
         errors = f" (torque error {own:.3g} % with its own, {other:.3g} % with the reference's)"
-    found = pair.drift
-    tested = found is not None and found.torque_share is not None and found.residual_share is not None
-    if tested and relevant((found.torque_share, found.residual_share)):
+    if pair.drift is not None and relevant(pair.drift.shares):
         why = "the tested values differ by as much, which may be chance: their doubt is as large"
     else:
         why = (
