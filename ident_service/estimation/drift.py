@@ -205,6 +205,13 @@ class Drift:
     effects: tuple[Effect, ...]
     verdict: Literal["unchanged", "changed"]
 
+    @property
+    def shares(self) -> tuple[Array, Array] | None:
+        """What all differences together change, as `torque_shares` has it; None without a motion."""
+        if self.torque_share is None or self.residual_share is None:
+            return None
+        return self.torque_share, self.residual_share
+
     @cached_property
     def changes(self) -> tuple[Effect, ...]:
         """The effects that have changed, the largest change of torque first."""

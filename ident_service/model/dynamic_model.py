@@ -17,6 +17,7 @@ from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array
 from ident_service.model.drives import WrittenArm, joint_drives
+from ident_service.model.presliding import presliding_ways, turned
 from ident_service.model.rigid_body import mjcf_model, pinocchio_model, read_mjcf, read_urdf, urdf_model
 
 
@@ -29,11 +30,15 @@ class DynamicModel:
             armature, damping or friction of its own, and only the methods here know these terms.
         arm: the mechanism and its configuration.
         delta: link parameters, shape (arm.layout.size,).
+        presliding: way over which each drive's dry friction turns round [rad or m], shape (joints,). Where one is not
+            zero, friction has a memory: carry a `direction` along with `turned`, or leave it out and have friction that
+            turns round at once, which the parameters were not fitted with.
     """
 
     model: pin.Model
     arm: ArmModel
     delta: Array
+    presliding: Array
 
     def __init__(self, arm: ArmModel, delta: Array) -> None:
         """Build the model.
@@ -46,7 +51,7 @@ class DynamicModel:
         chain, layout = arm.chain, arm.layout
         links_only = np.array(delta, dtype=float)
         links_only[layout.term_columns("drive_inertia")] = 0.0
-        self.arm, self.delta = arm, delta
+        self.arm, self.delta, self.presliding = arm, delta, presliding_ways(arm)
         self.model = pinocchio_model(replace(chain, coupling=np.eye(chain.joints)), layout, links_only)
         self.model.name = arm.config.name
         drives = joint_drives(chain, layout, delta)
@@ -59,11 +64,26 @@ class DynamicModel:
         # What armatures do not say: zero where every joint has its own drive.
         self._shared = chain.coupling.T @ (inertia[:, None] * chain.coupling) - np.diag(drives.armature)
 
-    def friction(self, velocity: Array) -> Array:
-        """Torque that friction takes, offsets included; dry friction has the sign of the velocity, none at rest.
+    def turned(self, direction: Array, step: Array) -> Array:
+        """The direction of dry friction after a step (Dahl 1968); exact where no drive turns round within it.
+
+        Args:
+            direction: before it, per drive, between -1 and 1, shape (..., joints); the signs of the first motion, where
+                nothing is known.
+            step: what the joints travel [rad or m], shape (..., joints).
+
+        Returns:
+            Shape (..., joints).
+        """
+        return turned(direction, np.asarray(step, dtype=float) @ self.arm.chain.coupling.T, self.presliding)
+
+    def friction(self, velocity: Array, direction: Array | None = None) -> Array:
+        """Torque that friction takes, offsets included.
 
         Args:
             velocity: [rad/s or m/s], shape (..., joints).
+            direction: of dry friction per drive, from `turned`, shape (..., joints); when None, the sign of the
+                drive's velocity: none at rest, and no pre-sliding.
 
         Returns:
             [N m or N], shape (..., joints).
@@ -72,25 +92,29 @@ class DynamicModel:
         rate = np.asarray(velocity, dtype=float) @ coupling.T
         fv, fc, fo = (layout.term_values(term, self.delta) for term in ("viscous", "coulomb", "offset"))
         fq, fa = (layout.term_values(term, self.delta) for term in ("quadratic", "viscous_asymmetry"))
-        taken = fv * rate + fc * np.sign(rate) + fo + fq * rate * np.abs(rate) + fa * np.abs(rate)
+        sign = np.sign(rate) if direction is None else np.asarray(direction, dtype=float)
+        taken = fv * rate + fc * sign + fo + fq * rate * np.abs(rate) + fa * np.abs(rate)
         if "stribeck" in layout.terms:
             bell = np.exp(-((rate / np.array(layout.stribeck_velocity)) ** 2))
-            taken = taken + layout.term_values("stribeck", self.delta) * np.sign(rate) * bell
+            taken = taken + layout.term_values("stribeck", self.delta) * sign * bell
         return np.asarray(taken @ coupling)
 
-    def inverse_dynamics(self, position: Array, velocity: Array, acceleration: Array) -> Array:
+    def inverse_dynamics(
+        self, position: Array, velocity: Array, acceleration: Array, direction: Array | None = None
+    ) -> Array:
         """Torque of a motion: links, drives and friction; what the regressor predicts (eq. 29).
 
         Args:
             position: [rad or m], shape (joints,).
             velocity: [rad/s or m/s], shape (joints,).
             acceleration: [rad/s^2 or m/s^2], shape (joints,).
+            direction: of dry friction, as for `friction`.
 
         Returns:
             [N m or N], shape (joints,).
         """
         rigid = pin.rnea(self.model, self._data, position, velocity, acceleration)
-        return np.asarray(rigid + self._shared @ acceleration + self.friction(velocity))
+        return np.asarray(rigid + self._shared @ acceleration + self.friction(velocity, direction))
 
 
 def _set_dry_friction(model: pin.Model, friction: Array) -> None:

@@ -115,9 +115,14 @@ def drive_torque(chain: Chain, layout: Layout, parameters: Parameters, ddq: Sequ
 
 
 def friction_torque(
-    tape: Tape, chain: Chain, layout: Layout, parameters: Parameters, dq: Sequence[Symbol]
+    tape: Tape,
+    chain: Chain,
+    layout: Layout,
+    parameters: Parameters,
+    dq: Sequence[Symbol],
+    direction: Sequence[Symbol] | None = None,
 ) -> list[Value]:
-    """What friction takes (`layout.py`), the direction of motion being the sign of the drive's velocity."""
+    """What friction takes (`layout.py`); its direction per drive is the sign of the drive's velocity when None."""
     torque: list[Value] = [0.0] * chain.joints
     columns = {term: layout.term_columns(term) for term in layout.terms}
     for drive in range(chain.joints):
@@ -126,12 +131,15 @@ def friction_torque(
         taken: Value = 0.0
         for term, places in columns.items():
             if term != "drive_inertia" and (column := int(places[drive])) in parameters:
-                taken = taken + parameters[column] * _shape(tape, layout, term, drive, rate)
+                turned = None if direction is None else direction[drive]
+                taken = taken + parameters[column] * _shape(tape, layout, term, drive, rate, turned)
         torque = [t + s * taken for t, s in zip(torque, share, strict=True)]
     return torque
 
 
-def _shape(tape: Tape, layout: Layout, term: JointTerm, drive: int, rate: Value) -> Value:
+def _shape(
+    tape: Tape, layout: Layout, term: JointTerm, drive: int, rate: Value, direction: Symbol | None = None
+) -> Value:
     """What a friction parameter is multiplied by."""
     if not isinstance(rate, Symbol):
         return 1.0 if term == "offset" else 0.0  # a drive that moves no joint
@@ -140,11 +148,12 @@ def _shape(tape: Tape, layout: Layout, term: JointTerm, drive: int, rate: Value)
     if term == "viscous":
         return rate
     if term == "coulomb":
-        return tape.apply("sign", rate)
+        return tape.apply("sign", rate) if direction is None else direction
     if term == "stribeck":
         ratio = rate * (1.0 / layout.stribeck_velocity[drive])
         bell = -(ratio * ratio)
-        return tape.apply("sign", rate) * (tape.apply("exp", bell) if isinstance(bell, Symbol) else 1.0)
+        sign = tape.apply("sign", rate) if direction is None else direction
+        return sign * (tape.apply("exp", bell) if isinstance(bell, Symbol) else 1.0)
     return rate * tape.apply("abs", rate) if term == "quadratic" else tape.apply("abs", rate)
 
 

@@ -35,7 +35,16 @@ def range_around(*values: Array, least: float = 0.0, zero: bool = False, share: 
     return low - share * (high - low), high + share * (high - low)
 
 
-def draw_frame(canvas: Canvas, axes: Axes, *, x: str, y: str, x_log: bool = False, y_log: bool = False) -> None:
+def draw_frame(
+    canvas: Canvas,
+    axes: Axes,
+    *,
+    x: str,
+    y: str,
+    x_log: bool = False,
+    y_log: bool = False,
+    y_ticks: Sequence[tuple[float, str]] | None = None,
+) -> None:
     """Grid, frame, ticks and names of both quantities.
 
     Args:
@@ -45,6 +54,7 @@ def draw_frame(canvas: Canvas, axes: Axes, *, x: str, y: str, x_log: bool = Fals
         y: of what stands upright, written above the frame.
         x_log: whether the axes show the logarithm of x.
         y_log: likewise.
+        y_ticks: values upright and their words, where the scale is neither straight nor in powers of ten.
     """
     bottom, right = axes.top + axes.height, axes.left + axes.width
     for value, words in _ticks(axes.low_x, axes.high_x, x_log, 6):
@@ -52,7 +62,8 @@ def draw_frame(canvas: Canvas, axes: Axes, *, x: str, y: str, x_log: bool = Fals
         canvas.line("grid grid-x", at, axes.top, at, bottom)
         if x:
             canvas.text("soft tick-x", at, bottom + _LINE, words, size=FONT, anchor="middle")
-    for value, words in _ticks(axes.low_y, axes.high_y, y_log, max(4, int(axes.height / 32))):
+    chosen = _ticks(axes.low_y, axes.high_y, y_log, max(4, int(axes.height / 32))) if y_ticks is None else y_ticks
+    for value, words in chosen:
         at = float(axes.y(value))
         canvas.line("grid", axes.left, at, right, at)
         canvas.text("soft", axes.left - 5, at + 4, words, size=FONT, anchor="end")

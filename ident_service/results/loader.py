@@ -48,8 +48,11 @@ def _identified(path: Path, arm: str | Path | None) -> IdentifiedArm:
 def _as_identified(config: ArmConfig, content: dict[str, object], joints: int) -> ArmConfig:
     """The arm with the friction's shape that a parameter file was fitted with."""
     friction = content.get("friction")
-    velocity = friction.get("stribeck_velocity") if isinstance(friction, dict) else None
-    if not velocity or len(velocity) != joints:
+    known = friction if isinstance(friction, dict) else {}
+    fitted = {
+        key: tuple(known[key]) for key in ("presliding", "stribeck_velocity") if len(known.get(key, ())) == joints
+    }
+    if not fitted:
         return config
-    shape = config.identification.friction.model_copy(update={"stribeck_velocity": tuple(velocity)})
+    shape = config.identification.friction.model_copy(update=fitted)
     return config.model_copy(update={"identification": config.identification.model_copy(update={"friction": shape})})

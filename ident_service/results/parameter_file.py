@@ -30,6 +30,10 @@ from ident_service.results.schemas import require_schema
 from ident_service.results.strict_json import strict_json
 
 MAX_BYTES = 64 * 2**20
+_TABLE = (
+    'a table from a paper is typed as {"format": "ident-parameters", "version": 1, "base_parameters": {"expressions": '
+    '["Lzz1 + 0.25*m2", "lx2"], "values": [0.9, 0.4]}}, as the README has it'
+)
 
 
 @dataclass(frozen=True)
@@ -69,7 +73,7 @@ def read_parameters(path: Path, names: tuple[str, ...] | None = None) -> Paramet
         content = strict_json(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise ParameterError(f"{path}: not JSON: {error}") from None
-    require_schema(content, "parameters", path, "a parameter file")
+    _require_document(content, path)
     table = content["base_parameters"]
     expressions, values = tuple(table["expressions"]), np.array(table["values"], dtype=float)
     for key, column in table.items():
@@ -80,6 +84,15 @@ def read_parameters(path: Path, names: tuple[str, ...] | None = None) -> Paramet
     except ParameterError as error:
         raise ParameterError(f"{path}: {error}") from None
     return ParameterFile(base, values, content.get("feasible_set"), content)
+
+
+def _require_document(content: Any, path: Path) -> None:
+    try:
+        require_schema(content, "parameters", path, "a parameter file")
+    except ParameterError as error:
+        if isinstance(content, dict) and "format" in content:
+            raise
+        raise ParameterError(f"{error}; {_TABLE}") from None
 
 
 def parameters_document(estimate: Estimate) -> dict[str, Any]:

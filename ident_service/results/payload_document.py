@@ -37,6 +37,7 @@ _WORDS: Mapping[Word, tuple[str, str]] = {
         "or compare: friction or the arm itself may have changed (`ident compare`)",
     ),
 }
+_ROUNDING = 1e-12  # of the largest value of a quantity; less is printed as zero
 # What no longer holds for an arm with a load, or is about other recordings.
 _STALE = ("bootstrap", "essential", "recording_quality", "validation", "fit", "information", "link_parameters")
 
@@ -152,9 +153,18 @@ def payload_text(payload: Payload, arm: KnownArm) -> str:
             f"the nearest real body (values that no motion shows: the smallest), p = {payload.body.p:.2g}, at most "
             f"{payload.body.torque_share[worst]:.2%} of the torque of joint {names[worst]} away",
         ]
-        body = zip(payload.base.names, payload.body.delta[: len(INERTIAL)], strict=False)
+        body = zip(payload.base.names, rounded(payload.body.delta[: len(INERTIAL)]), strict=False)
         lines.append("  " + "  ".join(f"{name} {value:.4g}" for name, value in body))
     return "\n".join(lines) + "\n"
+
+
+def rounded(values: Array) -> Array:
+    """The ten of a body with zeros for what is rounding beside its inertia, its first moments or its mass."""
+    shown = np.array(values, dtype=float)
+    for quantity in (slice(0, 6), slice(6, 9), slice(9, 10)):
+        part = shown[quantity]
+        part[np.abs(part) < _ROUNDING * np.abs(part).max()] = 0.0
+    return shown
 
 
 def loaded_config(config: ArmConfig) -> ArmConfig:

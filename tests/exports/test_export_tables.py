@@ -32,30 +32,43 @@ from ident_service.errors import ModelError
 from ident_service.model.arm_model import arm_model
 from ident_service.model.layout import TERM_SYMBOLS, Layout
 from ident_service.results.export import json_model
+from ident_service.results.export.formats import export_texts
 from ident_service.results.export.json_model import json_export
 from ident_service.results.export.table import csv_export
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "exports.md"
 
 
-def documented_loader(folder: Path) -> Any:
-    """What the documentation's lines make of a file, run as they stand there."""
+def documented_loader(folder: Path) -> dict[str, Any]:
+    """What the documentation's lines make of a file, run as they stand there: their variables."""
     blocks = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL)
     (code,) = [block for block in blocks if "json.loads" in block]
     assert "ident_service" not in code
     found: dict[str, Any] = {}
     with contextlib.chdir(folder):
         exec(code, found)  # noqa: S102  # the documentation's own lines
-    return found["model"]
+    return found
 
 
 @pytest.mark.parametrize("name", SIMULATED)
 def test_the_documented_lines_load_the_file_into_pinocchio(tmp_path: Path, name: str) -> None:
     arm = true_arm(name)
     (tmp_path / "ARM.json").write_text(json_export(arm, "ARM.json"))
-    model = documented_loader(tmp_path)
+    found = documented_loader(tmp_path)
     states = states_of(arm.model.chain)
-    assert_same(pinocchio_torque(model, arm.model.chain, states), torque_of(arm, states, ("drive_inertia",)))
+    assert_same(pinocchio_torque(found["model"], arm.model.chain, states), torque_of(arm, states, ("drive_inertia",)))
+    assert not found["coupled"].any()
+
+
+def test_the_documented_lines_know_drives_that_move_several_joints(tmp_path: Path) -> None:
+    model = arm_model(load_arm("tx40"))
+    arm = identified(model, some_delta(model))
+    (tmp_path / "ARM.json").write_text(json_export(arm, "ARM.json"))
+    found = documented_loader(tmp_path)
+    states = states_of(model.chain)
+    alone, meant = pinocchio_torque(found["model"], model.chain, states), torque_of(arm, states, ("drive_inertia",))
+    assert_same(alone + states[2] @ found["coupled"], meant)
+    assert np.abs(alone - meant).max() > 1e-3 * np.abs(meant).max()
 
 
 @settings(max_examples=25)
@@ -108,7 +121,7 @@ def test_strange_names_come_back(tmp_path: Path) -> None:
     chain = dataclasses.replace(random_chain(np.random.default_rng(1), 4), names=names)
     model = model_around(chain)
     (tmp_path / "ARM.json").write_text(json_export(identified(model, some_delta(model)), "ARM.json"))
-    assert tuple(documented_loader(tmp_path).names)[1:] == names
+    assert tuple(documented_loader(tmp_path)["model"].names)[1:] == names
 
 
 @pytest.mark.parametrize("what", ["mass", "viscous", "axis", "values"])
@@ -126,3 +139,19 @@ def test_a_file_that_says_something_else_is_refused(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(json_model, "_document", lambda _: document)
     with pytest.raises(ModelError, match="it was not written"):
         json_export(arm, "ARM.json")
+
+
+def test_values_before_the_constraints_stand_beside_their_deviations() -> None:
+    arm = true_arm("planar2")
+    free = arm.beta + 0.5
+    arm = dataclasses.replace(arm, feasible_set="pseudo_inertia", unconstrained=free)
+    rows = [row for row in csv.DictReader(io.StringIO(csv_export(arm, "ARM.csv"))) if row["kind"] == "base"]
+    assert [float(row["unconstrained_value"]) for row in rows] == free.tolist()
+    content = json.loads(json_export(arm, "ARM.json"))
+    assert content["base_parameters"]["unconstrained_values"] == free.tolist()
+    said = "standard deviations are of the unconstrained fit; values are held in the set pseudo_inertia"
+    assert said in content["notes"]
+    (exported,) = export_texts(arm, ["c"])
+    assert f" * Mind: {said}.\n" in exported.text
+    assert exported.notes == (said,)
+    assert export_texts(true_arm("planar2"), ["c"])[0].notes == ()

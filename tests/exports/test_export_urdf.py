@@ -385,3 +385,15 @@ def test_shared_drives_carry_nothing(tmp_path: Path) -> None:
     has = carried(model, some_delta(model), ("viscous", "coulomb"))
     np.testing.assert_array_equal(has["viscous"], [True] * 4 + [False] * 2)
     assert bodies_of(model.layout, some_delta(model)).shape == (6, 10)
+
+
+def test_comments_stand_at_the_end_and_once(tmp_path: Path) -> None:
+    source = (Path(__file__).parents[2] / "configs" / "threelink.urdf").read_text()
+    model = arm_of_file(tmp_path, "urdf", source)
+    delta = some_delta(model)
+    bare, said = urdf_export(model, delta, "a.urdf")[0], ("one -- of many", "<two>")
+    text = urdf_export(model, delta, "a.urdf", said)[0]
+    assert text == bare + "<!-- ident-service: one - of many. -->\n<!-- ident-service: _two_. -->\n"
+    again = arm_of_file(tmp_path, "urdf", text)
+    assert urdf_export(again, delta, "a.urdf", said)[0] == text
+    assert urdf_export(again, delta, "a.urdf")[0] == bare

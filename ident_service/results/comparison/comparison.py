@@ -23,9 +23,11 @@ from ident_service.estimation.drift import Drift, Identified, drift
 from ident_service.estimation.drift_causes import Cause, causes
 from ident_service.estimation.least_squares import TorqueError, torque_error
 from ident_service.model.chain import Array
+from ident_service.results.comparison.in_use import InUse, values_in_use
 from ident_service.results.comparison.sides import Side
 from ident_service.results.run_folder import ARM
 
+UNSAID = "-"
 Verdict = Literal["unchanged", "changed", "impossible"]
 
 
@@ -54,6 +56,8 @@ class Pair:
         crossed: the reference's parameters on this side's torques; None where these are not kept.
         provenance: what differs in how the two came about: key to both values.
         notes: what a reader must know.
+        in_use: the values that the sides are used with, which need not be those that are tested.
+        free: whether values from before any constraint are tested.
         other_shape: joints, from 1, whose friction has another shape on each side, and so is not compared.
     """
 
@@ -69,6 +73,8 @@ class Pair:
     crossed: Crossed | None
     provenance: Mapping[str, tuple[str, str]]
     notes: tuple[str, ...]
+    in_use: InUse
+    free: bool
     other_shape: tuple[int, ...] = ()
 
     @property
@@ -77,6 +83,11 @@ class Pair:
         if self.drift is None or (self.drift.verdict == "unchanged" and self.other_shape):
             return "impossible"
         return self.drift.verdict
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether nothing has changed by the test, and the values in use predict other torques nevertheless."""
+        return self.verdict == "unchanged" and self.in_use.matters
 
 
 @dataclass(frozen=True)
@@ -145,6 +156,7 @@ def _pair(reference: Side, side: Side) -> Pair:
             explained = tuple(
                 causes(np.where(np.isfinite(found.deviations), difference, 0.0), K, reference.file.base.names, motion)
             )
+    in_use = values_in_use((reference, side), places, compared)
     return Pair(
         side=side,
         places=(places[0], places[1]),
@@ -157,7 +169,9 @@ def _pair(reference: Side, side: Side) -> Pair:
         causes=explained,
         crossed=_crossed(reference, side, (places[0], places[1])),
         provenance=_provenance(reference, side),
-        notes=tuple(_notes(reference, side, free, differing)),
+        notes=tuple(_notes(reference, side, free, differing, in_use)),
+        in_use=in_use,
+        free=free,
         other_shape=differing,
     )
 
@@ -206,7 +220,7 @@ def _crossed(reference: Side, side: Side, places: tuple[NDArray[np.intp], NDArra
 def _provenance(reference: Side, side: Side) -> dict[str, tuple[str, str]]:
     known = [_flat(one) for one in (reference, side)]
     keys = list(dict.fromkeys([*known[0], *known[1]]))
-    both = {key: (known[0].get(key, "-"), known[1].get(key, "-")) for key in keys}
+    both = {key: (known[0].get(key, UNSAID), known[1].get(key, UNSAID)) for key in keys}
     return {key: pair for key, pair in both.items() if pair[0] != pair[1]}
 
 
@@ -231,7 +245,7 @@ def _flat(side: Side) -> dict[str, str]:
     return {key: str(value) for key, value in facts.items() if value is not None}
 
 
-def _notes(reference: Side, side: Side, free: bool, differing: Sequence[int]) -> list[str]:
+def _notes(reference: Side, side: Side, free: bool, differing: Sequence[int], in_use: InUse) -> list[str]:
     notes = []
     both = (reference.content, side.content)
     names = [content.get("arm", {}).get("name") for content in both]
@@ -239,8 +253,15 @@ def _notes(reference: Side, side: Side, free: bool, differing: Sequence[int]) ->
         notes.append(f"different arms: {names[0]} and {names[1]}")
     if reference.joints and side.joints and reference.joints != side.joints:
         notes.append(f"joints are called {', '.join(reference.joints)} and {', '.join(side.joints)}; compared in order")
-    if not free and any(content.get("feasible_set") in ("inertia", "pseudo_inertia") for content in both):
+    tested = reference.covariance is not None and side.covariance is not None
+    if tested and not free and any(content.get("feasible_set") in ("inertia", "pseudo_inertia") for content in both):
         notes.append("constrained values are compared, in the covariance of unconstrained ones: on the careful side")
+    made = [f"{content.get('method', '?')}, {content.get('feasible_set', '?')}" for content in both]
+    if made[0] != made[1] and (worst := in_use.worst()) is not None:
+        notes.append(
+            f"values in use come about in two ways ({made[0]}; {made[1]}) and change the torque of joint "
+            f"{', '.join(_names(side, [worst[0] + 1]))} by {worst[1]:.2%}, the most of all joints"
+        )
     recordings = [{one["sha256"] for one in content.get("provenance", {}).get("recordings", [])} for content in both]
     if reference.sha256 != side.sha256 and recordings[0] & recordings[1]:
         notes.append("both were fitted to the same recording: their doubts are not independent")

@@ -16,6 +16,7 @@ from ident_service.model.chain import Array
 from ident_service.results.comparison.comparison import Comparison, Pair
 from ident_service.results.comparison.findings import findings
 from ident_service.results.comparison.sides import Side
+from ident_service.results.comparison.text import contradiction
 from ident_service.results.files import write_atomically
 from ident_service.results.schemas import require_schema
 
@@ -69,11 +70,15 @@ def _pair(reference: Side, pair: Pair) -> dict[str, Any]:
         "side": _side(pair.side),
         "verdict": pair.verdict,
         "reason": pair.reason,
+        "contradiction": contradiction(pair),
         "parameters": {
             "expressions": [expressions[place] for place in pair.places[0]],
             "reference": first.tolist(),
             "compared": second.tolist(),
             "difference": pair.difference.tolist(),
+            "tested": "unconstrained_values" if pair.free else "values",
+            "used": {"reference": pair.in_use.reference.tolist(), "compared": pair.in_use.side.tolist()},
+            "used_torque_share": None if pair.in_use.shares is None else pair.in_use.shares[0].tolist(),
             "standard_deviations": None if found is None else _perhaps(found.deviations),
             "z": None if found is None else found.z.tolist(),
             "p": None if found is None else found.p.tolist(),

@@ -14,7 +14,7 @@ from ident_service.model.layout import TERM_SYMBOLS, Layout
 from ident_service.results.comparison.comparison import Pair
 from ident_service.results.comparison.findings import joint_name
 from ident_service.results.comparison.sides import Side
-from ident_service.results.drawing import Axes, Canvas
+from ident_service.results.drawing import Axes, Canvas, number
 from ident_service.results.drawing_chart import draw_frame, draw_key, range_around
 from ident_service.results.evidence.friction import friction_term
 from ident_service.results.report.figure import LEFT, RIGHT, WIDTH, Figure
@@ -26,13 +26,13 @@ _TERMS: dict[str, JointTerm] = {symbol: term for term, symbol in TERM_SYMBOLS.it
 _LARGEST_Z = 1e3
 
 
-def friction_curves(reference: Side, pair: Pair, number: int) -> list[Figure]:
+def friction_curves(reference: Side, pair: Pair, place: int) -> list[Figure]:
     """One figure per joint with friction on both sides.
 
     Args:
         reference: the first side.
         pair: the other one.
-        number: of the pair, from 1, for the figures' names.
+        place: of the pair, from 1, for the figures' names.
     """
     ours, theirs = (_friction(side) for side in (reference, pair.side))
     figures = []
@@ -52,10 +52,10 @@ def friction_curves(reference: Side, pair: Pair, number: int) -> list[Figure]:
             for branch in (at < 0.0, at > 0.0):
                 canvas.polyline(kind, axes.x(at[branch]), axes.y(curve[branch]))
         most = float(np.max(np.abs(curves[1] - curves[0])))
-        words = f"{joint_name(pair, joint)}: the curves differ by {most:.3g} {torque} at most."
+        words = f"{joint_name(pair, joint)}: the curves differ by {most:.3g} {torque} at most, by the values in use."
         figures.append(
             Figure(
-                slug=f"friction-{number}-{joint}",
+                slug=f"friction-{place}-{joint}",
                 title=f"{joint_name(pair, joint)}: friction of both against velocity",
                 description=words,
                 caption=f"{words} Good: one line on the other. Bad: farther apart where the joint is fast (viscous: "
@@ -66,7 +66,7 @@ def friction_curves(reference: Side, pair: Pair, number: int) -> list[Figure]:
     return figures
 
 
-def z_figure(found: Drift, number: int) -> Figure:
+def z_figure(found: Drift, place: int) -> Figure:
     """Every parameter's difference in standard deviations, on a scale that shows 1 as well as 1000."""
     size = len(found.z)
     shown = _squeezed(np.clip(found.z, -_LARGEST_Z, _LARGEST_Z))
@@ -76,13 +76,16 @@ def z_figure(found: Drift, number: int) -> Figure:
     limit = max(float(np.max(np.abs(shown), initial=0.0)), float(_squeezed(np.array([line]))[0])) * 1.1
     axes = Axes(LEFT, _TOP, WIDTH - LEFT - RIGHT, _HEIGHT, 0.0, size + 1.0, -limit, limit)
     draw_key(canvas, WIDTH - RIGHT, 16, [("dot", "good", "within chance"), ("area", "bad", "beyond")])
-    draw_frame(canvas, axes, x="number of the base parameter, as in the table", y="asinh(z)")
+    sigmas = [sign * level for level in _levels(limit) for sign in (-1.0, 1.0)[: 2 if level else 1]]
+    ticks = [(float(_squeezed(np.array([level]))[0]), number(level)) for level in sigmas]
+    across = "number of the base parameter, as in the table"
+    draw_frame(canvas, axes, x=across, y="difference [\u03c3], closer together the larger it is", y_ticks=ticks)
     for level in (-line, line):
         y = float(axes.y(_squeezed(np.array([level]))[0]))
         canvas.line("limit", LEFT, y, WIDTH - RIGHT, y)
-    for place in range(size):
-        x, y = float(axes.x(place + 1.0)), float(axes.y(shown[place]))
-        beyond = found.p[place] < ALPHA
+    for k in range(size):
+        x, y = float(axes.x(k + 1.0)), float(axes.y(shown[k]))
+        beyond = found.p[k] < ALPHA
         # Shape tells what colour tells.
         if beyond:
             canvas.rectangle("bad", x - 3.6, y - 3.6, 7.2, 7.2)
@@ -91,13 +94,19 @@ def z_figure(found: Drift, number: int) -> Figure:
     count = int(np.sum(found.p < ALPHA))
     words = f"{count} of {size} parameters lie beyond chance; the largest |z| is {float(np.max(np.abs(found.z))):.3g}."
     return Figure(
-        slug=f"z-{number}",
+        slug=f"z-{place}",
         title="Difference of every base parameter in standard deviations",
         description=words,
         caption=f"{words} Good: round dots between the lines, without a pattern. Bad: squares; neighbours that are "
         "squares together are one effect, as the findings say.",
         canvas=canvas,
     )
+
+
+def _levels(limit: float) -> tuple[float, ...]:
+    """Standard deviations to mark on a squeezed scale up to a limit, so far apart that their numbers can be read."""
+    levels = (0.0, 1.0, 3.0, 10.0, 30.0) if limit < 4.5 else (0.0, 1.0, 10.0, 100.0, 1000.0)
+    return tuple(level for level in levels if np.arcsinh(level) <= limit)
 
 
 def _squeezed(z: Array) -> Array:

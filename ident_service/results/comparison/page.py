@@ -13,9 +13,16 @@ import numpy as np
 from ident_service.estimation.drift import ALPHA
 from ident_service.results.comparison.comparison import Comparison, Pair
 from ident_service.results.comparison.figures import friction_curves, z_figure
-from ident_service.results.comparison.findings import findings
+from ident_service.results.comparison.findings import findings, joint_name
 from ident_service.results.comparison.sides import Side
-from ident_service.results.comparison.text import finding_line, verdict_lines
+from ident_service.results.comparison.text import (
+    LEFT_OUT,
+    contradiction,
+    finding_line,
+    shortened,
+    tested_line,
+    verdict_lines,
+)
 from ident_service.results.drawing import number, plain
 from ident_service.results.drawing_style import sheet
 from ident_service.results.report.figure import Figure
@@ -38,7 +45,7 @@ def comparison_html(comparison: Comparison) -> str:
         '<meta name="color-scheme" content="light dark">'
         f"<title>{plain(title)}</title><style>{style}</style>"
     )
-    body = [f"<header><h1>{plain(title)}</h1>{paragraph(f'Reference: {reference.path}')}</header><main>"]
+    body = [f"<header><h1>{plain(title)}</h1>{paragraph(f'Reference: {_name(reference)}')}</header><main>"]
     for place, pair in enumerate(comparison.pairs, 1):
         body += _sections(reference, pair, place)
     body.append(section("files", "What was compared", _files(comparison)))
@@ -49,11 +56,13 @@ def comparison_html(comparison: Comparison) -> str:
 def _sections(reference: Side, pair: Pair, place: int) -> Iterable[str]:
     found = findings(pair)
     first, *_ = verdict_lines(pair)
+    said = contradiction(pair)
     lines = [f"{finding_line(one)}. May mean: {one.meaning}." for one in found]
     yield section(
         f"verdict-{place}",
-        f"{pair.side.path}: {pair.verdict}",
+        f"{_name(pair.side)}: {pair.verdict}",
         paragraph(first, "verdict"),
+        paragraph(said) if said else "",
         items(lines) if lines else "",
         items(pair.notes) if pair.notes else "",
     )
@@ -94,12 +103,18 @@ def _parameters(reference: Side, pair: Pair) -> str:
         rows.append(cells)
     heads = ["no.", "base parameter", "unit", "reference", "compared", "difference", "\u03c3", "z", "p (Holm)"]
     caption = "Base parameters that both have, \u03c3 being the difference's standard deviation"
+    if tested := tested_line(pair):
+        caption += f"; {tested}"
+    if pair.in_use.apart:
+        heads += ["reference in use", "compared in use"]
+        for k, cells in enumerate(rows):
+            cells += [_number(float(pair.in_use.reference[k])), _number(float(pair.in_use.side[k]))]
     return table(caption, heads, rows, kind="parameters")
 
 
 def _left_out(pair: Pair) -> str:
     parts = [("the reference", pair.only_reference), ("the compared", pair.only_side)]
-    return "".join(f"<h3>Only in {plain(name)}</h3>{items(rows)}" for name, rows in parts if rows)
+    return "".join(f"<h3>Only in {plain(name)}</h3>{items(shortened(rows))}" for name, rows in parts if rows)
 
 
 def _effects(pair: Pair) -> str:
@@ -109,14 +124,18 @@ def _effects(pair: Pair) -> str:
     for one in pair.drift.effects:
         torque = _NOTHING if one.torque_share is None else _number(100.0 * one.torque_share, 3)
         residual = _NOTHING if one.residual_share is None else _number(100.0 * one.residual_share, 3)
-        name = f"{one.kind} of {'joint' if one.kind in ('friction', 'drive inertia') else 'link'} {one.number}"
+        of_joint = one.kind in ("friction", "drive inertia")
+        name = f"{one.kind} of {f'joint {joint_name(pair, one.number)}' if of_joint else f'link {one.number}'}"
         changed = Cell("changed", kind="bad") if one.changed else Cell("no")
         rows.append([Cell(name), _number(one.test.sigma, 3), _number(one.p, 2), torque, residual, changed])
     joint = pair.drift.joint
     together = [_number(joint.sigma, 3), _number(pair.drift.joint_p, 2)]
     rows.append([Cell("all together"), *together, _NOTHING, _NOTHING, _NOTHING])
     heads = ["effect", "\u03c3", "p (Holm)", "of the torque [%]", "of the residual [%]", "verdict"]
-    return table("Effects: significance, and what they change of the worst joint's torque", heads, rows)
+    made = table("Effects: significance, and what they change of the worst joint's torque", heads, rows)
+    if not joint.left_out:
+        return made
+    return made + paragraph(f"{joint.left_out} of {len(pair.places[0])} directions are {LEFT_OUT}.")
 
 
 def _torque(pair: Pair) -> str:
@@ -129,7 +148,12 @@ def _torque(pair: Pair) -> str:
         values = (own.joint_relative_percent[k], other.joint_relative_percent[k])
         rows.append([Cell(name), *(_number(float(value), 4) for value in values)])
     heads = ["joint", "its own parameters [%]", "the reference's parameters [%]"]
-    return table(f"Relative torque error on the recordings of {pair.side.path}", heads, rows)
+    return table(f"Relative torque error of the values in use, on the recordings of {_name(pair.side)}", heads, rows)
+
+
+def _name(side: Side) -> str:
+    arm = side.content.get("arm", {}).get("name")
+    return f"{side.name} ({arm})" if arm else side.name
 
 
 def _files(comparison: Comparison) -> str:

@@ -21,6 +21,7 @@ from ident_service.estimation.drift import Identified, Motion
 from ident_service.model.chain import Array
 from ident_service.model.expressions import parse_expression
 from ident_service.model.information import Information
+from ident_service.results.consistency import require_consistent
 from ident_service.results.information_document import information_from
 from ident_service.results.parameter_file import ParameterFile, read_parameters
 from ident_service.results.run_folder import PARAMETERS, read_results
@@ -44,6 +45,12 @@ class Side:
     sha256: str
     file: ParameterFile
     config: ArmConfig | None = None
+
+    @property
+    def name(self) -> str:
+        """A short one: of the folder, or of the file where it is not called as in a folder of results."""
+        path = self.path.absolute()
+        return path.parent.name if path.name == PARAMETERS else path.name
 
     @property
     def content(self) -> Mapping[str, Any]:
@@ -146,11 +153,13 @@ def read_side(path: Path) -> Side:
 
     Raises:
         UsageError: neither is there.
-        ParameterError: torn, changed or foreign.
+        ParameterError: torn, changed or foreign, or values that contradict each other.
         ConfigError: the folder's arm is not one that this version reads.
     """
     if path.is_dir():
         results = read_results(path)
+        require_consistent(results.parameters, path / PARAMETERS)
         return Side(path, results.sha256[PARAMETERS], results.parameters, results.config)
     file = read_parameters(path)
+    require_consistent(file, path)
     return Side(path, hashlib.sha256(path.read_bytes()).hexdigest(), file)

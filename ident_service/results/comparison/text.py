@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from ident_service.estimation.drift import ALPHA, RELEVANT_RESIDUAL, RELEVANT_TORQUE
-from ident_service.results.comparison.comparison import Comparison, Pair
-from ident_service.results.comparison.findings import Finding, findings
+from ident_service.estimation.drift import ALPHA, RELEVANT_RESIDUAL, RELEVANT_TORQUE, relevant
+from ident_service.results.comparison.comparison import UNSAID, Comparison, Pair
+from ident_service.results.comparison.findings import Finding, findings, joint_name
 from ident_service.results.comparison.sides import Side
 
 _WIDTH = 46
+_MOST = 8  # parameters that only one side has, of which each is named
+LEFT_OUT = (
+    "left out: directions that neither motion shows, or that the recordings, being short, cannot tell from noise; of "
+    "these the test says nothing"
+)
 
 
 def comparison_text(comparison: Comparison) -> str:
@@ -32,6 +39,7 @@ def _pair(comparison: Comparison, pair: Pair) -> list[str]:
         left = f", {joint.left_out} of {len(pair.places[0])} directions left out" if joint.left_out else ""
         lines += ["", f"all parameters together: {joint.sigma:.3g} sigma in {joint.directions} directions, "]
         lines[-1] += f"p = {joint.p:.2g}{left}"
+        lines += [f"  {LEFT_OUT}"] if left else []
     for name, share in _shares(pair):
         lines.append(f"  joint {name}: the differences change its predicted torque by {share:.2%} (root mean squares)")
     if pair.crossed is not None:
@@ -49,10 +57,13 @@ def _pair(comparison: Comparison, pair: Pair) -> list[str]:
     lines += ["", *_table(comparison.reference, pair)]
     for title, left_out in (("the reference", pair.only_reference), (str(pair.side.path), pair.only_side)):
         if left_out:
-            lines += ["", f"left out, only in {title}:", *(f"  {expression}" for expression in left_out)]
+            lines += ["", f"left out, only in {title}:", *(f"  {one}" for one in shortened(left_out))]
     if pair.provenance:
         lines += ["", "what differs in how they came about (reference; compared):"]
-        lines += [f"  {key}: {_short(a, 60)}; {_short(b, 60)}" for key, (a, b) in pair.provenance.items()]
+        said = {key: both for key, both in pair.provenance.items() if UNSAID not in both}
+        lines += [f"  {key}: {_short(a, 60)}; {_short(b, 60)}" for key, (a, b) in said.items()]
+        if alone := [key for key in pair.provenance if key not in said]:
+            lines.append(f"  said of one alone: {', '.join(alone)}")
     lines += [f"note: {note}" for note in pair.notes]
     return [*lines, ""]
 
@@ -63,11 +74,52 @@ def verdict_lines(pair: Pair) -> list[str]:
         return [f"NO VERDICT: {pair.reason}"]
     if pair.drift.verdict == "unchanged":
         floor = f"p >= {ALPHA:g} after Holm, or less than {RELEVANT_TORQUE:.0%} of every joint's torque"
-        return [f"UNCHANGED ({floor} or {RELEVANT_RESIDUAL:.0%} of its residual)"]
+        lines = [f"UNCHANGED ({floor} or {RELEVANT_RESIDUAL:.0%} of its residual)"]
+        return [*lines, contradiction(pair)] if pair.contradicted else lines
     lines = ["CHANGED"]
     for finding in findings(pair):
         lines += [f"  {finding_line(finding)}", f"    may mean: {finding.meaning}"]
     return lines
+
+
+def contradiction(pair: Pair) -> str:
+    """Why an arm that has not changed has values in use that predict other torques; empty where they do not."""
+    worst = pair.in_use.worst()
+    if not pair.contradicted or worst is None:
+        return ""
+    joint, share = worst
+    errors = ""
+    if pair.crossed is not None:
+        own, other = (error.joint_relative_percent[joint] for error in (pair.crossed.own, pair.crossed.reference))
+        errors = f" (torque error {own:.3g} % with its own, {other:.3g} % with the reference's)"
+    if pair.drift is not None and relevant(pair.drift.shares):
+        why = "the tested values differ by as much, which may be chance: their doubt is as large"
+    else:
+        why = (
+            "the unconstrained values, which are tested, do not; what was made of them does (feasible set, "
+            "constraints, method, or a file that was edited)"
+        )
+    return (
+        f"BUT the values in use change the torque of joint {joint_name(pair, joint + 1)} by {share:.2%}{errors}: "
+        f"{why}. Do not take one set of parameters for the other"
+    )
+
+
+def tested_line(pair: Pair) -> str:
+    """Which values the tests are about; empty where nothing is tested."""
+    if pair.compared is None:
+        return ""
+    if not pair.free:
+        return "tested: the values in use"
+    line = "tested: unconstrained values, to which the covariances belong"
+    return f"{line}; the values in use, held in a feasible set, stand beside them" if pair.in_use.apart else line
+
+
+def shortened(rows: Sequence[str]) -> list[str]:
+    """The first few of many, and how many more there are."""
+    if len(rows) <= _MOST:
+        return list(rows)
+    return [*rows[:_MOST], f"and {len(rows) - _MOST} more (all of them in the JSON)"]
 
 
 def finding_line(finding: Finding) -> str:
@@ -98,8 +150,10 @@ def _validations(side: Side) -> str:
 
 
 def _table(reference: Side, pair: Pair) -> list[str]:
+    apart, use = pair.in_use.apart, pair.in_use
     heads = f"{'reference':>11s} {'compared':>11s} {'difference':>11s} {'z':>8s} {'p (Holm)':>9s}"
-    lines = [f"{'base parameter':{_WIDTH}s} {heads}"]
+    heads += f" {'ref. in use':>11s} {'cmp. in use':>11s}" if apart else ""
+    lines = [*filter(None, (tested_line(pair),)), f"{'base parameter':{_WIDTH}s} {heads}"]
     expressions = reference.content["base_parameters"]["expressions"]
     for k, (here, there) in enumerate(zip(*pair.places, strict=True)):
         values = reference.file.values[here], pair.side.file.values[there]
@@ -111,7 +165,8 @@ def _table(reference: Side, pair: Pair) -> list[str]:
             z, p = (f"{pair.drift.z[k]:.2f}", f"{pair.drift.p[k]:.2g}") if seen else ("unseen", "")
         lines.append(
             f"{_short(expressions[here], _WIDTH):{_WIDTH}s} {values[0]:11.4g} {values[1]:11.4g} "
-            f"{pair.difference[k]:11.3g} {z:>8s} {p:>9s}".rstrip()
+            f"{pair.difference[k]:11.3g} {z:>8s} {p:>9s}"
+            f"{f' {use.reference[k]:11.4g} {use.side[k]:11.4g}' if apart else ''}".rstrip()
         )
     return lines
 

@@ -14,6 +14,7 @@ from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base import BaseParameters, base_from_expressions
 from ident_service.model.chain import Array
 from ident_service.model.regressor import joint_regressor
+from ident_service.results.consistency import named_link_values, require_base_values, require_consistent
 from ident_service.results.export.check import AGREEMENT, disagreement, random_states
 from ident_service.results.parameter_file import ParameterFile
 from ident_service.results.run_folder import PARAMETERS, Results, read_results
@@ -31,6 +32,8 @@ class IdentifiedArm:
         sigma: standard deviations of the base parameters, None where unknown.
         verdicts: one word per base parameter, empty where unknown.
         source: SHA-256 of the parameter file.
+        feasible_set: that the values are held in; `none` where they are not.
+        unconstrained: base parameters before that [SI], to which `sigma` belongs, shape (base,); None where unknown.
     """
 
     model: ArmModel
@@ -40,6 +43,15 @@ class IdentifiedArm:
     sigma: tuple[float | None, ...]
     verdicts: tuple[str, ...]
     source: str
+    feasible_set: str = "none"
+    unconstrained: Array | None = None
+
+    @property
+    def sigma_said(self) -> str:
+        """What the standard deviations belong to, where it is not the values beside them; else empty."""
+        if self.feasible_set == "none" or not any(deviation is not None for deviation in self.sigma):
+            return ""
+        return f"standard deviations are of the unconstrained fit; values are held in the set {self.feasible_set}"
 
     @cached_property
     def base_delta(self) -> Array:
@@ -91,6 +103,7 @@ def identified_arm(config: ArmConfig, parameters: ParameterFile, source: str, wh
         raise ParameterError(
             f"{where}: its expressions do not group the parameters of {config.name} as its motion does"
         )
+    require_consistent(parameters, where)
     sigma, verdicts = table.get("standard_deviations"), table.get("verdicts")
     return IdentifiedArm(
         model=model,
@@ -100,6 +113,8 @@ def identified_arm(config: ArmConfig, parameters: ParameterFile, source: str, wh
         sigma=tuple(sigma or [None] * base.size),
         verdicts=tuple(verdicts or [""] * base.size),
         source=source,
+        feasible_set=parameters.feasible_set or "none",
+        unconstrained=None if (free := table.get("unconstrained_values")) is None else np.array(free, dtype=float),
     )
 
 
@@ -116,13 +131,11 @@ def read_identified(folder: Path) -> IdentifiedArm:
 
 
 def _link_values(parameters: ParameterFile, base: BaseParameters, where: Path) -> Array | None:
-    table = parameters.content.get("link_parameters")
-    if table is None:
+    if "link_parameters" not in parameters.content:
         return None
-    named = dict(zip(table["names"], table["values"], strict=False))
-    if len(table["names"]) != len(table["values"]) or set(named) != set(base.names):
+    named = named_link_values(parameters)
+    if named is None or set(named) != set(base.names):
         raise ParameterError(f"{where}: its link parameters are not those of the arm")
-    delta = np.array([float(named[name]) for name in base.names])
-    if np.abs(base.K @ delta - parameters.values).max() > AGREEMENT * np.abs(parameters.values).max():
-        raise ParameterError(f"{where}: its link parameters do not have the values of its base parameters")
+    delta = np.array([named[name] for name in base.names])
+    require_base_values(base, delta, parameters.values, where)
     return delta

@@ -1,4 +1,6 @@
-"""A C99 header with the arm's dynamics in base parameters: nothing but <math.h>, no memory, no state, C++ too.
+"""A C99 header with the arm's dynamics in base parameters: nothing but <math.h>, no memory, C++ too.
+
+The state of friction with pre-sliding is the caller's.
 
 The formulas are those of `model/newton_euler.py`, printed one operation a line, with a zero for every link parameter
 that is no base column. What is written is read back as text and run.
@@ -7,6 +9,7 @@ that is no base column. What is written is read back as text and run.
 from __future__ import annotations
 
 import re
+import textwrap
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -16,10 +19,19 @@ from ident_service.config.schema import JointTerm
 from ident_service.errors import ModelError
 from ident_service.model.chain import Array
 from ident_service.model.newton_euler import drive_torque, friction_torque, mass_matrix, rigid_torque
+from ident_service.model.presliding import presliding_ways, turned
+from ident_service.model.regressor import joint_regressor
 from ident_service.model.tape import Symbol, Tape, Value
 from ident_service.results.export.arm import IdentifiedArm
 from ident_service.results.export.c_code import c_lines, run_c_lines
-from ident_service.results.export.check import AGREEMENT, disagreement, random_states, torque, with_terms
+from ident_service.results.export.check import (
+    AGREEMENT,
+    disagreement,
+    presliding_left_out,
+    random_states,
+    torque,
+    with_terms,
+)
 from ident_service.results.export.words import identifier, plain, unique
 
 _PARAMETER = re.compile(r"^    (-?[\d.e+-]+),? /\* \d+ ")
@@ -68,6 +80,7 @@ def _written(arm: IdentifiedArm) -> str:
 def _preface(arm: IdentifiedArm, name: str) -> str:
     gravity = ", ".join(repr(float(g)) for g in arm.model.chain.gravity)
     terms = ", ".join(arm.model.layout.terms).replace("_", " ") or "none"
+    sigma = f" * Mind: {plain(arm.sigma_said)}.\n *\n" if arm.sigma_said else ""
     return f"""\
 /* Dynamics of the arm {plain(arm.model.config.name)} in identified base parameters.
  *
@@ -85,10 +98,35 @@ def _preface(arm: IdentifiedArm, name: str) -> str:
  * Every array has {name}_JOINTS entries, M their square; results may overwrite arguments. No memory is allocated,
  * nothing global is written, only <math.h> is used; C99 and C++.
  *
- * Made by ident-service {__version__} from parameters with SHA-256
+{_turning_comment(arm, name)}{sigma} * Made by ident-service {__version__} from parameters with SHA-256
  * {arm.source}.
  */
 """
+
+
+def turning_said(arm: IdentifiedArm) -> tuple[str, ...]:
+    """What a reader should know of friction with pre-sliding; nothing where there is none."""
+    name = c_prefix(arm)
+    return tuple(
+        f"{name}_inverse_dynamics and {name}_friction are without {words}; with {name}_turned and "
+        f"{name}_turning_friction the caller carries its state"
+        for words in presliding_left_out(arm.model, arm.base_delta if arm.delta is None else arm.delta)
+    )
+
+
+def _turning_comment(arm: IdentifiedArm, name: str) -> str:
+    said = turning_said(arm)
+    if not said:
+        return ""
+    lines = textwrap.wrap(plain(said[0]) + ".", 115)
+    lines += [
+        "",
+        f"  {name}_turned(step, before, direction)          direction of each drive's dry friction after a step of the",
+        "      joints [rad or m], in which no drive turns round; begin with the signs of the first motion",
+        f"  {name}_turning_friction(dq, direction, tau)     friction and torque offsets with that direction",
+        "",
+    ]
+    return "".join(f" * {line}".rstrip() + "\n" for line in lines)
 
 
 def _parameters(arm: IdentifiedArm, name: str) -> str:
@@ -125,12 +163,39 @@ def _functions(arm: IdentifiedArm) -> list[tuple[str, tuple[str, ...], str, _For
         M = mass_matrix(tape, chain, layout, p, s["q"])
         return [M[i][j] for i in range(n) for j in range(n)]
 
-    return [
+    ways = presliding_ways(arm.model)
+
+    def turn(tape: Tape, p: dict[int, Value], s: dict[str, list[Symbol]]) -> list[Value]:
+        return [
+            _turned(tape, share, s["step"], before, x0)
+            for share, before, x0 in zip(chain.coupling, s["before"], ways, strict=True)
+        ]
+
+    def turning(tape: Tape, p: dict[int, Value], s: dict[str, list[Symbol]]) -> list[Value]:
+        return friction_torque(tape, chain, layout, p, s["dq"], s["direction"])
+
+    found: list[tuple[str, tuple[str, ...], str, _Formulas]] = [
         ("rigid_dynamics", ("q", "dq", "ddq"), "tau", rigid),
         ("friction", ("dq",), "tau", friction),
         ("gravity", ("q",), "tau", gravity),
         ("mass_matrix", ("q",), "M", mass),
     ]
+    if turning_said(arm):
+        found += [("turned", ("step", "before"), "direction", turn)]
+        found += [("turning_friction", ("dq", "direction"), "tau", turning)]
+    return found
+
+
+def _turned(tape: Tape, share: Array, step: list[Symbol], before: Symbol, way: float) -> Value:
+    """One step of Dahl's law (`model/presliding.py`) of one drive."""
+    travelled: Value = sum((float(c) * x for c, x in zip(share, step, strict=True) if c), 0.0)
+    if not isinstance(travelled, Symbol):
+        return before  # a drive that moves no joint
+    sign = tape.apply("sign", travelled)
+    if not way > 0.0:
+        return sign
+    spent = tape.apply("abs", travelled) * (-1.0 / way)
+    return sign + (before - sign) * (tape.apply("exp", spent) if isinstance(spent, Symbol) else 1.0)
 
 
 def _function(
@@ -216,6 +281,7 @@ def _check(arm: IdentifiedArm, text: str) -> None:
         # Where offsets are grouped with masses, only the sum is the same.
         ("gravity", run("gravity") + run("friction", {"dq": still.T}), torque(model, delta, (q, still, still))),
         ("mass matrix", run("mass_matrix"), M.reshape(len(q), n * n)),
+        *_turning_pairs(arm, delta, run),
     )
     for what, found, meant in pairs:
         if np.abs(meant).max() == 0.0 == np.abs(found).max():
@@ -224,3 +290,27 @@ def _check(arm: IdentifiedArm, text: str) -> None:
             raise ModelError(
                 f"{arm.model.config.name}: {what} read back from the C header differs from the parameters'"
             )
+
+
+def _turning_pairs(
+    arm: IdentifiedArm, delta: Array, run: Callable[[str, dict[str, Array]], Array]
+) -> list[tuple[str, Array, Array]]:
+    """Friction with a state, as read back and as meant, after small steps and after none."""
+    if not turning_said(arm):
+        return []
+    model, ways = arm.model, presliding_ways(arm.model)
+    still, dq, before = random_states(model.chain.joints)
+    step = np.where(np.arange(len(dq))[:, None] % 3 == 0, 0.0, 1e-3 * dq)
+    before = np.tanh(before)
+    direction = turned(before, step @ model.chain.coupling.T, ways)
+    H = joint_regressor(model.chain, model.layout, 0.0 * still, dq, 0.0 * dq, direction=direction)
+    without = with_terms(model, delta, [term for term in model.layout.terms if term != "drive_inertia"])
+    without -= with_terms(model, delta, ())
+    friction = run("turning_friction", {"dq": dq.T, "direction": direction.T})
+    memoryless = run("friction", {"dq": dq.T})
+    dry = np.einsum("jps,p->sj", H - joint_regressor(model.chain, model.layout, 0.0 * still, dq, 0.0 * dq), without)
+    return [
+        ("direction of friction", run("turned", {"step": step.T, "before": before.T}), direction),
+        # Where offsets are grouped with masses, only differences of friction are the same.
+        ("friction with a state", friction - memoryless, dry),
+    ]

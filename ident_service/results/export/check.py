@@ -13,6 +13,7 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array
 from ident_service.model.drives import JOINT_TERMS, WrittenArm, joint_drives
 from ident_service.model.layout import TERM_SYMBOLS, Layout
+from ident_service.model.presliding import presliding_ways
 from ident_service.model.regressor import joint_regressor
 
 AGREEMENT = 1e-9
@@ -123,4 +124,21 @@ def left_out(model: ArmModel, delta: Array, has: Carried) -> tuple[str, ...]:
         if missing.any():
             joints = "every joint" if missing.all() else ", ".join(np.array(model.chain.names)[missing])
             found.append(f"{_WORDS[term]} ({TERM_SYMBOLS[term]}) of {joints}")
-    return tuple(found)
+    return (*found, *presliding_left_out(model, delta))
+
+
+def presliding_left_out(model: ArmModel, delta: Array) -> tuple[str, ...]:
+    """Pre-sliding of dry friction, in words, where a drive has it: what has no memory does not carry it."""
+    layout, ways = model.layout, presliding_ways(model)
+    dry = [layout.term_values(term, delta) for term in ("coulomb", "stribeck") if term in layout.terms]
+    said = [
+        f"{name} {way:.3g} {'rad' if turns else 'm'}"
+        for name, way, turns, *values in zip(model.chain.names, ways, model.chain.revolute, *dry, strict=True)
+        if way > 0.0 and any(values)
+    ]
+    if not said:
+        return ()
+    return (
+        f"pre-sliding of dry friction (way: {', '.join(said)}): here it turns round at once, and torques after a "
+        "reversal differ by up to twice the dry friction; the torque errors of the report are with pre-sliding",
+    )

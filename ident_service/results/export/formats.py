@@ -11,7 +11,8 @@ from pathlib import Path
 
 from ident_service.errors import UsageError
 from ident_service.results.export.arm import IdentifiedArm, read_identified
-from ident_service.results.export.c_header import c_header, c_prefix
+from ident_service.results.export.bodies_said import body_notes
+from ident_service.results.export.c_header import c_header, c_prefix, turning_said
 from ident_service.results.export.json_model import json_export
 from ident_service.results.export.mjcf import mjcf_export
 from ident_service.results.export.sdf import sdf_export
@@ -44,35 +45,45 @@ _BASE_ONLY = "no body has these parameters: base parameters only"
 
 def _urdf(arm: IdentifiedArm) -> Export:
     name = f"{arm.model.config.name}.urdf"
-    text, lost, notes = urdf_export(arm.model, arm.body(), name)
-    return Export("urdf", name, text, lost, notes)
+    said = body_notes(arm)
+    text, lost, notes = urdf_export(arm.model, arm.body(), name, said)
+    return Export("urdf", name, text, lost, (*notes, *said))
 
 
 def _mjcf(arm: IdentifiedArm) -> Export:
     name = f"{arm.model.config.name}.xml"
-    text, lost = mjcf_export(arm.model, arm.body(), name)
-    return Export("mjcf", name, text, lost)
+    said = body_notes(arm)
+    text, lost = mjcf_export(arm.model, arm.body(), name, said)
+    return Export("mjcf", name, text, lost, said)
 
 
 def _sdf(arm: IdentifiedArm) -> Export:
     name = f"{arm.model.config.name}.sdf"
-    text, lost, notes = sdf_export(arm.model, arm.body(), name)
-    return Export("sdf", name, text, lost, notes)
+    said = body_notes(arm)
+    text, lost, notes = sdf_export(arm.model, arm.body(), name, said)
+    return Export("sdf", name, text, lost, (*notes, *said))
 
 
 def _json(arm: IdentifiedArm) -> Export:
     name = f"{arm.model.config.name}.json"
-    return Export("json", name, json_export(arm, name), notes=(_BASE_ONLY,) if arm.delta is None else ())
+    return Export("json", name, json_export(arm, name), notes=_notes(arm))
 
 
 def _csv(arm: IdentifiedArm) -> Export:
     name = f"{arm.model.config.name}.csv"
     lost = ("kinematics",)
-    return Export("csv", name, csv_export(arm, name), lost, (_BASE_ONLY,) if arm.delta is None else ())
+    return Export("csv", name, csv_export(arm, name), lost, _notes(arm))
 
 
 def _c(arm: IdentifiedArm) -> Export:
-    return Export("c", f"{c_prefix(arm)}_dynamics.h", c_header(arm))
+    notes = (*turning_said(arm), *filter(None, (arm.sigma_said,)))
+    return Export("c", f"{c_prefix(arm)}_dynamics.h", c_header(arm), notes=notes)
+
+
+def _notes(arm: IdentifiedArm) -> tuple[str, ...]:
+    """Of the formats with base and link values."""
+    notes = (_BASE_ONLY,) if arm.delta is None else body_notes(arm)
+    return (*notes, arm.sigma_said) if arm.sigma_said else notes
 
 
 FORMATS: dict[str, Callable[[IdentifiedArm], Export]] = {

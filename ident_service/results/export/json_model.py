@@ -15,9 +15,11 @@ from ident_service.config.schema import Joint
 from ident_service.errors import ModelError
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.layout import INERTIAL, Layout
+from ident_service.model.presliding import presliding_ways
 from ident_service.model.regressor import joint_regressor
 from ident_service.results.export.arm import IdentifiedArm
 from ident_service.results.export.bodies import about_center, about_origin, joint_bodies
+from ident_service.results.export.bodies_said import body_notes
 from ident_service.results.export.check import AGREEMENT, disagreement, random_states, torque
 
 _FORMAT, _VERSION = "ident-dynamics", 1
@@ -70,14 +72,20 @@ def _document(arm: IdentifiedArm) -> dict[str, Any]:
         "arm": model.config.name,
         "software": f"ident-service {__version__}",
         "parameters_sha256": arm.source,
+        "notes": [*body_notes(arm), *filter(None, (arm.sigma_said,))],
         "units": "SI: m, rad, kg, s, N m; torque positive along the joint's axis",
         "gravity": chain.gravity.tolist(),
         "joints": joints,
+        "friction": {
+            "presliding": presliding_ways(model).tolist(),
+            "stribeck_velocity": list(layout.stribeck_velocity),
+        },
         "drives": None if arm.delta is None else {"coupling": chain.coupling.tolist(), **drives},
         "base_parameters": {
             "expressions": list(arm.base.expressions),
             "units": list(arm.base.units),
             "values": arm.beta.tolist(),
+            "unconstrained_values": None if arm.unconstrained is None else arm.unconstrained.tolist(),
             "standard_deviations": list(arm.sigma),
             "verdicts": list(arm.verdicts),
         },
@@ -94,6 +102,8 @@ def _check(arm: IdentifiedArm, text: str, name: str) -> None:
     content = json.loads(text)
     if content["base_parameters"]["values"] != arm.beta.tolist():
         raise ModelError(f"{name}: the base parameters read back differ; it was not written")
+    if content["friction"]["presliding"] != presliding_ways(arm.model).tolist():
+        raise ModelError(f"{name}: the ways of pre-sliding read back differ; it was not written")
     if arm.delta is None:
         return
     joints, drives, n = content["joints"], dict(content["drives"]), len(content["joints"])

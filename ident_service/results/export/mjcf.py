@@ -19,19 +19,20 @@ from ident_service.model.chain import WORLD, Array
 from ident_service.model.drives import JOINT_TERMS, joint_drives
 from ident_service.results.export.bodies import about_center, joint_bodies, require_real
 from ident_service.results.export.check import Carried, carried, gravity_of, left_out, require_same_torques
-from ident_service.results.export.words import plain, unique
+from ident_service.results.export.words import comments, unique
 from ident_service.results.export.xml_places import xml_places
 
 _ATTRIBUTES = dict(zip(JOINT_TERMS, ("armature", "damping", "frictionloss"), strict=True))
 
 
-def mjcf_export(model: ArmModel, delta: Array, name: str) -> tuple[str, tuple[str, ...]]:
+def mjcf_export(model: ArmModel, delta: Array, name: str, said: tuple[str, ...] = ()) -> tuple[str, tuple[str, ...]]:
     """The arm as MJCF, after pinocchio has read the same torques out of it.
 
     Args:
         model: the arm.
         delta: link parameters, shape (layout.size,).
         name: of the file, for errors.
+        said: of its bodies, for a comment in it.
 
     Returns:
         The text, and what it does not carry.
@@ -47,7 +48,7 @@ def mjcf_export(model: ArmModel, delta: Array, name: str) -> tuple[str, tuple[st
     lost = left_out(model, delta, everything)
     if any(joint.velocity is not None for joint in model.config.joints.values()):
         lost = (*lost, "velocity limits")
-    text = _text(model, delta, has, shared, lost)
+    text = _text(model, delta, has, shared, lost, said)
     written = read_back(TextFile(name=name, text=text), "mjcf", gravity_of(model))
     require_same_torques(model, delta, written, has, name)
     _require_same_tendons(model, delta, text, shared, name)
@@ -61,13 +62,14 @@ def _shared(model: ArmModel, delta: Array) -> Carried:
     return {term: ~own & (model.layout.term_values(term, delta) >= 0.0) for term in terms}
 
 
-def _text(model: ArmModel, delta: Array, has: Carried, shared: Carried, lost: tuple[str, ...]) -> str:
+def _text(
+    model: ArmModel, delta: Array, has: Carried, shared: Carried, lost: tuple[str, ...], said: tuple[str, ...]
+) -> str:
     chain = model.chain
     bodies = joint_bodies(model, delta)
     require_real(model, bodies, "MuJoCo")
     root = ET.Element("mujoco", model=model.config.name)
-    if lost:
-        root.append(ET.Comment(f" This format has no place for: {plain('; '.join(lost))}. "))
+    root.extend(ET.Comment(comment) for comment in comments(lost, said))
     ET.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     ET.SubElement(root, "option", gravity=_numbers(chain.gravity))
     *names, base = unique((*chain.names, *(f"{name}_link" for name in chain.names), "base_link"))[chain.joints :]

@@ -17,20 +17,23 @@ from ident_service.model.urdf import roll_pitch_yaw
 from ident_service.results.export.bodies import about_center, joint_bodies, require_real
 from ident_service.results.export.check import Carried, carried, gravity_of, left_out, require_same_torques
 from ident_service.results.export.sdf_reader import read_sdf
-from ident_service.results.export.words import plain, unique
+from ident_service.results.export.words import comments, unique
 
 _TERMS: tuple[JointTerm, ...] = ("viscous", "coulomb")
 _UNBOUNDED = 1e16  # the specification's own word for it before 1.11
 _ENTRIES = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
 
 
-def sdf_export(model: ArmModel, delta: Array, name: str) -> tuple[str, tuple[str, ...], tuple[str, ...]]:
+def sdf_export(
+    model: ArmModel, delta: Array, name: str, said: tuple[str, ...] = ()
+) -> tuple[str, tuple[str, ...], tuple[str, ...]]:
     """The arm as SDF, after the same torques were read out of it.
 
     Args:
         model: the arm.
         delta: link parameters, shape (layout.size,).
         name: of the file, for errors.
+        said: of its bodies, for a comment in it.
 
     Returns:
         The text, what it does not carry, and notes.
@@ -42,7 +45,7 @@ def sdf_export(model: ArmModel, delta: Array, name: str) -> tuple[str, tuple[str
     gravity = ("gravity",) if model.chain.gravity.any() else ()
     lost = (*gravity, *left_out(model, delta, has))
     joints = _names(model)
-    text = _text(model, delta, has, joints, lost)
+    text = _text(model, delta, has, joints, lost, said)
     written = read_sdf(text, name, gravity_of(model), dict(zip(joints, model.chain.names, strict=True)))
     require_same_torques(model, delta, written, has, name)
     renamed = [f"{own} is called {new}" for own, new in zip(model.chain.names, joints, strict=True) if own != new]
@@ -59,13 +62,14 @@ def _names(model: ArmModel) -> tuple[str, ...]:
     return unique(found)
 
 
-def _text(model: ArmModel, delta: Array, has: Carried, joints: tuple[str, ...], lost: tuple[str, ...]) -> str:
+def _text(
+    model: ArmModel, delta: Array, has: Carried, joints: tuple[str, ...], lost: tuple[str, ...], said: tuple[str, ...]
+) -> str:
     chain = model.chain
     bodies = joint_bodies(model, delta)
     require_real(model, bodies, "SDF's readers")
     root = ET.Element("sdf", version="1.9")
-    if lost:
-        root.append(ET.Comment(f" This format has no place for: {plain('; '.join(lost))}. "))
+    root.extend(ET.Comment(comment) for comment in comments(lost, said))
     arm = ET.SubElement(root, "model", name=model.config.name)
     links = unique((*joints, *(f"{name}_link" for name in joints)))[chain.joints :]
     drives = joint_drives(chain, model.layout, delta)

@@ -1,4 +1,4 @@
-"""CSV: one parameter a row, base parameters first, then the link parameters of a body that has them."""
+"""CSV: one parameter a row: base parameters, the link parameters of a body that has them, the shape of friction."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import csv
 import io
 
 from ident_service.errors import ModelError
+from ident_service.model.presliding import presliding_ways
 from ident_service.results.export.arm import IdentifiedArm
 
-_HEADER = ("kind", "name", "unit", "value", "sigma", "verdict")
+# Standard deviations are those of the unconstrained values; both are the same where nothing was constrained.
+_HEADER = ("kind", "name", "unit", "value", "sigma", "verdict", "unconstrained_value")
 
 
 def csv_export(arm: IdentifiedArm, name: str) -> str:
@@ -23,19 +25,35 @@ def csv_export(arm: IdentifiedArm, name: str) -> str:
     """
     base, layout = arm.base, arm.model.layout
     sigma = ("" if deviation is None else repr(float(deviation)) for deviation in arm.sigma)
+    free = [""] * base.size if arm.unconstrained is None else [repr(float(value)) for value in arm.unconstrained]
     rows = [
-        ("base", expression, unit, repr(float(value)), deviation, verdict)
-        for expression, unit, value, deviation, verdict in zip(
-            base.expressions, base.units, arm.beta, sigma, arm.verdicts, strict=True
+        ("base", expression, unit, repr(float(value)), deviation, verdict, before)
+        for expression, unit, value, deviation, verdict, before in zip(
+            base.expressions, base.units, arm.beta, sigma, arm.verdicts, free, strict=True
         )
     ]
+    shape = _friction_shape(arm)
     if arm.delta is not None:
         table = zip(layout.names, layout.units, arm.delta, strict=True)
-        rows += [("link", parameter, unit, repr(float(value)), "", "") for parameter, unit, value in table]
+        rows += [("link", parameter, unit, repr(float(value)), "", "", "") for parameter, unit, value in table]
+    rows += [("friction shape", parameter, unit, repr(value), "", "", "") for parameter, unit, value in shape]
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([_HEADER, *rows])
     found = [row["value"] for row in csv.DictReader(io.StringIO(text.getvalue()))]
-    meant = [*arm.beta.tolist(), *([] if arm.delta is None else arm.delta.tolist())]
+    meant = [*arm.beta.tolist(), *([] if arm.delta is None else arm.delta.tolist()), *(value for *_, value in shape)]
     if [float(value) for value in found] != meant:
         raise ModelError(f"{name}: the table read back differs from the parameters; it was not written")
     return text.getvalue()
+
+
+def _friction_shape(arm: IdentifiedArm) -> list[tuple[str, str, float]]:
+    """What in the friction is not linear, joint by joint: name, unit, value; none of what the arm has not."""
+    model, layout = arm.model, arm.model.layout
+    units = ["rad" if turns else "m" for turns in model.chain.revolute]
+    ways = presliding_ways(model).tolist()
+    found = [(f"presliding{k}", unit, way) for k, (unit, way) in enumerate(zip(units, ways, strict=True), 1)]
+    found = found if any(ways) else []
+    if "stribeck" in layout.terms:
+        velocities = enumerate(zip(units, layout.stribeck_velocity, strict=True), 1)
+        found += [(f"stribeck_velocity{k}", f"{unit}/s", float(velocity)) for k, (unit, velocity) in velocities]
+    return found

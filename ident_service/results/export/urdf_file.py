@@ -5,6 +5,7 @@ URDF has a place for viscous and dry friction of a joint, none for gravity, driv
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from ident_service.config.quantities import TextFile
@@ -12,20 +13,32 @@ from ident_service.config.schema import JointTerm
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array
 from ident_service.model.urdf import urdf_text
-from ident_service.results.export.check import carried, gravity_of, left_out, require_same_torques
+from ident_service.results.export.check import (
+    carried,
+    gravity_of,
+    left_out,
+    presliding_left_out,
+    require_same_torques,
+)
 from ident_service.results.export.original_urdf import original_urdf
+from ident_service.results.export.words import plain
 from ident_service.results.files import write_atomically
 
+_MARK = "ident-service: "
+_EARLIER = re.compile(rf"(?:<!-- {_MARK}[^<>]*-->\n)+\Z")
 _TERMS: tuple[JointTerm, ...] = ("viscous", "coulomb")
 
 
-def urdf_export(model: ArmModel, delta: Array, name: str) -> tuple[str, tuple[str, ...], tuple[str, ...]]:
+def urdf_export(
+    model: ArmModel, delta: Array, name: str, said: tuple[str, ...] = ()
+) -> tuple[str, tuple[str, ...], tuple[str, ...]]:
     """The identified URDF, after pinocchio has read the same torques out of it.
 
     Args:
         model: the arm.
         delta: link parameters, shape (layout.size,).
         name: of the file, for errors.
+        said: of its bodies, for a comment at its end.
 
     Returns:
         The text, what it does not carry, and notes.
@@ -41,10 +54,20 @@ def urdf_export(model: ArmModel, delta: Array, name: str) -> tuple[str, tuple[st
         text, notes = original_urdf(model, delta, has)
     else:
         text = urdf_text(model, delta)
+    gravity = "gravity" if model.chain.gravity.any() else ""
+    unwritten = left_out(model, delta, has)
+    text = _commented(text, (*presliding_left_out(model, delta), *said))
     written = read_back(TextFile(name=name, text=text), "urdf", gravity_of(model))
     require_same_torques(model, delta, written, has, name)
-    gravity = "gravity" if model.chain.gravity.any() else ""
-    return text, tuple(filter(None, (gravity, *left_out(model, delta, has)))), notes
+    return text, tuple(filter(None, (gravity, *unwritten))), notes
+
+
+def _commented(text: str, said: tuple[str, ...]) -> str:
+    """With comments at the end instead of those of an earlier export; every byte before is as it was."""
+    kept = _EARLIER.sub("", text)
+    if not said:
+        return kept
+    return kept + ("" if kept.endswith("\n") else "\n") + "".join(f"<!-- {_MARK}{plain(one)}. -->\n" for one in said)
 
 
 def write_urdf(path: Path, model: ArmModel, delta: Array) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 
 def identifier(name: str) -> str:
@@ -23,6 +23,12 @@ def unique(names: Iterable[str]) -> tuple[str, ...]:
         taken.add(candidate)
         found.append(candidate)
     return tuple(found)
+
+
+def comments(lost: Sequence[str], said: Sequence[str]) -> tuple[str, ...]:
+    """What a file says of itself: what its format has no place for, and what its reader should know."""
+    parts = ([f"This format has no place for: {'; '.join(lost)}"] if lost else []) + list(said)
+    return tuple(f" {plain(part)}. " for part in parts)
 
 
 def plain(text: str) -> str:
