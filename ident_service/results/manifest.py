@@ -18,6 +18,7 @@ from ident_service.results.files import write_atomically
 
 MANIFEST: Final = "manifest.json"
 _MAX_BYTES = 64 * 2**20
+_REMEDY = "identify again, or copy the folder again"
 
 
 def named_files(folder: Path) -> Mapping[str, str]:
