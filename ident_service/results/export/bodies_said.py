@@ -42,7 +42,7 @@ def _implausible(model: ArmModel, delta: Array) -> tuple[str, ...]:
 
 
 def reach(model: ArmModel) -> float:
-    """Longest way from the first joint, wherever that is mounted, along the frames and the last link; with strokes [m]."""
+    """Longest way from the first joint, wherever that is mounted, along the frames and the last link [m]."""
     chain = model.chain
     ways = np.zeros(chain.joints)
     for k, parent in enumerate(chain.parents):
