@@ -42,11 +42,12 @@ def _implausible(model: ArmModel, delta: Array) -> tuple[str, ...]:
 
 
 def reach(model: ArmModel) -> float:
-    """Longest way from the base along the joints' frames and the last link's, strokes included [m]."""
+    """Longest way from the first joint, wherever that is mounted, along the frames and the last link [m]."""
     chain = model.chain
     ways = np.zeros(chain.joints)
     for k, parent in enumerate(chain.parents):
-        ways[k] = np.linalg.norm(chain.translation[k]) + (0.0 if parent == WORLD else ways[parent]) + _stroke(model, k)
+        before = 0.0 if parent == WORLD else ways[parent] + np.linalg.norm(chain.translation[k])
+        ways[k] = before + _stroke(model, k)
     return float(np.max(ways + _link_lengths(chain)))
 
 
