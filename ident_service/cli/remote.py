@@ -10,6 +10,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,7 @@ from ident_service.errors import IdentError, UsageError
 if TYPE_CHECKING:
     from ident_service.service.client import Client
 
+Verb = Callable[["Client", argparse.Namespace], Answer]
 _LOOK = 0.4  # s between looks at a job, and between renewals of its lease
 _CODES = {"done": DONE, "refused": VERDICT_NO, "faulted": FAULTED}
 _LIVE = ("queued", "running")
@@ -29,14 +31,14 @@ _MOVE = ("check", "run", "home")
 def add(verbs: Verbs) -> None:
     """Register `jobs`."""
     jobs = verbs.group("jobs", "what a daemon does; without --server, that of the state folder")
-    sub = jobs.add("list", _list, "jobs, the newest first")
+    sub = jobs.add("list", _with_client(_list), "jobs, the newest first")
     sub.add_argument("--most", type=count, default=20, metavar="N")
     for name, verb, text in (
         ("show", _show, "one job and what its command answered"),
         ("watch", _watch, "wait for its end; its exit code becomes ours"),
         ("cancel", _cancel, "have it end; a motion by a controlled stop"),
     ):
-        sub = jobs.add(name, verb, text)
+        sub = jobs.add(name, _with_client(verb), text)
         sub.add_argument("job", metavar="ID")
 
 
@@ -50,14 +52,23 @@ def remotely(arguments: argparse.Namespace) -> Answer:
     verb = REMOTE.get(arguments.word)
     if verb is None:
         raise UsageError(f"{arguments.word}: no daemon does this; --server is for {', '.join(sorted(REMOTE))}")
-    return verb(arguments)
+    return _with_client(verb)(arguments)
 
 
-def _asked(make: Callable[[Client, argparse.Namespace], dict[str, Any]]) -> Callable[[argparse.Namespace], Answer]:
+def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
+    """The verb with a connection of its own."""
+
+    def connected(arguments: argparse.Namespace) -> Answer:
+        with closing(_client(arguments)) as client:
+            return verb(client, arguments)
+
+    return connected
+
+
+def _asked(make: Callable[[Client, argparse.Namespace], dict[str, Any]]) -> Verb:
     """A verb that is a job."""
 
-    def verb(arguments: argparse.Namespace) -> Answer:
-        client = _client(arguments)
+    def verb(client: Client, arguments: argparse.Namespace) -> Answer:
         job = {key: value for key, value in make(client, arguments).items() if value is not None}
         body: dict[str, Any] = {"job": {**job, "kind": arguments.word}}
         if arguments.word in _MOVE:
@@ -117,41 +128,38 @@ def _home(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
     return {"arm": arguments.arm}
 
 
-def _ask(arguments: argparse.Namespace) -> Answer:
-    answer = _client(arguments).post(f"/api/v1/arms/{_id(arguments.arm)}/{arguments.word}")
+def _ask(client: Client, arguments: argparse.Namespace) -> Answer:
+    answer = client.post(f"/api/v1/arms/{_id(arguments.arm)}/{arguments.word}")
     reached = bool(answer.get("reached", answer.get("arms")) or answer.get("jobs"))
     words = f"{arguments.word} asked" if reached else "nobody moves the arm"
     return DONE, f"{arguments.arm}: {words}\n", answer
 
 
-def _ack(arguments: argparse.Namespace) -> Answer:
+def _ack(client: Client, arguments: argparse.Namespace) -> Answer:
     path = f"/api/v1/arms/{_id(arguments.arm)}/faults/{_id(arguments.fault)}/ack"
-    answer = _client(arguments).post(path)
+    answer = client.post(path)
     return DONE, f"{arguments.arm}: acknowledged {answer['code']} ({answer['cause']})\n", answer
 
 
-def _list(arguments: argparse.Namespace) -> Answer:
-    jobs = _client(arguments).get(f"/api/v1/jobs?most={min(arguments.most, 500)}")
+def _list(client: Client, arguments: argparse.Namespace) -> Answer:
+    jobs = client.get(f"/api/v1/jobs?most={min(arguments.most, 500)}")
     lines = [f"{job['id']:<44} {job['state']:<12} {job['arm'] or '':<16} by {job['created_by']}\n" for job in jobs]
     return DONE, "".join(lines) or "no jobs yet\n", {"jobs": jobs}
 
 
-def _show(arguments: argparse.Namespace) -> Answer:
-    client = _client(arguments)
+def _show(client: Client, arguments: argparse.Namespace) -> Answer:
     return _told(client, client.get(f"/api/v1/jobs/{_id(arguments.job)}"), DONE)
 
 
-def _watch(arguments: argparse.Namespace) -> Answer:
-    client = _client(arguments)
+def _watch(client: Client, arguments: argparse.Namespace) -> Answer:
     return _followed(client, arguments, client.get(f"/api/v1/jobs/{_id(arguments.job)}"), moves=False, ours=False)
 
 
-def _cancel(arguments: argparse.Namespace) -> Answer:
-    client = _client(arguments)
+def _cancel(client: Client, arguments: argparse.Namespace) -> Answer:
     return _told(client, client.post(f"/api/v1/jobs/{_id(arguments.job)}/cancel"), DONE)
 
 
-REMOTE: dict[str, Callable[[argparse.Namespace], Answer]] = {
+REMOTE: dict[str, Verb] = {
     "simulate": _asked(_simulate),
     "identify": _asked(_identify),
     "design": _asked(_design),

@@ -168,7 +168,10 @@ class UnitChild:
         return ""
 
     def close(self) -> None:
-        """As the protocol says."""
+        """As the protocol says; once it has ended, the whole socket."""
+        if self._ended:
+            self._socket.close()
+            return
         with suppress(OSError):
             self._socket.shutdown(socket.SHUT_WR)
 

@@ -1,0 +1,224 @@
+"""The daemon as a process: one per state folder, ready and alive for its manager, and the command that asks it."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import socket
+import stat
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from daemon.conftest import quick_text
+from daemon.served import daemon_process
+
+from ident_service.cli import main
+from ident_service.errors import ArmError, MotionRefused, UnknownId, UsageError
+from ident_service.motion.control_file import ControlFile
+from ident_service.service.api.notify import tell_manager, watchdog_seconds
+from ident_service.service.arm_state import control_path
+from ident_service.service.client import Client
+from ident_service.service.jobs.child import ANSWER, LOG, PROCESS, UnitChild, alive, name_of
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+
+
+def ident(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, dict[str, Any]]:
+    """Exit code and document of a command."""
+    capsys.readouterr()
+    try:
+        code = main([*map(str, words), "--json"])
+    except SystemExit as end:
+        code = int(end.code or 0)
+    document = json.loads(capsys.readouterr().out)
+    assert document["exit_code"] == code
+    return code, document
+
+
+def test_the_command_drives_a_daemon(state: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with daemon_process(state) as (process, client):
+        # One instance, and everything below the state folder is its own.
+        second = subprocess.run(
+            [sys.executable, "-m", "ident_service", "serve", "--port", "0", "--state", str(state)],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert second.returncode == 2
+        assert f"process {process.pid} serves this state folder already" in second.stderr
+        assert client.get("/healthz")["healthy"] is True
+        for name in ("token", "registry.sqlite", "serve.lock"):
+            assert stat.S_IMODE((state / name).stat().st_mode) == 0o600, name
+        server = ("--server", client._url, "--state", state)
+        client.post("/api/v1/arms", {"description": quick_text()})
+        code, document = ident(capsys, "run", "quick", *server)
+        assert (code, document["error"]["kind"]) == (2, "UsageError")
+        assert "--confirm quick" in document["error"]["message"]
+        code, document = ident(capsys, "check", "quick", "--confirm", "quick", *server)
+        assert (code, document["job"]["state"]) == (0, "done")
+        code, document = ident(capsys, "simulate", "quick", *server)
+        assert (code, document["job"]["state"], document["answer"]["feasible"]) == (0, "done", True)
+        run = document["job"]["run"]
+        code, document = ident(capsys, "identify", f"{run}/identification.mcap", "--arm", "quick", *server)
+        assert (code, document["answer"]["feasible"]) == (0, True)
+        code, document = ident(capsys, "simulate", "wam7", *server)
+        assert (code, document["job"]["state"]) == (1, "failed")
+        assert ident(capsys, "verify", "x.json", *server)[0] == 2
+        assert ident(capsys, "jobs", "list", "--state", state)[1]["jobs"][0]["kind"] == "simulate"
+        with ControlFile.take(control_path(state, "quick"), None) as mover:
+            assert ident(capsys, "stop", "quick", *server)[1]["arms"] == ["quick"]
+            assert mover.stop
+        # The same acts at a terminal are in the same trail.
+        assert ident(capsys, "accept", state / "runs" / run, "--note", "at the terminal", "--state", state)[0] == 0
+        assert client.get("/api/v1/arms/quick")["accepted"]["who"] == "terminal"
+        code, document = ident(capsys, "token", "add", "ann", "--role", "viewer", "--state", state)
+        looks = Client(client._url, document["token"])
+        assert looks.get("/api/v1/whoami") == {"name": "ann", "role": "viewer"}
+        assert "ident_jobs" in _metrics(client)
+        with pytest.raises(UsageError, match="look only"):
+            looks.post("/api/v1/jobs", {"job": {"kind": "simulate", "arm": "quick"}})
+        with pytest.raises(UnknownId):
+            client.get("/api/v1/runs/none")
+        with pytest.raises(MotionRefused):
+            client.post("/api/v1/jobs", {"job": {"kind": "home", "arm": "quick"}})
+        looks.close()
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 0
+        with pytest.raises(ArmError, match="cannot be reached"):
+            client.get("/healthz")
+    for line in (state.parent / "serve.log").read_text().splitlines():
+        if line.startswith("{"):
+            assert {"time", "level", "logger", "message"} <= set(json.loads(line))
+    assert "ident_" not in (state.parent / "serve.log").read_text().replace("ident_service", "")
+
+
+def _metrics(client: Client) -> str:
+    client._connection.request("GET", "/metrics", headers=client._headers)
+    return client._connection.getresponse().read().decode()
+
+
+def test_a_manager_hears_ready_alive_and_stopping(state: Path, tmp_path: Path) -> None:
+    path = tmp_path / "notify"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(path))
+        manager.settimeout(60)
+        with daemon_process(state, NOTIFY_SOCKET=str(path), WATCHDOG_USEC="400000") as (process, _):
+            heard = {manager.recv(100).decode() for _ in range(3)}
+            assert heard == {"READY=1", "WATCHDOG=1"}
+            process.send_signal(signal.SIGTERM)
+            while manager.recv(100) != b"STOPPING=1":
+                pass
+            assert process.wait(60) == 0
+
+
+def test_without_a_manager_nothing_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+    tell_manager("READY=1")
+    monkeypatch.setenv("NOTIFY_SOCKET", "/nowhere/at/all")
+    tell_manager("READY=1")
+    monkeypatch.setenv("WATCHDOG_USEC", "3000000")
+    monkeypatch.setenv("WATCHDOG_PID", "1")
+    assert watchdog_seconds() is None
+    monkeypatch.setenv("WATCHDOG_PID", str(os.getpid()))
+    assert watchdog_seconds() == 1.5
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (("--host", "0.0.0.0"), "can be reached from other machines"),  # noqa: S104 - refused
+        (("--host", "192.0.2.1", "--port", "1"), "can be reached from other machines"),
+        (("--tls-cert", "nowhere.pem"), "both"),
+        (("--tls-cert", "nowhere.pem", "--tls-key", "nowhere.pem"), "no such file"),
+    ],
+)
+def test_what_would_be_open_is_not_served(
+    state: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], reason: str
+) -> None:
+    code, document = ident(capsys, "serve", *words, "--state", state)
+    assert code == 2
+    assert reason in document["error"]["message"]
+    assert not (state / "token").exists()
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["http://robot.example:8470", "ftp://127.0.0.1", "127.0.0.1:8470", "http://u@localhost", "http://127.0.0.1:99999"],
+)
+def test_a_token_is_sent_nowhere_in_the_clear(url: str) -> None:
+    with pytest.raises(UsageError):
+        Client(url, "ident_secret")
+
+
+def door(folder: Path, request: dict[str, Any], more: bytes = b"") -> tuple[int, str]:
+    """What a motion's own unit makes of a request: its exit code and what the journal hears."""
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "ident_service.service.jobs.door"],
+            stdin=theirs,
+            stdout=theirs,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        theirs.close()
+        ours.sendall(json.dumps(request).encode() + b"\n" + more)
+        ours.shutdown(socket.SHUT_WR)
+        return process.wait(120), process.communicate()[1]
+
+
+def test_a_unit_of_its_own_does_motions_under_a_lease_and_nothing_else(state: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "job"
+    folder.mkdir()
+    for words in (["serve"], ["simulate", "planar2", "--json"], ["run", "planar2"], [], ["-c", "x"]):
+        code, said = door(folder, {"folder": str(folder), "words": words})
+        assert (code, "only motions" in said) == (2, True), words
+    assert list(folder.iterdir()) == []
+    words = ["home", "planar2", "--lease-from-stdin", "--json", "--state", str(state)]
+    code, _ = door(folder, {"folder": str(folder), "words": words})
+    assert code == 3  # it was not checked, in the words of the command
+    assert json.loads((folder / ANSWER).read_text())["error"]["kind"] == "MotionRefused"
+    assert "not checked yet" in (folder / LOG).read_text()
+    assert not alive((folder / PROCESS).read_text().strip())
+    # Files that are there already are nobody's to overwrite.
+    assert door(folder, {"folder": str(folder), "words": words})[0] == 2
+
+
+def test_a_child_behind_a_door_is_told_and_heard(tmp_path: Path) -> None:
+    path, folder = tmp_path / "door", tmp_path / "job"
+    folder.mkdir()
+    with pytest.raises(UsageError, match=r"ident-motion\.socket"):
+        UnitChild(("home",), folder, path)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listening:
+        listening.bind(str(path))
+        listening.listen()
+        child = UnitChild(("home", "a"), folder, path)
+        unit, _ = listening.accept()
+        with unit:
+            assert json.loads(unit.recv(1000)) == {"folder": str(folder), "words": ["home", "a"]}
+            child.say(b"\n")
+            child.say(b"stop\n")
+            assert unit.recv(10) == b"\nstop\n"
+            assert (child.process, child.exit_code, child.ended()) == ("", None, False)
+            child.close()
+            assert select.select([unit], [], [], 10.0)[0]
+            assert unit.recv(10) == b""
+        assert child.ended()
+        child.close()
+
+
+def test_a_process_is_found_again_by_more_than_its_number() -> None:
+    name = name_of(os.getpid())
+    assert alive(name)
+    pid, began, boot = name.split()
+    assert not alive(f"{pid} {int(began) + 1} {boot}")
+    assert not alive("")
+    with subprocess.Popen([sys.executable, "-c", ""]) as process:
+        other = name_of(process.pid)
+        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+        assert not alive(other)  # a zombie has ended
