@@ -94,6 +94,8 @@ class Identify(Ask):
     method: Literal["ols", "wls", "huber", "iv"] | None = None
     feasible_set: FeasibleSet | None = None
     prior: Literal["none", "euclidean", "entropic"] | None = None
+    as_accepted: Annotated[int, Field(ge=1, lt=10_000)] | None = None
+    """By the description that this acceptance keeps, which the comparison with its set needs; not by today's."""
 
 
 class Simulate(Ask):
@@ -121,8 +123,17 @@ class Export(Ask):
     formats: Annotated[tuple[Literal["urdf", "mjcf", "sdf", "json", "csv", "c"], ...], Field(min_length=1)] = ("urdf",)
 
 
+class Judge(Ask):
+    """A run's parameters against those of an acceptance of its arm; the comparison becomes part of the run."""
+
+    kind: Literal["judge"]
+    arm: ArmName
+    run: Id
+    against: Annotated[int, Field(ge=1, lt=10_000)]
+
+
 Asked = Annotated[
-    Design | Check | Rehearse | Run | Home | Identify | Simulate | Report | Export, Field(discriminator="kind")
+    Design | Check | Rehearse | Run | Home | Identify | Simulate | Report | Export | Judge, Field(discriminator="kind")
 ]
 """Any of them; `kind` says which."""
 
