@@ -26,8 +26,10 @@ from ident_service.cli import (
     motions,
     parameters,
     recovery,
+    reidentify,
     remote,
     results,
+    schedule,
 )
 from ident_service.cli.answer import (
     DONE,
@@ -58,6 +60,8 @@ GROUPS = (
     bus,
     emulate,
     keeping,
+    schedule,
+    reidentify,
     daemon,
     remote,
 )
