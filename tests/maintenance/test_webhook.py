@@ -38,7 +38,7 @@ class Receiver(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    def do_POST(self) -> None:  # noqa: N802 - the library's name
+    def do_POST(self) -> None:
         server = self.server
         assert isinstance(server, Receiver)
         body = self.rfile.read(int(self.headers["Content-Length"]))
@@ -123,8 +123,11 @@ def test_nobody_there_harms_nothing_and_what_waits_is_bounded() -> None:
         "https://a:b@host/",
         "x",
         "https://h:x/",
-    ]
-    + ["http://127.0.0.1.example/", "https://host/\n", "https://host/ x", "http://169.254.169.254/"],
+        "http://127.0.0.1.example/",
+        "https://host/\n",
+        "https://host/ x",
+        "http://169.254.169.254/",
+    ],
 )
 def test_addresses_that_are_refused(url: str) -> None:
     with pytest.raises(UsageError):
