@@ -48,22 +48,8 @@ from ident_service.errors import ArmFault, ConfigError, IdentError, MotionRefuse
 __all__ = ["DONE", "FAILED", "FAULTED", "USAGE", "VERDICT_NO", "main"]
 
 GROUPS = (
-    commission,
-    motions,
-    arm,
-    recovery,
-    parameters,
-    results,
-    comparing,
-    exports,
-    configs,
-    bus,
-    emulate,
-    keeping,
-    schedule,
-    reidentify,
-    daemon,
-    remote,
+    *(commission, motions, arm, recovery, parameters, results, comparing, exports, keeping),
+    *(configs, bus, emulate, schedule, reidentify, daemon, remote),
 )
 _EXIT_CODES: tuple[tuple[type[IdentError], int], ...] = (
     (ConfigError, USAGE),

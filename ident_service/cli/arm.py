@@ -35,7 +35,7 @@ def add(verbs: Verbs) -> None:
     sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
     sub.add_argument("--home", action="store_true", help="for `ident home` and `ident recover`, and no motion")
     sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person: the arm is supported")
-    add_lease(sub)
+    add_lease(sub, confirm=False)
     sub = verbs.add("run", _run, "move the arm along a motion and record it")
     _motion(sub)
     sub.add_argument("--speed", type=speed, default=1.0, metavar="SHARE", help="of the motion's own speed")

@@ -78,9 +78,9 @@ class StdinLease:
             self._over = f"nobody renewed the lease for {self._seconds:g} s"
 
 
-def add_lease(sub: Parser) -> None:
-    """The option of every verb that a program may have an arm moved by."""
-    if not any("--confirm" in action.option_strings for action in sub._actions):
+def add_lease(sub: Parser, *, confirm: bool = True) -> None:
+    """The options of every verb that a program may have an arm moved by; `confirm` unless it has its own."""
+    if confirm:
         sub.add_argument("--confirm", metavar="NAME", help="with --server: the arm's name, typed by a person")
     sub.add_argument(
         "--lease-from-stdin",

@@ -34,10 +34,10 @@ def add(verbs: Verbs) -> None:
     sub.add_argument(
         "--zero", action="store_true", help="move nothing: a person has led the arm home, and its encoders begin there"
     )
-    sub.add_argument("--confirm", metavar="NAME", help="with --zero: the arm's name, typed by a person who has looked")
+    sub.add_argument("--confirm", metavar="NAME", help="with --zero or --server: the arm's name, typed by a person")
     sub.add_argument("--out", type=Path, metavar="DIR", help=_HELP_OUT)
     add_can_log(sub)
-    add_lease(sub)
+    add_lease(sub, confirm=False)
     sub = verbs.add(
         "recover", _recover, "after a fault or a stop: what is in the way, and what to do (exit code 3: something is)"
     )

@@ -52,6 +52,10 @@ def remotely(arguments: argparse.Namespace) -> Answer:
     verb = REMOTE.get(arguments.word)
     if verb is None:
         raise UsageError(f"{arguments.word}: no daemon does this; --server is for {', '.join(sorted(REMOTE))}")
+    given = {name for name, value in vars(arguments).items() if value != arguments.words.get_default(name)}
+    if lost := sorted(given - _CARRIED[arguments.word] - _OURS):
+        options = ", ".join(f"--{name.replace('_', '-')}" for name in lost)
+        raise UsageError(f"{arguments.word} --server: {options} would be lost; a daemon is not told of it")
     return _with_client(verb)(arguments)
 
 
@@ -172,6 +176,23 @@ REMOTE: dict[str, Verb] = {
     "jobs show": _show,
     "jobs watch": _watch,
     "jobs cancel": _cancel,
+}
+
+
+# What of each verb a daemon is told; anything else that is given must not be lost in silence.
+_OURS = frozenset({"json", "state", "server", "verb", "word", "words", "asks"})
+_MOTION = frozenset({"arm", "motion", "confirm"})
+_CARRIED: dict[str, frozenset[str]] = {
+    "simulate": frozenset({"arm", "motion", "seed", "feasible_set"}),
+    "identify": frozenset({"arm", "recordings", "validate", "method", "feasible_set", "prior"}),
+    "design": frozenset({"arm", "seconds", "starts", "seed", "criterion", "chosen", "motion", "after"}),
+    "check": _MOTION | {"home"},
+    "run": _MOTION | {"speed"},
+    "home": _MOTION,
+    **dict.fromkeys(("stop", "pause", "resume"), frozenset({"arm"})),
+    "ack": frozenset({"arm", "fault"}),
+    "jobs list": frozenset({"most"}),
+    **dict.fromkeys(("jobs show", "jobs watch", "jobs cancel"), frozenset({"job"})),
 }
 
 

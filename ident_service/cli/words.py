@@ -81,7 +81,7 @@ class Verbs:
             Its parser, to add arguments to.
         """
         parser = self.commands.add_parser(name, parents=[self.common], help=text, description=text, **rest)
-        parser.set_defaults(verb=run, word=f"{self.prefix}{name}")
+        parser.set_defaults(verb=run, word=f"{self.prefix}{name}", words=parser)
         return parser
 
     def group(self, name: str, text: str) -> Verbs:

@@ -17,6 +17,7 @@ from ident_service.estimation.identify import Estimate
 from ident_service.results.export.urdf_file import write_urdf
 from ident_service.results.files import write_atomically
 from ident_service.results.manifest import MANIFEST as MANIFEST
+from ident_service.results.manifest import hashes as hashes
 from ident_service.results.manifest import verified_files
 from ident_service.results.manifest import write_manifest as write_manifest
 from ident_service.results.parameter_file import (

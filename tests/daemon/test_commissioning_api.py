@@ -73,6 +73,20 @@ def test_from_an_upload_to_accepted_parameters_and_back(daemon: Asked, arm: str,
         (4, 2, "owner"),
     ]
     assert daemon.get(f"/api/v1/arms/{ARM}").json()["accepted"] == acts[-1]
+    page = daemon.get(f"/api/v1/runs/{runs[0]}/report.html")
+    assert page.status_code == 200
+    assert page.text.lstrip().lower().startswith("<!doctype html")
+    assert "sandbox" in page.headers["content-security-policy"]
+    for asked in (
+        {"kind": "report", "run": runs[0]},
+        {"kind": "export", "run": runs[0], "formats": ["urdf", "csv"]},
+        {"kind": "compare", "run": runs[0], "other": runs[1]},
+    ):
+        made = daemon.follow(daemon.begin(asked)["id"])
+        assert made["state"] == "done", made
+    assert (state / "reports" / f"{runs[0]}.html").is_file()
+    proven = daemon.follow(daemon.begin({"kind": "verify", "run": runs[0]})["id"])
+    assert proven["state"] == "done", proven
     assert [line["what"] for line in daemon.get("/api/v1/audit?most=500").json()].count("accepted") == 2
     wrong = daemon.post("/api/v1/arms/planar2/acceptances", {"run": runs[0], "note": "of another arm"})
     assert wrong.status_code == 400
@@ -102,6 +116,24 @@ def test_check_run_identify(daemon: Asked, arm: str) -> None:
     assert daemon.get(f"/api/v1/runs/{ended['run']}").json()["parameters"]["sha256"]
     log = daemon.get(f"/api/v1/jobs/{early['id']}/log").text
     assert "not checked yet" in log
+
+
+@pytest.mark.parametrize(
+    ("asked", "state_of_it", "key"),
+    [
+        ({"kind": "base"}, "done", "base_parameters"),
+        ({"kind": "watch", "seconds": 0.1}, "done", "joints"),
+        ({"kind": "recover"}, "done", "steps"),
+        ({"kind": "preview"}, "done", "warnings"),
+    ],
+)
+def test_what_only_looks_needs_no_word(
+    daemon: Asked, arm: str, asked: dict[str, object], state_of_it: str, key: str
+) -> None:
+    job = daemon.begin({**asked, "arm": arm})
+    ended = daemon.follow(job["id"])
+    assert ended["state"] == state_of_it, ended
+    assert key in daemon.get(f"/api/v1/jobs/{job['id']}/result").json()["answer"]
 
 
 @pytest.mark.timeout(300)

@@ -16,6 +16,7 @@ from ident_service.service.jobs.commands import REPORTS
 from ident_service.service.registry import runs
 
 router = APIRouter(prefix="/api/v1", tags=["runs"], responses=failures(404))
+_REPORT = "report.html"
 _BINARY: dict[int | str, dict[str, Any]] = {
     200: {"content": {"application/octet-stream": {}}, "description": "The file."},
     **failures_of_files(404),
@@ -60,8 +61,10 @@ def get_file(service: Serving, _: Viewer, run: Id, name: FileName) -> FileRespon
 
 @router.get("/runs/{run}/report.html", response_class=FileResponse, responses=_PAGE)
 def get_report(service: Serving, _: Viewer, run: Id) -> FileResponse:
-    """The report that a job of the kind `report` has made."""
+    """The report: the one that a job of the kind `report` has made since, or the run's own."""
     path = service.state / REPORTS / f"{runs.known_run(service.db, run)['id']}.html"
+    if not path.is_file() and _REPORT in runs.run_files(service.db, service.state, run):
+        path = runs.run_file(service.db, service.state, run, _REPORT)
     if not path.is_file():
         raise UnknownId(f"the run {run} has no report yet; ask for a job of the kind report")
     return FileResponse(path, media_type="text/html", headers={"Content-Security-Policy": _POLICY})

@@ -84,6 +84,43 @@ class Home(Ask):
     arm: ArmName
 
 
+class LeaveLimit(Ask):
+    """Lead an arm that stands outside its position limits back inside, slowly."""
+
+    kind: Literal["leave_limit"]
+    arm: ArmName
+
+
+class Recover(Ask):
+    """After a fault or a stop: what is in the way, and what to do; nothing moves."""
+
+    kind: Literal["recover"]
+    arm: ArmName
+
+
+class Watch(Ask):
+    """Look at the arm without a torque or a change of state."""
+
+    kind: Literal["watch"]
+    arm: ArmName
+    seconds: Annotated[float, Field(gt=0, le=60)] = 2.0
+
+
+class Base(Ask):
+    """Base parameters and their expressions."""
+
+    kind: Literal["base"]
+    arm: ArmName
+
+
+class Preview(Ask):
+    """What a motion asks of the arm, and what it will teach."""
+
+    kind: Literal["preview"]
+    arm: ArmName
+    motion: Id | None = None
+
+
 class Identify(Ask):
     """From recordings to parameters."""
 
@@ -123,6 +160,21 @@ class Export(Ask):
     formats: Annotated[tuple[Literal["urdf", "mjcf", "sdf", "json", "csv", "c"], ...], Field(min_length=1)] = ("urdf",)
 
 
+class Verify(Ask):
+    """The certificate in a run's parameters, in exact arithmetic."""
+
+    kind: Literal["verify"]
+    run: Id
+
+
+class Compare(Ask):
+    """Two runs: what changed, and by how many deviations."""
+
+    kind: Literal["compare"]
+    run: Id
+    other: Id
+
+
 class Judge(Ask):
     """A run's parameters against those of an acceptance of its arm; the comparison becomes part of the run."""
 
@@ -133,9 +185,26 @@ class Judge(Ask):
 
 
 Asked = Annotated[
-    Design | Check | Rehearse | Run | Home | Identify | Simulate | Report | Export | Judge, Field(discriminator="kind")
+    Base
+    | Preview
+    | Design
+    | Watch
+    | Recover
+    | Check
+    | Rehearse
+    | Run
+    | Home
+    | LeaveLimit
+    | Identify
+    | Simulate
+    | Report
+    | Export
+    | Verify
+    | Compare
+    | Judge,
+    Field(discriminator="kind"),
 ]
 """Any of them; `kind` says which."""
 
-MOVES = frozenset({"check", "rehearse", "run", "home"})
+MOVES = frozenset({"check", "rehearse", "run", "home", "leave_limit"})
 """Kinds that may give an arm a torque: they need a lease, and a person's word."""

@@ -13,17 +13,24 @@ from ident_service.service.acceptance import ARM, PARAMETERS, accepted_set
 from ident_service.service.jobs.asked import (
     MOVES,
     Asked,
+    Base,
     Check,
+    Compare,
     Design,
     Export,
     Home,
     Identify,
     Judge,
+    LeaveLimit,
+    Preview,
     RecordingOf,
+    Recover,
     Rehearse,
     Report,
     Run,
     Simulate,
+    Verify,
+    Watch,
 )
 from ident_service.service.registry.arms import KnownArm, known_arm, resources
 from ident_service.service.registry.database import Database
@@ -31,6 +38,8 @@ from ident_service.service.registry.motions import MOTIONS, motion_path, new_id
 from ident_service.service.registry.runs import RUNS, known_run, run_file, run_folder
 
 JOBS, REPORTS, EXPORTS = "jobs", "reports", "exports"
+_LOOKS = (Check, Watch, Recover, Base, Preview)  # that make no folder
+_VERBS: Final = {"leave_limit": "recover"}
 FOLDERS: Final = {"design": MOTIONS, "export": EXPORTS}
 
 
@@ -62,13 +71,13 @@ def command(db: Database, state: Path, asked: Asked) -> Command:
         UsageError: it names what is not known.
         ConfigError: the arm's description has mistakes.
     """
-    if isinstance(asked, Report | Export):
+    if isinstance(asked, Report | Export | Verify | Compare):
         return _about_a_run(db, state, asked)
     if isinstance(asked, Judge):
         return _judgement(db, state, asked)
     arm = known_arm(db, state, asked.arm)
-    made = None if isinstance(asked, Check) else new_id(arm.name)
-    words = [asked.kind, *_words(db, state, asked, arm)]
+    made = None if isinstance(asked, _LOOKS) else new_id(arm.name)
+    words = [_VERBS.get(asked.kind, asked.kind), *_words(db, state, asked, arm)]
     if made is not None:
         words += ["--out", str(state / FOLDERS.get(asked.kind, RUNS) / made)]
     moves = asked.kind in MOVES
@@ -79,7 +88,7 @@ def command(db: Database, state: Path, asked: Asked) -> Command:
         arm.name,
         moves,
         made,
-        resources(arm.config) if moves else (),
+        resources(arm.config) if moves or isinstance(asked, Watch | Recover) else (),
         HOLD_TO_RUN_SECONDS if isinstance(asked, Rehearse) else LEASE_SECONDS,
     )
 
@@ -98,13 +107,17 @@ def _words(db: Database, state: Path, asked: Asked, arm: KnownArm) -> list[str]:
     if isinstance(asked, Simulate):
         motion = [] if asked.motion is None else [f"--motion={motion_path(db, state, asked.motion)}"]
         return [path, *motion, *_given({"seed": asked.seed, "feasible-set": asked.feasible_set})]
-    if isinstance(asked, Home):
+    if isinstance(asked, Home | Base | Recover):
         return [path]
-    if isinstance(asked, Check | Run | Rehearse):
+    if isinstance(asked, LeaveLimit):
+        return [path, "--leave-limit"]
+    if isinstance(asked, Watch):
+        return [path, f"--seconds={asked.seconds!r}"]
+    if isinstance(asked, Check | Run | Rehearse | Preview):
         motion = [] if asked.motion is None else [str(motion_path(db, state, asked.motion))]
         if isinstance(asked, Check):
             return [path, *motion, *(["--home"] if asked.home else []), "--confirm", arm.name]
-        return [path, *motion, f"--speed={asked.speed!r}"]
+        return [path, *motion, *([] if isinstance(asked, Preview) else [f"--speed={asked.speed!r}"])]
     raise AssertionError(asked)
 
 
@@ -117,8 +130,14 @@ def _design(db: Database, state: Path, asked: Design) -> list[str]:
     return [*after, *parameters, *_given({**chosen, "motion": asked.motion})]
 
 
-def _about_a_run(db: Database, state: Path, asked: Report | Export) -> Command:
+def _about_a_run(db: Database, state: Path, asked: Report | Export | Verify | Compare) -> Command:
     folder, arm = run_folder(db, state, asked.run), str(known_run(db, asked.run)["arm"])
+    if isinstance(asked, Verify):
+        words = ["verify", str(run_file(db, state, asked.run, PARAMETERS))]
+        return Command((*words, *_always(state)), arm, False, asked.run, (), LEASE_SECONDS)
+    if isinstance(asked, Compare):
+        words = ["compare", str(folder), str(run_folder(db, state, asked.other))]
+        return Command((*words, *_always(state)), arm, False, asked.run, (), LEASE_SECONDS)
     if isinstance(asked, Report):
         made: str | None = None
         place = state / REPORTS

@@ -274,8 +274,8 @@ class Engine:
 
     def _free(self, live: _Live) -> bool:
         """Whether nothing stands before it: who came later does not overtake on the same arm or bus."""
-        if not live.order.moves:
-            running = [other for other in self._live.values() if other.child is not None and not other.order.moves]
+        if not live.order.resources:
+            running = [one for one in self._live.values() if one.child is not None and not one.order.resources]
             return len(running) < self._computing
         needed, earlier = set(live.order.resources), True
         for other in self._live.values():
