@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
@@ -88,7 +89,7 @@ def _add(arguments: argparse.Namespace) -> Answer:
     with registry(arguments) as db:
         name = _known(db, arguments)
         row = add_schedule(db, name, when, at_terminal(arguments), time.time(), arguments.motion)
-    return DONE, _line(row), _shown(row)
+    return DONE, schedule_line(row), _shown(row)
 
 
 def _list(arguments: argparse.Namespace) -> Answer:
@@ -96,7 +97,11 @@ def _list(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as db:
         rows = schedules(db, arguments.arm)
-    return DONE, "".join(map(_line, rows)) or "nothing is scheduled\n", {"schedules": [_shown(row) for row in rows]}
+    return (
+        DONE,
+        "".join(map(schedule_line, rows)) or "nothing is scheduled\n",
+        {"schedules": [_shown(row) for row in rows]},
+    )
 
 
 def _remove(arguments: argparse.Namespace) -> Answer:
@@ -120,7 +125,7 @@ def _enabled(arguments: argparse.Namespace, *, enabled: bool) -> Answer:
 
     with registry(arguments) as db:
         row = enable_schedule(db, arguments.number, at_terminal(arguments), time.time(), enabled=enabled)
-    return DONE, _line(row), _shown(row)
+    return DONE, schedule_line(row), _shown(row)
 
 
 def _maintenance(arguments: argparse.Namespace) -> Answer:
@@ -130,7 +135,7 @@ def _maintenance(arguments: argparse.Namespace) -> Answer:
         name = _known(db, arguments)
         row = add_event(db, name, arguments.what, arguments.note, at_terminal(arguments), time.time())
         due = dues(db, name)
-    text = f"{name}: entered: {row['what']}\n" + "".join(_due_line(one) for one in due)
+    text = f"{name}: entered: {row['what']}\n" + "".join(due_line(one) for one in due)
     if not due:
         text += f"nothing is due by it; `ident schedule add {name} --maintenance` would make it so\n"
     return DONE, text, {**row, "due": [dict(one) for one in due]}
@@ -141,7 +146,7 @@ def _due(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as db:
         rows = dues(db, arguments.arm)
-    return DONE, "".join(map(_due_line, rows)) or "nothing is due\n", {"due": [dict(row) for row in rows]}
+    return DONE, "".join(map(due_line, rows)) or "nothing is due\n", {"due": [dict(row) for row in rows]}
 
 
 def _dismiss(arguments: argparse.Namespace) -> Answer:
@@ -157,8 +162,7 @@ def _alarms(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as db:
         rows = alarms(db, arguments.arm)
-    text = "".join(f"{row['id']:>4}  {row['arm']:<16} {_day(row['at'])}  {row['what']}\n" for row in rows)
-    return VERDICT_NO if rows else DONE, text or "no alarm stands\n", {"alarms": [dict(row) for row in rows]}
+    return VERDICT_NO if rows else DONE, alarm_lines(rows), {"alarms": [dict(row) for row in rows]}
 
 
 def _ack(arguments: argparse.Namespace) -> Answer:
@@ -174,14 +178,22 @@ def _shown(row: Row) -> dict[str, Any]:
     return {key: value for key, value in row.items() if key not in hidden} | {"enabled": bool(row["enabled"])}
 
 
-def _line(row: Row) -> str:
+def schedule_line(row: Row) -> str:
+    """One schedule, for a person."""
     when = f"cron {row['cron']} (UTC)" if row["cron"] else str(row["trigger"])
     coming = f", next {_day(row['next'])}" if row["cron"] and row["enabled"] else ""
     return f"{row['id']:>4}  {row['arm']:<16} {when}{coming}{'' if row['enabled'] else ', disabled'}\n"
 
 
-def _due_line(row: Row) -> str:
+def due_line(row: Row) -> str:
+    """One thing that is due, for a person."""
     return f"due {row['id']}: {row['arm']} since {_day(row['at'])}: {row['cause']}; `ident reidentify {row['arm']}`\n"
+
+
+def alarm_lines(rows: Sequence[Row]) -> str:
+    """Alarms, for a person."""
+    lines = [f"{row['id']:>4}  {row['arm']:<16} {_day(row['at'])}  {row['what']}\n" for row in rows]
+    return "".join(lines) or "no alarm stands\n"
 
 
 def _day(at: float) -> str:

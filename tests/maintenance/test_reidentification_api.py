@@ -10,7 +10,10 @@ from typing import Any
 import pytest
 from daemon.conftest import Asked, serving
 from daemon.conftest import viewer as viewer
+from daemon.served import daemon_process, url_of
 from maintenance.conftest import ARM, description
+
+from ident_service.cli import main
 
 pytestmark = pytest.mark.slow
 
@@ -112,3 +115,33 @@ def test_a_lease_that_nobody_renews_ends_it(daemon: Asked) -> None:
     ended = followed(daemon, name, lease=False)
     assert ended["state"] == "cancelled", ended
     assert [job["kind"] for job in daemon.get("/api/v1/jobs").json()] == ["check"]
+
+
+@pytest.mark.timeout(300)
+def test_the_command_drives_a_daemon(accepted: str, state: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def ident(*words: str) -> tuple[int, str, str]:
+        capsys.readouterr()
+        code = main([*words, "--server", url, "--state", str(state)])
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    with daemon_process(state) as (process, client):
+        url = url_of(process, state)
+        client.post("/api/v1/arms", {"description": description(seed=33)})
+        assert "next 20" in ident("schedule", "add", ARM, "--cron", "0 6 * * mon")[1]
+        assert ident("schedule", "add", ARM, "--maintenance")[0] == 0
+        assert ident("schedule", "disable", "1")[1].endswith(", disabled\n")
+        assert "(UTC), next" in ident("schedule", "enable", "1")[1]
+        assert ident("schedule", "remove", "1")[0] == 0
+        assert ident("schedule", "list", ARM)[1].count("\n") == 1
+        assert "maintenance: belt" in ident("maintenance", ARM, "--what", "belt")[1]
+        assert "maintenance: belt" in ident("due", "list")[1]
+        assert "would be lost" in ident("maintenance", ARM, "--what", "belt", "--by", "ann")[2]
+        assert ident("reidentify", ARM, "--confirm", "other")[0] == 2
+        code, out, _ = ident("reidentify", ARM, "--confirm", ARM)
+        assert (code, "unchanged" in out) == (0, True)
+        assert ident("due", "list")[1] == "nothing is due\n"
+        assert ident("maintenance", ARM, "--what", "belt again")[0] == 0
+        assert ident("due", "dismiss", "2", "--note", "the same belt")[0] == 0
+        assert ident("alarm", "list")[:2] == (0, "no alarm stands\n")
+        assert ident("alarm", "ack", "1", "--note", "x")[0] == 2
