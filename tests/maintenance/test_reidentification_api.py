@@ -44,6 +44,7 @@ def test_a_person_asks_and_a_drier_joint_is_found(daemon: Asked, viewer: str) ->
     assert daemon.post("/api/v1/schedules", {"arm": ARM, "maintenance": True}).status_code == 201
     assert daemon.post(f"/api/v1/arms/{ARM}/maintenance", {"what": "belt changed"}).status_code == 201
     (due,) = daemon.get("/api/v1/due").json()
+    assert 'ident_arm_due{arm="quick"} 1\n' in daemon.get("/metrics").text
     assert due["cause"] == "maintenance: belt changed"
     time.sleep(2.0)  # time enough for four looks
     assert daemon.get("/api/v1/jobs").json() == []  # it asks for a person, and does nothing
@@ -70,6 +71,7 @@ def test_a_person_asks_and_a_drier_joint_is_found(daemon: Asked, viewer: str) ->
 
     (alarm,) = daemon.get("/api/v1/alarms").json()
     assert (alarm["run"], "friction of joint elbow" in alarm["what"]) == (ended["run"], True)
+    assert 'ident_arm_drift_alarms{arm="quick"} 1\n' in daemon.get("/metrics").text
     looks = {"headers": {"Authorization": f"Bearer {viewer}"}}
     assert daemon.get("/api/v1/alarms", **looks).status_code == 200
     assert daemon.post(f"/api/v1/alarms/{alarm['id']}/ack", {"note": "x"}, **looks).status_code == 403
@@ -145,3 +147,35 @@ def test_the_command_drives_a_daemon(accepted: str, state: Path, capsys: pytest.
         assert ident("due", "dismiss", "2", "--note", "the same belt")[0] == 0
         assert ident("alarm", "list")[:2] == (0, "no alarm stands\n")
         assert ident("alarm", "ack", "1", "--note", "x")[0] == 2
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("step", ["check", "run", "identify"])
+def test_a_kill_in_the_midst_is_told_and_nothing_moves_by_itself(accepted: str, state: Path, step: str) -> None:
+    path = "/api/v1/reidentifications"
+    with daemon_process(state) as (process, client):
+        client.post("/api/v1/arms", {"description": description(seed=34)})
+        word = client.post(f"/api/v1/arms/{ARM}/challenge")["challenge"]
+        row = client.post(path, {"arm": ARM, "confirm": {"name": ARM, "challenge": word}})
+        while not (row["step"] == step and client.get(f"/api/v1/jobs/{row['job']}")["state"] == "running"):
+            assert row["state"] == "running", row
+            client.post(f"{path}/{row['id']}/lease")
+            time.sleep(0.02)
+            row = client.get(f"{path}/{row['id']}")
+        process.kill()
+        process.wait()
+    with daemon_process(state) as (_, client):
+        until = time.monotonic() + 120.0
+        while (row := client.get(f"{path}/{row['id']}"))["state"] == "running" and time.monotonic() < until:
+            time.sleep(0.1)
+        assert (row["state"], row["step"]) == ("interrupted", step)
+        assert "the service died while it ran" in row["detail"]
+        time.sleep(1.5)
+        kinds = [job["kind"] for job in reversed(client.get("/api/v1/jobs"))]
+        assert kinds == ["check", "run", "identify"][: len(kinds)]
+        assert kinds[-1] == step
+        assert client.get("/api/v1/alarms") == []
+        if step == "identify":  # what was recorded is there to be identified from
+            files = client.get(f"/api/v1/runs/{row['recorded']}")["files"]
+            assert "run.mcap" in files
+            assert row["recorded"] in row["detail"]

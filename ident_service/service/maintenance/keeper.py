@@ -52,6 +52,11 @@ class Keeper:
         """Begin to look, after the engine has told what was interrupted; returns at once."""
         self._thread.start()
 
+    @property
+    def healthy(self) -> bool:
+        """Whether anybody looks."""
+        return self._thread.is_alive()
+
     def close(self) -> None:
         """Look no more."""
         self._ending.set()
