@@ -26,8 +26,10 @@ from ident_service.cli import (
     motions,
     parameters,
     recovery,
+    reidentify,
     remote,
     results,
+    schedule,
 )
 from ident_service.cli.answer import (
     DONE,
@@ -47,7 +49,7 @@ __all__ = ["DONE", "FAILED", "FAULTED", "USAGE", "VERDICT_NO", "main"]
 
 GROUPS = (
     *(commission, motions, arm, recovery, parameters, results, comparing, exports, keeping),
-    *(configs, bus, emulate, daemon, remote),
+    *(configs, bus, emulate, schedule, reidentify, daemon, remote),
 )
 _EXIT_CODES: tuple[tuple[type[IdentError], int], ...] = (
     (ConfigError, USAGE),

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from ident_service.cli.answer import DONE, VERDICT_NO, Answer, state_folder
 from ident_service.cli.words import Verbs
+from ident_service.errors import UsageError
 
 
 def add(verbs: Verbs) -> None:
@@ -17,7 +18,9 @@ def add(verbs: Verbs) -> None:
     sub = verbs.add("compare", _compare, "has the arm changed? (exit code 3: yes, or it cannot be said)")
     sub.add_argument("reference", type=Path, metavar="A", help="folder of results, or parameters.json: the reference")
     sub.add_argument("others", type=Path, nargs="+", metavar="B", help="what is compared with it")
-    sub.add_argument("--out", type=Path, metavar="PATH", help="FILE.json, or a folder for JSON, text and page")
+    out = sub.add_mutually_exclusive_group()
+    out.add_argument("--out", type=Path, metavar="PATH", help="FILE.json, or a folder for JSON, text and page")
+    out.add_argument("--keep", action="store_true", help="in the folder B itself, named by its manifest; one B")
 
     sub = verbs.add("payload", _payload, "what does an identified arm carry? (exit code 3: nothing, or no real body)")
     sub.add_argument("run", type=Path, metavar="RUN", help="folder of results of the arm without the load")
@@ -31,9 +34,15 @@ def add(verbs: Verbs) -> None:
 def _compare(arguments: argparse.Namespace) -> Answer:
     from ident_service.results.comparison.document import comparison_document
     from ident_service.results.comparison.text import comparison_text
-    from ident_service.service.comparison import compare_files
+    from ident_service.service.comparison import KEPT, compare_files, compare_into
 
-    comparison, files = compare_files([arguments.reference, *arguments.others], arguments.out)
+    if arguments.keep:
+        if len(arguments.others) != 1 or not arguments.others[0].is_dir():
+            raise UsageError("--keep is for one folder of results that is compared with the reference")
+        folder = arguments.others[0]
+        comparison, files = compare_into(arguments.reference, folder), tuple(folder / name for name in KEPT)
+    else:
+        comparison, files = compare_files([arguments.reference, *arguments.others], arguments.out)
     text = comparison_text(comparison) + "".join(f"file: {path}\n" for path in files)
     document = comparison_document(comparison) | {"files": [str(path) for path in files]}
     return (DONE if comparison.verdict == "unchanged" else VERDICT_NO), text, document

@@ -26,6 +26,11 @@ def add(verbs: Verbs) -> None:
     sub.add_argument("--name", action="append", default=[], metavar="HOST", help="host name that clients use, too")
     sub.add_argument("--motion-door", type=Path, metavar="SOCKET", help="of the unit that motions run in")
 
+    sub.add_argument(
+        "--webhook", metavar="URL", help="is told what is due, and of drift; https, or http to this machine"
+    )
+    sub.add_argument("--webhook-secret", type=Path, metavar="FILE", help="which notices are signed with; chmod 600")
+
     token = verbs.group("token", "who may talk to the daemon")
     sub = token.add("add", _add, "make a token and print it; nothing can print it again")
     sub.add_argument("name", metavar="NAME", help="which the audit trail will show")
@@ -49,6 +54,8 @@ def _serve(arguments: argparse.Namespace) -> Answer:
         tls_key=arguments.tls_key,
         names=tuple(arguments.name),
         motion_door=arguments.motion_door,
+        webhook=arguments.webhook,
+        webhook_secret=arguments.webhook_secret,
     )
     log_as_json()
     serve(settings, lambda url: print_to_person(f"ident: {url}, state {state}, token in {state / 'token'}\n"))

@@ -6,13 +6,39 @@ Boundary: words to calls, results to words; the work is `service/acceptance.py` 
 from __future__ import annotations
 
 import argparse
+import os
+import pwd
 from dataclasses import asdict
 from pathlib import Path
 
 from ident_service.cli.answer import DONE, Answer, state_folder
-from ident_service.cli.words import Verbs, count
+from ident_service.cli.words import Parser, Verbs, count
+from ident_service.errors import UsageError
 
-_WHO = "terminal"
+_LONGEST_NAME = 80
+
+
+def add_by(sub: Parser) -> None:
+    """The option of every verb that is a person's act."""
+    sub.add_argument("--by", metavar="NAME", help="who says so (default: the name you are logged in with)")
+
+
+def at_terminal(arguments: argparse.Namespace) -> str:
+    """Who sits there, for the audit trail; no token has such a name.
+
+    Raises:
+        UsageError: no name.
+    """
+    if arguments.by is not None:
+        name = arguments.by.strip()
+    else:
+        try:
+            name = pwd.getpwuid(os.getuid()).pw_name
+        except KeyError:
+            name = str(os.getuid())
+    if not name or len(name) > _LONGEST_NAME:
+        raise UsageError(f"--by needs a name of 1 to {_LONGEST_NAME} characters")
+    return f"terminal:{name}"
 
 
 def add(verbs: Verbs) -> None:
@@ -20,15 +46,19 @@ def add(verbs: Verbs) -> None:
     sub = verbs.add("accept", _accept, "make a run's parameters the arm's current ones; earlier sets are kept")
     sub.add_argument("run", type=Path, metavar="RUN", help="folder that `identify` or `simulate` made")
     sub.add_argument("--note", required=True, help="why; for whoever reads it years later")
+    add_by(sub)
     sub = verbs.add("rollback", _rollback, "make an earlier accepted set the current one again")
     sub.add_argument("arm", metavar="NAME", help="of the arm")
     sub.add_argument("--note", required=True, help="why; for whoever reads it years later")
     sub.add_argument("--to", type=count, metavar="NUMBER", help="acceptance (default: before the current set's)")
+    add_by(sub)
     sub = verbs.add("import", _import, "a run folder from another machine: verified, copied below the state folder")
     sub.add_argument("run", type=Path, metavar="RUNFOLDER")
+    add_by(sub)
     sub = verbs.add("prune", _prune, "let recordings go of runs that nobody accepted; deletes only with --yes")
     sub.add_argument("--keep", type=count, required=True, metavar="N", help="newest runs of each arm keep theirs")
     sub.add_argument("--yes", action="store_true", help="DELETE them")
+    add_by(sub)
 
 
 def _accept(arguments: argparse.Namespace) -> Answer:
@@ -38,7 +68,7 @@ def _accept(arguments: argparse.Namespace) -> Answer:
 
     state = state_folder(arguments)
     with Database(state) as db:
-        act = accept(db, state, arguments.run.resolve(), arguments.note, _WHO)
+        act = accept(db, state, arguments.run.resolve(), arguments.note, at_terminal(arguments))
     path = arm_folder(state, act.arm) / CURRENT / PARAMETERS
     return DONE, f"{act.arm}: acceptance {act.number}; current: {path}\n", {**asdict(act), "current": str(path)}
 
@@ -50,7 +80,7 @@ def _rollback(arguments: argparse.Namespace) -> Answer:
 
     state = state_folder(arguments)
     with Database(state) as db:
-        act = rollback(db, state, arguments.arm, arguments.note, _WHO, arguments.to)
+        act = rollback(db, state, arguments.arm, arguments.note, at_terminal(arguments), arguments.to)
     path = arm_folder(state, act.arm) / CURRENT / PARAMETERS
     text = f"{act.arm}: acceptance {act.number} is the set of {act.origin} ({act.run}); current: {path}\n"
     return DONE, text, {**asdict(act), "current": str(path)}
@@ -63,7 +93,7 @@ def _import(arguments: argparse.Namespace) -> Answer:
 
     state = state_folder(arguments)
     with Database(state) as db:
-        row = import_run(db, state, arguments.run, _WHO)
+        row = import_run(db, state, arguments.run, at_terminal(arguments))
     folder = state / RUNS / row["id"]
     return (
         DONE,
@@ -83,7 +113,11 @@ def _prune(arguments: argparse.Namespace) -> Answer:
     state = state_folder(arguments)
     with Database(state) as db:
         untold = rebuild_runs(db, state)
-        gone = let_go(db, state, arguments.keep, _WHO) if arguments.yes else expendable(db, state, arguments.keep)
+        gone = (
+            let_go(db, state, arguments.keep, at_terminal(arguments))
+            if arguments.yes
+            else expendable(db, state, arguments.keep)
+        )
     size = sum(one.bytes for one in gone)
     verb = "deleted" if arguments.yes else "would be deleted; say --yes"
     text = "".join(f"{one.run}/{one.name}  {one.bytes / 2**20:.1f} MiB\n" for one in gone)

@@ -49,11 +49,14 @@ def remotely(arguments: argparse.Namespace) -> Answer:
         UsageError: a verb that no daemon does.
         IdentError: as the daemon says.
     """
-    verb = REMOTE.get(arguments.word)
+    from ident_service.cli.remote_maintenance import CARRIED, VERBS
+
+    verbs, carried = REMOTE | VERBS, _CARRIED | CARRIED
+    verb = verbs.get(arguments.word)
     if verb is None:
-        raise UsageError(f"{arguments.word}: no daemon does this; --server is for {', '.join(sorted(REMOTE))}")
+        raise UsageError(f"{arguments.word}: no daemon does this; --server is for {', '.join(sorted(verbs))}")
     given = {name for name, value in vars(arguments).items() if value != arguments.words.get_default(name)}
-    if lost := sorted(given - _CARRIED[arguments.word] - _OURS):
+    if lost := sorted(given - carried[arguments.word] - _OURS):
         options = ", ".join(f"--{name.replace('_', '-')}" for name in lost)
         raise UsageError(f"{arguments.word} --server: {options} would be lost; a daemon is not told of it")
     return _with_client(verb)(arguments)
@@ -76,7 +79,7 @@ def _asked(make: Callable[[Client, argparse.Namespace], dict[str, Any]]) -> Verb
         job = {key: value for key, value in make(client, arguments).items() if value is not None}
         body: dict[str, Any] = {"job": {**job, "kind": arguments.word}}
         if arguments.word in _MOVE:
-            body["confirm"] = _confirmation(client, arguments)
+            body["confirm"] = confirmation(client, arguments)
         made = client.post("/api/v1/jobs", body)
         tell(arguments, f"job {made['id']}")
         return _followed(client, arguments, made, moves=arguments.word in _MOVE)
@@ -85,7 +88,7 @@ def _asked(make: Callable[[Client, argparse.Namespace], dict[str, Any]]) -> Verb
 
 
 def _simulate(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
-    motion = _motion(client, arguments.arm, arguments.motion)
+    motion = motion_id(client, arguments.arm, arguments.motion)
     return {
         "arm": arguments.arm,
         "motion": motion,
@@ -120,12 +123,16 @@ def _design(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _check(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
-    motion = _motion(client, arguments.arm, arguments.motion)
+    motion = motion_id(client, arguments.arm, arguments.motion)
     return {"arm": arguments.arm, "motion": motion, "home": arguments.home}
 
 
 def _run(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
-    return {"arm": arguments.arm, "motion": _motion(client, arguments.arm, arguments.motion), "speed": arguments.speed}
+    return {
+        "arm": arguments.arm,
+        "motion": motion_id(client, arguments.arm, arguments.motion),
+        "speed": arguments.speed,
+    }
 
 
 def _home(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -133,14 +140,14 @@ def _home(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _ask(client: Client, arguments: argparse.Namespace) -> Answer:
-    answer = client.post(f"/api/v1/arms/{_id(arguments.arm)}/{arguments.word}")
+    answer = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/{arguments.word}")
     reached = bool(answer.get("reached", answer.get("arms")) or answer.get("jobs"))
     words = f"{arguments.word} asked" if reached else "nobody moves the arm"
     return DONE, f"{arguments.arm}: {words}\n", answer
 
 
 def _ack(client: Client, arguments: argparse.Namespace) -> Answer:
-    path = f"/api/v1/arms/{_id(arguments.arm)}/faults/{_id(arguments.fault)}/ack"
+    path = f"/api/v1/arms/{word_of_address(arguments.arm)}/faults/{word_of_address(arguments.fault)}/ack"
     answer = client.post(path)
     return DONE, f"{arguments.arm}: acknowledged {answer['code']} ({answer['cause']})\n", answer
 
@@ -152,15 +159,17 @@ def _list(client: Client, arguments: argparse.Namespace) -> Answer:
 
 
 def _show(client: Client, arguments: argparse.Namespace) -> Answer:
-    return _told(client, client.get(f"/api/v1/jobs/{_id(arguments.job)}"), DONE)
+    return _told(client, client.get(f"/api/v1/jobs/{word_of_address(arguments.job)}"), DONE)
 
 
 def _watch(client: Client, arguments: argparse.Namespace) -> Answer:
-    return _followed(client, arguments, client.get(f"/api/v1/jobs/{_id(arguments.job)}"), moves=False, ours=False)
+    return _followed(
+        client, arguments, client.get(f"/api/v1/jobs/{word_of_address(arguments.job)}"), moves=False, ours=False
+    )
 
 
 def _cancel(client: Client, arguments: argparse.Namespace) -> Answer:
-    return _told(client, client.post(f"/api/v1/jobs/{_id(arguments.job)}/cancel"), DONE)
+    return _told(client, client.post(f"/api/v1/jobs/{word_of_address(arguments.job)}/cancel"), DONE)
 
 
 REMOTE: dict[str, Verb] = {
@@ -236,18 +245,18 @@ def _told(client: Client, job: dict[str, Any], code: int) -> Answer:
     return code, "\n".join([*lines, ""]), {"job": job, "answer": result}
 
 
-def _confirmation(client: Client, arguments: argparse.Namespace) -> dict[str, str]:
+def confirmation(client: Client, arguments: argparse.Namespace) -> dict[str, str]:
     """The arm's name as a person types it, now or as `--confirm`, and a challenge for it."""
     name = arguments.confirm
     if name is None and sys.stdin.isatty() and not arguments.json:
         name = input(f"{arguments.arm} will move where you may not see it. Type its name to confirm: ").strip()
     if name != arguments.arm:
         raise UsageError(f"a motion is confirmed by the arm's name, typed: --confirm {arguments.arm}")
-    word = client.post(f"/api/v1/arms/{_id(arguments.arm)}/challenge")["challenge"]
+    word = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/challenge")["challenge"]
     return {"name": name, "challenge": word}
 
 
-def _motion(client: Client, arm: str, motion: Path | None) -> str | None:
+def motion_id(client: Client, arm: str, motion: Path | None) -> str | None:
     """The id of a motion; a file is uploaded first."""
     if motion is None:
         return None
@@ -263,7 +272,7 @@ def _recording(path: Path) -> dict[str, str]:
     return {"run": run, **({"name": name} if name else {})}
 
 
-def _id(word: str) -> str:
+def word_of_address(word: str) -> str:
     """A word that may stand in an address."""
     if not word or any(letter in word for letter in "/?#% \\") or not word.isprintable() or word.startswith("."):
         raise UsageError(f"{word!r}: with --server, arms, runs and jobs are named by id, not by path")

@@ -309,7 +309,13 @@ _MOTION_DEPENDS_ON = (
 
 
 class ArmConfig(Section):
-    """A whole arm as its YAML file describes it; the first thing that passes every door."""
+    """A whole arm as its YAML file describes it; the first thing that passes every door.
+
+    WARNING: with `unattended_motion: allowed` a scheduled re-identification, or one after maintenance, moves the arm
+    with nobody there, at any hour and without any further word; preflight's question whether the arm is supported and
+    nobody is within its reach is answered by this key alone. It is for the simulator, and for a cell whose fence and
+    interlock take the drives' power away as soon as a person can reach in; software does not see people.
+    """
 
     format: Literal["ident-arm"]
     version: Literal[1]
@@ -332,6 +338,7 @@ class ArmConfig(Section):
     design: Design = Design()
     motions: Motions = Motions()
     driver: Driver | None = None
+    unattended_motion: Literal["refused", "allowed"] = "refused"
 
     @property
     def sha256(self) -> str:

@@ -26,12 +26,14 @@ from ident_service.errors import ParameterError, UsageError
 from ident_service.results.files import appearing_folder, write_atomically
 from ident_service.results.manifest import file_sha256
 from ident_service.service.arm_state import arm_folder
+from ident_service.service.maintenance.alarms import end_alarms
 from ident_service.service.registry.audit import note as audit
 from ident_service.service.registry.database import Database
 
 PARAMETERS, URDF, ARM = "parameters.json", "identified.urdf", "arm.json"
 ACCEPTED, CURRENT, ACT = "accepted", "current", "acceptance.json"
 LONGEST_NOTE: Final = 2000
+_LONGEST_NAME = 100
 
 
 @dataclass(frozen=True)
@@ -67,16 +69,16 @@ def accept(db: Database, state: Path, folder: Path, note: str, who: str, *, arm:
         state: the state folder.
         folder: of results, verified against its manifest here.
         note: why.
-        who: accepts.
+        who: accepts; their name.
         arm: whose they are to be; the one that the folder names if None.
 
     Raises:
-        UsageError: no note, nothing was identified in the folder, or it is about another arm.
+        UsageError: no note, no name, nothing was identified in the folder, or it is about another arm.
         ParameterError: the folder is not what its manifest names, or no body can have its parameters.
     """
     from ident_service.results.run_folder import read_results
 
-    note = _noted(note)
+    note, who = _noted(note), _named(who)
     results = read_results(folder)
     if results.parameters.content.get("feasibility", {}).get("feasible") is not True:
         raise ParameterError(f"{folder}: no body can have these parameters, so no arm has them; accept a feasible set")
@@ -88,7 +90,9 @@ def accept(db: Database, state: Path, folder: Path, note: str, who: str, *, arm:
         act = Acceptance(arm, number, folder.name, number, results.sha256[PARAMETERS], note, round(time.time(), 3), who)
         _write(state, act, folder)
         _follow(db, state, arm)
-        audit(db, who, "accepted", arm, number=number, run=act.run, note=note, sha256=act.parameters_sha256)
+        with db.transaction():
+            audit(db, who, "accepted", arm, number=number, run=act.run, note=note, sha256=act.parameters_sha256)
+            end_alarms(db, arm, f"accepted {act.run} as number {number}", who, act.at)
     return act
 
 
@@ -100,13 +104,14 @@ def rollback(db: Database, state: Path, arm: str, note: str, who: str, to: int |
         state: the state folder.
         arm: name.
         note: why.
-        who: asks.
+        who: asks; their name.
         to: number of the acceptance; the one before the current set's if None.
 
     Raises:
-        UsageError: no note, or there is no such set.
+        UsageError: no note, no name, or there is no such set.
+        ParameterError: the set is not what was accepted.
     """
-    note = _noted(note)
+    note, who = _noted(note), _named(who)
     with _acting(state, arm):
         acts = acceptances(state, arm)
         if not acts:
@@ -125,8 +130,7 @@ def rollback(db: Database, state: Path, arm: str, note: str, who: str, to: int |
             *(note, round(time.time(), 3), who),
         )
         source = _folder(state, arm, target.number)
-        if file_sha256(source / PARAMETERS) != target.parameters_sha256:
-            raise ParameterError(f"{source / PARAMETERS}: was changed since it was accepted")
+        _require_as_accepted(source, target)
         _write(state, act, source)
         _follow(db, state, arm)
         audit(db, who, "rolled back", arm, number=act.number, to=target.number, note=note)
@@ -146,6 +150,24 @@ def acceptances(state: Path, arm: str) -> list[Acceptance]:
         except (OSError, ValueError, TypeError) as error:
             raise ParameterError(f"{folder / ACT}: cannot be read ({error}); put a copy of it back") from None
     return acts
+
+
+def accepted_set(state: Path, arm: str, number: int | None = None) -> tuple[Acceptance, Path]:
+    """A set that was accepted, and the folder with its files; the current one if `number` is None.
+
+    Raises:
+        UsageError: nothing was accepted, or nothing of this number.
+        ParameterError: it is not what was accepted.
+    """
+    acts = acceptances(state, arm)
+    if not acts:
+        raise UsageError(f"{arm}: nothing has been accepted yet; `ident accept RUN` makes a run's parameters its own")
+    if number is not None and not 1 <= number <= len(acts):
+        raise UsageError(f"{arm}: no acceptance {number}; they are numbered from 1 to {len(acts)}")
+    act = acts[-1 if number is None else number - 1]
+    folder = _folder(state, arm, act.number)
+    _require_as_accepted(folder, act)
+    return act, folder
 
 
 def settle(db: Database, state: Path) -> None:
@@ -169,6 +191,19 @@ def _noted(note: str) -> str:
     if len(note) > LONGEST_NOTE:
         raise UsageError(f"a note has {LONGEST_NOTE} characters at most")
     return note
+
+
+def _named(who: str) -> str:
+    who = who.strip()
+    if not who or len(who) > _LONGEST_NAME:
+        raise UsageError(f"say who accepts, by a name of 1 to {_LONGEST_NAME} characters")
+    return who
+
+
+def _require_as_accepted(folder: Path, act: Acceptance) -> None:
+    path = folder / PARAMETERS
+    if not path.is_file() or file_sha256(path) != act.parameters_sha256:
+        raise ParameterError(f"{path}: was changed since it was accepted; put a copy of it back")
 
 
 def _folder(state: Path, arm: str, number: int) -> Path:

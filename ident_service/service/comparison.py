@@ -11,8 +11,10 @@ from ident_service.results.comparison.page import comparison_html
 from ident_service.results.comparison.sides import read_side
 from ident_service.results.comparison.text import comparison_text
 from ident_service.results.files import appearing_folder, write_atomically
+from ident_service.results.run_folder import write_manifest
 
 DOCUMENT, TEXT, PAGE = "comparison.json", "comparison.txt", "comparison.html"
+KEPT = (DOCUMENT, TEXT, PAGE)
 
 
 def compare_files(paths: Sequence[Path], out: Path | None = None) -> tuple[Comparison, tuple[Path, ...]]:
@@ -41,9 +43,27 @@ def compare_files(paths: Sequence[Path], out: Path | None = None) -> tuple[Compa
     return comparison, tuple(out / name for name in names)
 
 
+def compare_into(reference: Path, folder: Path) -> Comparison:
+    """Compare a folder of results with a reference, and keep the comparison in it, named by its manifest.
+
+    A kill in between leaves files that the manifest does not name, which nobody believes.
+
+    Args:
+        reference: folder of results or parameter file.
+        folder: of results, verified here.
+
+    Raises:
+        UsageError, ParameterError, ConfigError: as `compare_files`.
+    """
+    comparison = compare([read_side(reference), read_side(folder)])
+    write_comparison_files(folder, comparison)
+    write_manifest(folder)
+    return comparison
+
+
 def write_comparison_files(folder: Path, comparison: Comparison) -> tuple[str, ...]:
     """Write a comparison in every form into a folder that exists; returns the names."""
     write_comparison(folder / DOCUMENT, comparison)
     write_atomically(folder / TEXT, comparison_text(comparison))
     write_atomically(folder / PAGE, comparison_html(comparison))
-    return DOCUMENT, TEXT, PAGE
+    return KEPT

@@ -22,7 +22,7 @@ from ident_service.service.registry.tokens import add_token, revoke_token
 
 OPEN = {("GET", "/healthz"), ("POST", "/api/v1/login"), ("POST", "/api/v1/logout")}
 STOPS = {("POST", "/api/v1/stop"), ("POST", "/api/v1/arms/{arm}/stop")}
-FILLED = {"arm": "planar2", "job": "j", "run": "r", "motion": "m", "name": "n", "code": "c"}
+FILLED = {"arm": "planar2", "job": "j", "run": "r", "motion": "m", "name": "n", "code": "c", "number": 1}
 MOTION = {"kind": "run", "arm": "planar2"}
 FAR = "203.0.113.9"
 
@@ -68,6 +68,12 @@ def test_a_viewer_changes_nothing(daemon: Asked, viewer: str) -> None:
         "/api/v1/jobs": {"job": {"kind": "simulate", "arm": "planar2"}},
         "/api/v1/arms/{arm}/acceptances": {"run": "r", "note": "n"},
         "/api/v1/arms/{arm}/rollback": {"note": "n"},
+        "/api/v1/schedules": {"arm": "planar2", "maintenance": True},
+        "/api/v1/schedules/{number}/enabled": {"enabled": False},
+        "/api/v1/arms/{arm}/maintenance": {"what": "belt"},
+        "/api/v1/due/{number}/dismiss": {"note": "n"},
+        "/api/v1/reidentifications": {"arm": "planar2"},
+        "/api/v1/alarms/{number}/ack": {"note": "n"},
     }
     tried = 0
     for method, path in routes(daemon):

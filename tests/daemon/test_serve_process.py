@@ -75,7 +75,7 @@ def test_the_command_drives_a_daemon(state: Path, tmp_path: Path, capsys: pytest
             assert mover.stop
         # The same acts at a terminal are in the same trail.
         assert ident(capsys, "accept", state / "runs" / run, "--note", "at the terminal", "--state", state)[0] == 0
-        assert client.get("/api/v1/arms/quick")["accepted"]["who"] == "terminal"
+        assert client.get("/api/v1/arms/quick")["accepted"]["who"].startswith("terminal:")
         code, document = ident(capsys, "token", "add", "ann", "--role", "viewer", "--state", state)
         looks = Client(client._url, document["token"])
         assert looks.get("/api/v1/whoami") == {"name": "ann", "role": "viewer"}

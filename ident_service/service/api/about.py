@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
@@ -15,6 +16,8 @@ from ident_service.service.api.asking import COOKIE, Cookie, Serving, Viewer, ad
 from ident_service.service.api.gate import SESSION_SECONDS, Throttled
 from ident_service.service.api.mistakes import failures, failures_of_files
 from ident_service.service.arm_state import fault_file
+from ident_service.service.maintenance.alarms import alarms
+from ident_service.service.maintenance.schedules import dues
 from ident_service.service.registry.audit import trail
 
 router = APIRouter(tags=["service"], responses=failures())
@@ -27,10 +30,12 @@ class Login(BaseModel):
     token: Annotated[str, Field(min_length=1, max_length=200)]
 
 
-@router.get("/healthz", responses={503: {"model": HealthAnswer, "description": "The queue is not looked after."}})
+@router.get(
+    "/healthz", responses={503: {"model": HealthAnswer, "description": "Queue or schedule is not looked after."}}
+)
 def healthz(service: Serving, response: Response) -> HealthAnswer:
-    """Whether the service looks after its queue; asks for no token."""
-    healthy = service.engine.healthy and not service.engine.closing
+    """Whether the service looks after its queue and its schedule; asks for no token."""
+    healthy = service.engine.healthy and service.keeper.healthy and not service.engine.closing
     response.status_code = 200 if healthy else 503
     return HealthAnswer(healthy=healthy, version=__version__)
 
@@ -46,7 +51,9 @@ def metrics(service: Serving, _: Viewer) -> PlainTextResponse:
         except IdentError:
             faults[folder.name] = 1  # a file that somebody damaged stands in the way like one
     jobs = {(row["kind"], row["state"]): row["number"] for row in rows}
-    text = service.metrics.text(jobs, service.engine.moving(), faults)
+    due = Counter[str](row["arm"] for row in dues(service.db))
+    drifted = Counter[str](row["arm"] for row in alarms(service.db, most=10_000))
+    text = service.metrics.text(jobs, service.engine.moving(), faults, due, drifted)
     return PlainTextResponse(text, media_type="text/plain; version=0.0.4")
 
 

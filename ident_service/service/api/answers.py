@@ -56,12 +56,13 @@ class ArmAnswer(ArmLine):
     """An arm.
 
     `moved_by` is the process that moves it, `resources` what a motion of it has for itself, `simulated` whether it can
-    be commissioned by `simulate`.
+    be commissioned by `simulate`, `unattended_motion` whether what is due may begin by itself.
     """
 
     sha256: str
     joints: list[str]
     simulated: bool
+    unattended_motion: Literal["refused", "allowed"]
     resources: list[str]
     moved_by: int | None
     faults: list[FaultAnswer]

@@ -11,7 +11,7 @@ from fastapi.routing import APIRoute
 
 from ident_service import __version__
 from ident_service.service.acceptance import settle
-from ident_service.service.api import about, arms, jobs, runs
+from ident_service.service.api import about, arms, jobs, maintenance, runs
 from ident_service.service.api.asking import Service
 from ident_service.service.api.doors import Doors
 from ident_service.service.api.gate import Gate
@@ -20,13 +20,15 @@ from ident_service.service.api.mistakes import answer_mistakes
 from ident_service.service.api.settings import Settings
 from ident_service.service.jobs.engine import Engine
 from ident_service.service.live import LiveRuns
+from ident_service.service.maintenance.keeper import Keeper, note_gave_up
+from ident_service.service.maintenance.webhook import Webhook, read_secret
 from ident_service.service.pages.routes import PAGES
 from ident_service.service.registry.arms import know_shipped
 from ident_service.service.registry.database import Database
 from ident_service.service.registry.runs import rebuild_runs
 from ident_service.service.registry.tokens import first_token
 
-ROUTERS = (about.router, arms.router, jobs.router, runs.router, *PAGES)
+ROUTERS = (about.router, arms.router, jobs.router, runs.router, maintenance.router, *PAGES)
 """In this order."""
 
 
@@ -49,18 +51,21 @@ def create_app(settings: Settings, ready: Callable[[Service], None] = lambda _: 
         motion_door=settings.motion_door,
         lease_factor=settings.lease_factor,
     )
-    service = Service(settings, db, engine, Gate(db), Metrics())
+    keeper = Keeper(engine, _webhook(settings, db))
+    service = Service(settings, db, engine, Gate(db), Metrics(), keeper)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         settle(db, settings.state)
         engine.start(lambda: rebuild_runs(db, settings.state))
+        keeper.start()
         ready(service)
         try:
             yield
         finally:
             await run_in_threadpool(engine.close)
             app.state.live.close()
+            await run_in_threadpool(keeper.close)
             db.close()
 
     app = FastAPI(
@@ -81,6 +86,12 @@ def create_app(settings: Settings, ready: Callable[[Service], None] = lambda _: 
     answer_mistakes(app)
     app.add_middleware(Doors, settings=settings, metrics=service.metrics)
     return app
+
+
+def _webhook(settings: Settings, db: Database) -> Webhook | None:
+    if settings.webhook is None or settings.webhook_secret is None:
+        return None
+    return Webhook(settings.webhook, read_secret(settings.webhook_secret), lambda *said: note_gave_up(db, *said))
 
 
 def _operation(route: APIRoute) -> str:

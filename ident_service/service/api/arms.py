@@ -174,6 +174,7 @@ def _arm(service: Service, arm: str) -> ArmAnswer:
         sha256=config.sha256,
         joints=list(config.joints) or list(config.kinematics.dh.joints if config.kinematics.dh else ()),
         simulated=isinstance(config.driver, SimulatedDriver),
+        unattended_motion=config.unattended_motion,
         resources=list(known.resources(config)),
         moved_by=mover(control_path(service.state, found.name)),
         faults=[FaultAnswer(**asdict(one)) for one in fault_file(service.state, found.name).remembered()],

@@ -21,6 +21,7 @@ from ident_service.service.api.gate import Gate, Throttled
 from ident_service.service.api.metrics import Metrics
 from ident_service.service.api.settings import Settings
 from ident_service.service.jobs.engine import Engine
+from ident_service.service.maintenance.keeper import Keeper
 from ident_service.service.registry.database import Database
 from ident_service.service.registry.tokens import Access
 
@@ -38,6 +39,7 @@ class Service:
     engine: Engine
     gate: Gate
     metrics: Metrics
+    keeper: Keeper
 
     @property
     def state(self) -> Path:

@@ -54,18 +54,26 @@ class JobRequest(BaseModel):
     confirm: Confirmation | None = None
 
 
+def require_confirmed(service: Service, arm: str, confirm: Confirmation | None, who: str) -> None:
+    """Refuse a motion that no person has confirmed.
+
+    Raises:
+        MotionRefused: no confirmation, or one that does not count.
+    """
+    # The challenge is used up first, so that a name cannot be tried again with it.
+    good = confirm is not None and service.gate.confirm(confirm.challenge, arm, who)
+    if confirm is None or not good or confirm.name != arm:
+        raise MotionRefused(
+            f"{arm}: a motion needs a fresh challenge of this arm (POST /api/v1/arms/{arm}/challenge), used once, "
+            "and the arm's name as a person has typed it"
+        )
+
+
 @router.post("/jobs", status_code=201)
 def create_job(service: Serving, who: Operator, body: JobRequest) -> JobAnswer:
     """Queue a job."""
     if body.job.kind in MOVES:
-        arm = getattr(body.job, "arm", "")
-        # The challenge is used up first, so that a name cannot be tried again with it.
-        good = body.confirm is not None and service.gate.confirm(body.confirm.challenge, arm, who.name)
-        if body.confirm is None or not good or body.confirm.name != arm:
-            raise MotionRefused(
-                f"{arm}: a motion needs a fresh challenge of this arm (POST /api/v1/arms/{arm}/challenge), used once, "
-                "and the arm's name as a person has typed it"
-            )
+        require_confirmed(service, getattr(body.job, "arm", ""), body.confirm, who.name)
     return answer_of(service, service.engine.create(body.job, who.name))
 
 

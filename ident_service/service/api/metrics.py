@@ -23,13 +23,22 @@ class Metrics:
             self._requests[method if method in _METHODS else "other", status] += 1
             self._seconds += seconds
 
-    def text(self, jobs: Mapping[tuple[str, str], int], moving: Iterable[str], faults: Mapping[str, int]) -> str:
+    def text(
+        self,
+        jobs: Mapping[tuple[str, str], int],
+        moving: Iterable[str],
+        faults: Mapping[str, int],
+        due: Mapping[str, int],
+        alarms: Mapping[str, int],
+    ) -> str:
         """All figures.
 
         Args:
             jobs: number by kind and state.
             moving: names of arms that somebody moves.
             faults: number of latched faults by arm.
+            due: number of re-identifications that are due, by arm.
+            alarms: number of drift alarms that stand, by arm.
         """
         with self._lock:
             requests, seconds = dict(self._requests), self._seconds
@@ -45,6 +54,7 @@ class Metrics:
         ]
         lines.append("# TYPE ident_arm_moving gauge")
         lines += [f'ident_arm_moving{{arm="{arm}"}} 1' for arm in sorted(moving)]
-        lines.append("# TYPE ident_arm_faults gauge")
-        lines += [f'ident_arm_faults{{arm="{arm}"}} {count}' for arm, count in sorted(faults.items())]
+        for name, counts in (("faults", faults), ("due", due), ("drift_alarms", alarms)):
+            lines.append(f"# TYPE ident_arm_{name} gauge")
+            lines += [f'ident_arm_{name}{{arm="{arm}"}} {count}' for arm, count in sorted(counts.items())]
         return "\n".join([*lines, ""])

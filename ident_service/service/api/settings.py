@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from ident_service.errors import UsageError
+from ident_service.service.maintenance.webhook import require_address
 
 PORT: Final = 8470
 _LOCAL_NAMES: Final = frozenset({"localhost", "127.0.0.1", "::1"})
@@ -25,6 +26,8 @@ class Settings:
         tls_key: file of its key, PEM.
         names: host names under which clients may reach it, besides the address.
         motion_door: socket of the unit that motions run in; None for processes of the service's own.
+        webhook: address that notices go to; None for nobody.
+        webhook_secret: file of the secret that they are signed with.
         computing: how many jobs compute at a time.
         lease_factor: for tests on machines that stall (`jobs/engine.py`).
     """
@@ -36,6 +39,8 @@ class Settings:
     tls_key: Path | None = None
     names: tuple[str, ...] = ()
     motion_door: Path | None = None
+    webhook: str | None = None
+    webhook_secret: Path | None = None
     computing: int = 1
     lease_factor: float = 1.0
 
@@ -43,10 +48,14 @@ class Settings:
         """Refuse what would be open to a network.
 
         Raises:
-            UsageError: an address beyond loopback without TLS, or half of what TLS needs, or no address.
+            UsageError: an address beyond loopback without TLS, half of what TLS or a webhook needs, or no address.
         """
         if (self.tls_cert is None) != (self.tls_key is None):
             raise UsageError("TLS needs both --tls-cert and --tls-key")
+        if (self.webhook is None) != (self.webhook_secret is None):
+            raise UsageError("a webhook needs both --webhook and --webhook-secret")
+        if self.webhook is not None:
+            require_address(self.webhook)
         for path in (self.tls_cert, self.tls_key):
             if path is not None and not path.is_file():
                 raise UsageError(f"{path}: no such file")

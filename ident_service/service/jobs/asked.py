@@ -131,6 +131,8 @@ class Identify(Ask):
     method: Literal["ols", "wls", "huber", "iv"] | None = None
     feasible_set: FeasibleSet | None = None
     prior: Literal["none", "euclidean", "entropic"] | None = None
+    as_accepted: Annotated[int, Field(ge=1, lt=10_000)] | None = None
+    """By the description that this acceptance keeps, which the comparison with its set needs; not by today's."""
 
 
 class Simulate(Ask):
@@ -173,6 +175,15 @@ class Compare(Ask):
     other: Id
 
 
+class Judge(Ask):
+    """A run's parameters against those of an acceptance of its arm; the comparison becomes part of the run."""
+
+    kind: Literal["judge"]
+    arm: ArmName
+    run: Id
+    against: Annotated[int, Field(ge=1, lt=10_000)]
+
+
 Asked = Annotated[
     Base
     | Preview
@@ -189,7 +200,8 @@ Asked = Annotated[
     | Report
     | Export
     | Verify
-    | Compare,
+    | Compare
+    | Judge,
     Field(discriminator="kind"),
 ]
 """Any of them; `kind` says which."""

@@ -9,7 +9,7 @@ from typing import Final
 
 from ident_service.errors import UsageError
 from ident_service.motion.controls import HOLD_TO_RUN_SECONDS, LEASE_SECONDS
-from ident_service.service.acceptance import PARAMETERS
+from ident_service.service.acceptance import ARM, PARAMETERS, accepted_set
 from ident_service.service.jobs.asked import (
     MOVES,
     Asked,
@@ -20,6 +20,7 @@ from ident_service.service.jobs.asked import (
     Export,
     Home,
     Identify,
+    Judge,
     LeaveLimit,
     Preview,
     RecordingOf,
@@ -72,6 +73,8 @@ def command(db: Database, state: Path, asked: Asked) -> Command:
     """
     if isinstance(asked, Report | Export | Verify | Compare):
         return _about_a_run(db, state, asked)
+    if isinstance(asked, Judge):
+        return _judgement(db, state, asked)
     arm = known_arm(db, state, asked.arm)
     made = None if isinstance(asked, _LOOKS) else new_id(arm.name)
     words = [_VERBS.get(asked.kind, asked.kind), *_words(db, state, asked, arm)]
@@ -98,6 +101,8 @@ def _words(db: Database, state: Path, asked: Asked, arm: KnownArm) -> list[str]:
         recordings = _recordings(db, state, asked.recordings)
         judged = [f"--validate={one}" for one in _recordings(db, state, asked.validate_on)]
         chosen = {"method": asked.method, "feasible-set": asked.feasible_set, "prior": asked.prior}
+        if asked.as_accepted is not None:
+            path = str(accepted_set(state, arm.name, asked.as_accepted)[1] / ARM)
         return [*recordings, "--arm", path, *judged, *_given(chosen)]
     if isinstance(asked, Simulate):
         motion = [] if asked.motion is None else [f"--motion={motion_path(db, state, asked.motion)}"]
@@ -142,6 +147,15 @@ def _about_a_run(db: Database, state: Path, asked: Report | Export | Verify | Co
         words = ["export", str(folder), "--format", ",".join(asked.formats), "--out", str(place / made)]
     place.mkdir(parents=True, exist_ok=True)
     return Command((*words, *_always(state)), arm, False, made or asked.run, (), LEASE_SECONDS)
+
+
+def _judgement(db: Database, state: Path, asked: Judge) -> Command:
+    run = known_run(db, asked.run)
+    if run["arm"] != asked.arm:
+        raise UsageError(f"the run {asked.run} is about the arm {run['arm']}, not {asked.arm}")
+    accepted = accepted_set(state, asked.arm, asked.against)[1] / PARAMETERS
+    words = ["compare", str(accepted), str(run_folder(db, state, asked.run)), "--keep"]
+    return Command((*words, *_always(state)), asked.arm, False, asked.run, (), LEASE_SECONDS)
 
 
 def _recordings(db: Database, state: Path, asked: Sequence[RecordingOf]) -> list[str]:

@@ -13,6 +13,7 @@ import logging
 import signal
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,6 +83,7 @@ class Engine:
         self.db, self.state = db, state
         self._computing, self._door, self._factor, self._now = computing, motion_door, lease_factor, now
         self._live: dict[str, _Live] = {}
+        self._stops = Counter[str | None]()
         self._lock = threading.RLock()
         self._wake, self._closing = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._work, name="jobs", daemon=True)
@@ -109,18 +111,28 @@ class Engine:
         """Whether the queue is being looked after."""
         return self._thread.is_alive() and self._now() - self.beat < 30.0
 
-    def create(self, asked: Asked, by: str, *, own_lease: bool = False) -> Row:
+    def create(
+        self,
+        asked: Asked,
+        by: str,
+        *,
+        own_lease: bool = False,
+        stops: int | None = None,
+        entering: Callable[[Row], None] = lambda _: None,
+    ) -> Row:
         """Queue a job.
 
         Args:
             asked: by ids.
             by: the name of a token, or `service`.
             own_lease: whether a motion's lease is the service's own, as a scheduled one's is.
+            stops: what `stops` answered when a person, or the schedule, began that of which this is a later step.
+            entering: writes what belongs to the job in the same transaction.
 
         Raises:
             UsageError: it names what is not known.
             ConfigError: the arm's description has mistakes.
-            MotionRefused: the service is ending.
+            MotionRefused: the service is ending, or somebody has asked for a stop meanwhile.
         """
         order = command(self.db, self.state, asked)
         if self.closing:
@@ -128,15 +140,22 @@ class Engine:
         job = new_id(asked.kind)
         (self.state / JOBS / job).mkdir(parents=True)
         with self._lock, self.db.transaction():
+            if stops is not None and stops != self.stops(order.arm):
+                raise MotionRefused("somebody asked for a stop meanwhile; nothing more is begun")
             row = rows.add_job(
                 *(self.db, job, asked.kind, order.arm, asked.model_dump(mode="json"), list(order.words), by),
                 motion=order.moves,
                 run=order.run,
             )
             note(self.db, by, "job created", job, kind=asked.kind, arm=order.arm)
+            entering(row)
             self._live[job] = _Live(job, order, by, own_lease, self._now())
         self._wake.set()
         return row
+
+    def stops(self, arm: str | None) -> int:
+        """How often a stop of this arm, or of all, has been asked for here."""
+        return self._stops[None] + (self._stops[arm] if arm is not None else 0)
 
     def renew(self, job: str) -> bool:
         """Renew a motion's lease; False where nothing moves or waits under it any more."""
@@ -171,6 +190,7 @@ class Engine:
         """
         reached, ended = self._reach(arm, lambda controls: controls.ask_stop()), []
         with self._lock:
+            self._stops[arm] += 1
             for live in list(self._live.values()):
                 if live.order.moves and arm in (None, live.order.arm):
                     self._end(live, f"{by} asked for a stop")

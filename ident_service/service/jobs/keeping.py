@@ -10,7 +10,7 @@ from ident_service.service.registry.database import Database, Row
 from ident_service.service.registry.motions import MOTION_FILE, MOTIONS, index_motion
 from ident_service.service.registry.runs import RUNS, index_run
 
-_MAKES_A_RUN = frozenset({"run", "rehearse", "home", "leave_limit", "identify", "simulate"})
+_MAKES_A_RUN = frozenset({"run", "rehearse", "home", "leave_limit", "identify", "simulate", "judge"})
 
 
 def keep(db: Database, state: Path, row: Row, by: str) -> None:
@@ -39,7 +39,7 @@ def keep(db: Database, state: Path, row: Row, by: str) -> None:
 
 def folder_of(state: Path, row: Row) -> Path | None:
     """The folder that a job makes, there or not; None for one that makes none."""
-    if row["run"] is None or row["kind"] in ("report", "verify", "compare"):
+    if row["run"] is None or row["kind"] in ("report", "verify", "compare", "judge"):
         return None
     place = {"design": MOTIONS, "export": EXPORTS}.get(row["kind"], RUNS)
     return state / place / str(row["run"])

@@ -20,7 +20,7 @@ from ident_service.service.registry import jobs as rows
 from ident_service.service.registry.audit import note
 from ident_service.service.registry.database import Database, Row
 
-_UNTOLD = "the service died while it ran; its process is being looked for"
+UNTOLD = "the service died while it ran; its process is being looked for"
 _WAIT = 40.0  # s for a process of the service before: a controlled stop and its recording take less
 
 
@@ -29,7 +29,7 @@ def mark_interrupted(db: Database, state: Path) -> None:
     with db.transaction():
         for row in rows.jobs(db, states=rows.LIVE, most=1_000_000):
             if row["state"] == "running":
-                detail = _UNTOLD
+                detail = UNTOLD
             elif row["motion"]:
                 detail = "the service ended before it began; nothing has moved, ask for it again"
             else:
@@ -41,7 +41,7 @@ def mark_interrupted(db: Database, state: Path) -> None:
 def explain_interrupted(db: Database, state: Path, cut_short: Callable[[], bool] = lambda: False) -> None:
     """See that processes of the service before have ended, and tell what their files show."""
     for row in rows.jobs(db, states=("interrupted",), most=1_000_000):
-        if row["detail"] != _UNTOLD or cut_short():
+        if row["detail"] != UNTOLD or cut_short():
             continue
         process = _process(state, row)
         # A motion has heard the end of its input and stops its arm; a computation is nobody's any more.

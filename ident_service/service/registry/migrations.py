@@ -135,4 +135,56 @@ CREATE TRIGGER audit_stays BEFORE UPDATE ON audit BEGIN SELECT RAISE(ABORT, 'the
 CREATE TRIGGER audit_keeps BEFORE DELETE ON audit BEGIN SELECT RAISE(ABORT, 'the audit trail is append-only'); END;
 """
 
-MIGRATIONS: Final[tuple[str, ...]] = (_FIRST,)
+_MAINTENANCE = """
+ALTER TABLE runs ADD COLUMN seconds REAL;  -- that the arm was driven; NULL: its folder does not say
+ALTER TABLE schedules ADD COLUMN counted REAL NOT NULL DEFAULT 0; -- operating seconds when it was last due
+
+CREATE TABLE reidentifications (
+    id TEXT PRIMARY KEY,
+    arm TEXT NOT NULL,
+    step TEXT NOT NULL CHECK (step IN ('check', 'run', 'identify', 'judge')),
+    state TEXT NOT NULL CHECK (state IN ('running', 'unchanged', 'changed', 'impossible',
+        'refused', 'failed', 'faulted', 'cancelled', 'interrupted')),
+    motion TEXT,
+    against INTEGER NOT NULL,          -- number of the acceptance
+    unattended INTEGER NOT NULL CHECK (unattended IN (0, 1)),
+    job TEXT,                          -- of the step; NULL where a terminal does them
+    recorded TEXT,                     -- id of the run with the recording
+    run TEXT,                          -- id of the run with the parameters and the comparison
+    detail TEXT NOT NULL DEFAULT '',
+    begun REAL NOT NULL,
+    begun_by TEXT NOT NULL,
+    ended REAL
+) STRICT;
+CREATE UNIQUE INDEX one_reidentification ON reidentifications (arm) WHERE state = 'running';
+
+CREATE TABLE dues (
+    id INTEGER PRIMARY KEY AUTOINCREMENT,
+    arm TEXT NOT NULL,
+    schedule INTEGER NOT NULL,
+    cause TEXT NOT NULL,
+    at REAL NOT NULL,
+    late INTEGER NOT NULL CHECK (late IN (0, 1)), -- found long after its time
+    told INTEGER NOT NULL DEFAULT 0 CHECK (told IN (0, 1)),
+    tried INTEGER NOT NULL DEFAULT 0 CHECK (tried IN (0, 1)), -- whether it was decided if it begins by itself
+    closed REAL,
+    closed_by TEXT,
+    how TEXT NOT NULL DEFAULT ''
+) STRICT;
+CREATE UNIQUE INDEX one_due ON dues (schedule) WHERE closed IS NULL;
+
+CREATE TABLE alarms (
+    id INTEGER PRIMARY KEY AUTOINCREMENT,
+    arm TEXT NOT NULL,
+    reidentification TEXT NOT NULL,
+    run TEXT NOT NULL,
+    what TEXT NOT NULL,                -- findings, in words
+    at REAL NOT NULL,
+    told INTEGER NOT NULL DEFAULT 0 CHECK (told IN (0, 1)),
+    closed REAL,
+    closed_by TEXT,
+    how TEXT NOT NULL DEFAULT ''
+) STRICT;
+"""
+
+MIGRATIONS: Final[tuple[str, ...]] = (_FIRST, _MAINTENANCE)

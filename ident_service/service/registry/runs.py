@@ -45,11 +45,12 @@ def index_run(db: Database, state: Path, run: str) -> Row:
         values = (
             *(_kind(files), name, None if table is None else table.get("arm", {}).get("sha256")),
             *(_began(folder), _ending(files, ended), file_sha256(folder / MANIFEST) if whole else None, time.time()),
+            _driven(arm, ended),
         )
         db.write(
-            "INSERT INTO runs VALUES (?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT (id) DO UPDATE SET kind = excluded.kind, "
-            "arm = excluded.arm, arm_sha256 = excluded.arm_sha256, ending = excluded.ending, "
-            "manifest_sha256 = excluded.manifest_sha256, indexed = excluded.indexed",
+            "INSERT INTO runs VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT (id) DO UPDATE SET kind = excluded.kind, "
+            "arm = excluded.arm, arm_sha256 = excluded.arm_sha256, ending = excluded.ending, manifest_sha256 = "
+            "excluded.manifest_sha256, indexed = excluded.indexed, seconds = excluded.seconds",
             *(run, *values),
         )
         for recording, size in sizes.items():
@@ -160,6 +161,18 @@ def _ending(files: dict[str, str], ended: dict[str, Any] | None) -> str:
     if ended is not None:
         return str(ended.get("error") or ended.get("state") or "unknown")
     return "done" if _PARAMETERS in files else KILLED
+
+
+def _driven(arm: dict[str, Any], ended: dict[str, Any] | None) -> float | None:
+    """How long the loop drove the arm [s]; None where that was not written down."""
+    cycles, rate = (ended or {}).get("cycles"), arm.get("control", {}).get("rate")
+    return cycles / rate if isinstance(cycles, int | float) and isinstance(rate, int | float) and rate > 0 else None
+
+
+def operating_seconds(db: Database, arm: str) -> float:
+    """How long runs of this registry drove an arm, all together [s]; what drives it otherwise is not known here."""
+    row = db.row("SELECT TOTAL(seconds) AS seconds FROM runs WHERE arm = ?", arm)
+    return float(row["seconds"]) if row is not None else 0.0
 
 
 def _feasible(table: dict[str, Any]) -> int | None:

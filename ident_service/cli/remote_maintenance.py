@@ -1,0 +1,136 @@
+"""`--server` for what is checked again: `schedule`, `maintenance`, `due`, `alarm`, `reidentify`, done by a daemon.
+
+Boundary: words to requests by id, answers to words; the connection is `remote.py`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+from ident_service.cli.answer import DONE, FAILED, FAULTED, VERDICT_NO, Answer, StopOnSignal, tell
+from ident_service.cli.remote import confirmation, motion_id, word_of_address
+from ident_service.cli.schedule import alarm_lines, due_line, schedule_line
+
+if TYPE_CHECKING:
+    from ident_service.service.client import Client
+
+_LOOK = 0.4  # s between looks, and between renewals of the lease
+_CODES = {"unchanged": DONE, "changed": VERDICT_NO, "impossible": VERDICT_NO, "refused": VERDICT_NO, "faulted": FAULTED}
+_API = "/api/v1"
+
+
+def _of(arguments: argparse.Namespace, path: str) -> str:
+    return f"{_API}/{path}" + (f"?arm={quote(arguments.arm, safe='')}" if arguments.arm is not None else "")
+
+
+def _add(client: Client, arguments: argparse.Namespace) -> Answer:
+    body = {
+        "arm": arguments.arm,
+        "cron": arguments.cron,
+        "hours": arguments.hours,
+        "maintenance": arguments.maintenance,
+        "motion": arguments.motion,
+    }
+    row = client.post(f"{_API}/schedules", body)
+    return DONE, schedule_line(row), row
+
+
+def _list(client: Client, arguments: argparse.Namespace) -> Answer:
+    rows = client.get(_of(arguments, "schedules"))
+    return DONE, "".join(map(schedule_line, rows)) or "nothing is scheduled\n", {"schedules": rows}
+
+
+def _remove(client: Client, arguments: argparse.Namespace) -> Answer:
+    client.ask("DELETE", f"{_API}/schedules/{arguments.number}")
+    return DONE, f"schedule {arguments.number}: removed\n", {"id": arguments.number, "removed": True}
+
+
+def _enabled(enabled: bool) -> Callable[[Client, argparse.Namespace], Answer]:
+    def verb(client: Client, arguments: argparse.Namespace) -> Answer:
+        row = client.post(f"{_API}/schedules/{arguments.number}/enabled", {"enabled": enabled})
+        return DONE, schedule_line(row), row
+
+    return verb
+
+
+def _maintenance(client: Client, arguments: argparse.Namespace) -> Answer:
+    body = {"what": arguments.what, "note": arguments.note}
+    row = client.post(f"{_API}/arms/{word_of_address(arguments.arm)}/maintenance", body)
+    due = client.get(_of(arguments, "due"))
+    text = f"{arguments.arm}: entered: {row['what']}\n" + "".join(map(due_line, due))
+    return DONE, text, {**row, "due": due}
+
+
+def _due(client: Client, arguments: argparse.Namespace) -> Answer:
+    rows = client.get(_of(arguments, "due"))
+    return DONE, "".join(map(due_line, rows)) or "nothing is due\n", {"due": rows}
+
+
+def _dismiss(client: Client, arguments: argparse.Namespace) -> Answer:
+    client.post(f"{_API}/due/{arguments.number}/dismiss", {"note": arguments.note})
+    return DONE, f"due {arguments.number}: dismissed\n", {"id": arguments.number, "dismissed": True}
+
+
+def _alarms(client: Client, arguments: argparse.Namespace) -> Answer:
+    rows = client.get(_of(arguments, "alarms"))
+    return VERDICT_NO if rows else DONE, alarm_lines(rows), {"alarms": rows}
+
+
+def _ack(client: Client, arguments: argparse.Namespace) -> Answer:
+    row = client.post(f"{_API}/alarms/{arguments.number}/ack", {"note": arguments.note})
+    return DONE, f"alarm {row['id']} of {row['arm']}: acknowledged\n", row
+
+
+def _reidentify(client: Client, arguments: argparse.Namespace) -> Answer:
+    """Begin it, keep its lease, and tell its end; Ctrl-C has the arm stopped."""
+    body = {
+        "arm": arguments.arm,
+        "motion": motion_id(client, arguments.arm, arguments.motion),
+        "confirm": confirmation(client, arguments),
+    }
+    row: dict[str, Any] = client.post(f"{_API}/reidentifications", body)
+    path, step, stopping, stopped = f"{_API}/reidentifications/{row['id']}", "", StopOnSignal(), False
+    with stopping:
+        while row["state"] == "running":
+            if row["step"] != step:
+                step = row["step"]
+                tell(arguments, f"-- {step}")
+            if stopping.requested():
+                if not stopped:
+                    client.post(f"{_API}/arms/{word_of_address(arguments.arm)}/stop")
+                stopped = True
+            else:
+                client.post(f"{path}/lease")
+            time.sleep(_LOOK)
+            row = client.get(path)
+    text = f"{row['arm']}: {row['detail'] or row['state']}\n" + (f"run {row['run']}\n" if row["run"] else "")
+    return _CODES.get(row["state"], FAILED), text, row
+
+
+VERBS: dict[str, Callable[[Client, argparse.Namespace], Answer]] = {
+    "schedule add": _add,
+    "schedule list": _list,
+    "schedule remove": _remove,
+    "schedule enable": _enabled(True),
+    "schedule disable": _enabled(False),
+    "maintenance": _maintenance,
+    "due list": _due,
+    "due dismiss": _dismiss,
+    "alarm list": _alarms,
+    "alarm ack": _ack,
+    "reidentify": _reidentify,
+}
+_NUMBER = frozenset({"number"})
+CARRIED: dict[str, frozenset[str]] = {
+    "schedule add": frozenset({"arm", "cron", "hours", "maintenance", "motion"}),
+    **dict.fromkeys(("schedule list", "due list", "alarm list"), frozenset({"arm"})),
+    **dict.fromkeys(("schedule remove", "schedule enable", "schedule disable"), _NUMBER),
+    "maintenance": frozenset({"arm", "what", "note"}),
+    **dict.fromkeys(("due dismiss", "alarm ack"), _NUMBER | {"note"}),
+    "reidentify": frozenset({"arm", "motion", "confirm"}),
+}
+"""What of each verb a daemon is told; who asks is the token's name, and not `--by`."""

@@ -1,0 +1,181 @@
+"""Routes about what is checked again: schedules, maintenance, what is due, re-identifications, drift alarms."""
+
+from __future__ import annotations
+
+import time
+from typing import Annotated
+
+from fastapi import APIRouter, HTTPException, Path, Query
+from pydantic import BaseModel, ConfigDict, Field
+
+from ident_service.motion.controls import LEASE_SECONDS
+from ident_service.service.api.answers import LeaseAnswer
+from ident_service.service.api.asking import Operator, Service, Serving, Viewer
+from ident_service.service.api.jobs import Confirmation, require_confirmed, without_paths
+from ident_service.service.api.maintenance_answers import (
+    AlarmAnswer,
+    DueAnswer,
+    EventAnswer,
+    ReidentificationAnswer,
+    ScheduleAnswer,
+)
+from ident_service.service.api.mistakes import failures
+from ident_service.service.jobs.asked import ArmName, Id
+from ident_service.service.maintenance import alarms as raised
+from ident_service.service.maintenance import schedules as planned
+from ident_service.service.maintenance.reidentification import Wanted, known_reidentification, reidentifications
+from ident_service.service.registry.arms import known_arm
+from ident_service.service.registry.database import Row
+
+router = APIRouter(prefix="/api/v1", tags=["maintenance"], responses=failures(404, 409))
+Number = Annotated[int, Path(ge=1, lt=2**62)]
+Most = Annotated[int, Query(ge=1, le=500)]
+Words = Annotated[str, Field(min_length=1, max_length=planned.LONGEST_NOTE)]
+
+
+class _Body(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class NewSchedule(_Body):
+    """When an arm is to be re-identified: exactly one of cron (UTC), operating hours, maintenance."""
+
+    arm: ArmName
+    cron: Annotated[str, Field(max_length=200)] | None = None
+    hours: Annotated[float, Field(gt=0, lt=1e6)] | None = None
+    maintenance: bool = False
+    motion: Id | None = None
+
+
+class Enabled(_Body):
+    """Whether a schedule counts."""
+
+    enabled: bool
+
+
+class Event(_Body):
+    """Maintenance that was done."""
+
+    what: Annotated[str, Field(min_length=1, max_length=planned.LONGEST_WHAT)]
+    note: Annotated[str, Field(max_length=planned.LONGEST_NOTE)] = ""
+
+
+class Remark(_Body):
+    """A person's word, with a reason."""
+
+    note: Words
+
+
+class NewReidentification(_Body):
+    """A person's word that an arm is re-identified now; it moves twice, for the preflight and for the run."""
+
+    arm: ArmName
+    motion: Id | None = None
+    confirm: Confirmation | None = None
+
+
+@router.get("/schedules")
+def list_schedules(service: Serving, _: Viewer, arm: ArmName | None = None) -> list[ScheduleAnswer]:
+    """All schedules, or those of an arm."""
+    return [ScheduleAnswer(**row) for row in planned.schedules(service.db, arm)]
+
+
+@router.post("/schedules", status_code=201)
+def add_schedule(service: Serving, who: Operator, body: NewSchedule) -> ScheduleAnswer:
+    """Add one."""
+    when = planned.When(body.cron, body.hours, body.maintenance)
+    row = planned.add_schedule(service.db, _arm(service, body.arm), when, who.name, time.time(), body.motion)
+    return ScheduleAnswer(**row)
+
+
+@router.post("/schedules/{number}/enabled")
+def enable_schedule(service: Serving, who: Operator, number: Number, body: Enabled) -> ScheduleAnswer:
+    """Let one count again from now, or no more."""
+    row = planned.enable_schedule(service.db, number, who.name, time.time(), enabled=body.enabled)
+    return ScheduleAnswer(**row)
+
+
+@router.delete("/schedules/{number}", status_code=204)
+def remove_schedule(service: Serving, who: Operator, number: Number) -> None:
+    """Take one away."""
+    planned.remove_schedule(service.db, number, who.name)
+
+
+@router.get("/arms/{arm}/maintenance")
+def list_maintenance(service: Serving, _: Viewer, arm: ArmName, most: Most = 100) -> list[EventAnswer]:
+    """Maintenance of an arm, the newest first."""
+    return [EventAnswer(**row) for row in planned.events(service.db, _arm(service, arm), most=most)]
+
+
+@router.post("/arms/{arm}/maintenance", status_code=201)
+def add_maintenance(service: Serving, who: Operator, arm: ArmName, body: Event) -> EventAnswer:
+    """Maintenance was done; what is scheduled after it falls due, and may begin by itself where that is allowed."""
+    row = planned.add_event(service.db, _arm(service, arm), body.what, body.note, who.name, time.time())
+    return EventAnswer(**row)
+
+
+@router.get("/due")
+def list_due(service: Serving, _: Viewer, arm: ArmName | None = None) -> list[DueAnswer]:
+    """What is due, the earliest first; a re-identification of the arm that comes to a verdict ends it."""
+    return [DueAnswer(**row) for row in planned.dues(service.db, arm)]
+
+
+@router.post("/due/{number}/dismiss", status_code=204)
+def dismiss_due(service: Serving, who: Operator, number: Number, body: Remark) -> None:
+    """A person's word that it is not to be done."""
+    planned.dismiss(service.db, number, body.note, who.name, time.time())
+
+
+@router.get("/reidentifications")
+def list_reidentifications(
+    service: Serving, _: Viewer, arm: ArmName | None = None, most: Most = 100
+) -> list[ReidentificationAnswer]:
+    """All of them, or those of an arm, the newest first."""
+    return [_told(service, row) for row in reidentifications(service.db, arm, most=most)]
+
+
+@router.post("/reidentifications", status_code=201)
+def begin_reidentification(service: Serving, who: Operator, body: NewReidentification) -> ReidentificationAnswer:
+    """Check, run, identify, compare with the accepted set; the lease is renewed until the arm has come to rest."""
+    arm = _arm(service, body.arm)
+    require_confirmed(service, arm, body.confirm, who.name)
+    return _told(service, service.keeper.reidentifications.begin(Wanted(arm, body.motion), who.name))
+
+
+@router.get("/reidentifications/{name}")
+def get_reidentification(service: Serving, _: Viewer, name: Id) -> ReidentificationAnswer:
+    """One of them."""
+    return _told(service, known_reidentification(service.db, name))
+
+
+@router.post("/reidentifications/{name}/lease")
+def renew_reidentification(service: Serving, who: Operator, name: Id) -> LeaseAnswer:
+    """Renew the lease of the step that it is at; where nothing moves there is nothing to renew, and no mistake."""
+    row = known_reidentification(service.db, name)
+    if row["begun_by"] != who.name:
+        raise HTTPException(403, "the lease of a motion is renewed by whoever asked for it")
+    if row["job"] is not None:
+        service.engine.renew(row["job"])
+    return LeaseAnswer(job=row["job"] or "", seconds=LEASE_SECONDS)
+
+
+@router.get("/alarms")
+def list_alarms(
+    service: Serving, _: Viewer, arm: ArmName | None = None, closed: bool = False, most: Most = 100
+) -> list[AlarmAnswer]:
+    """Drift alarms that stand, or with `closed` all of them, the newest first."""
+    return [AlarmAnswer(**row) for row in raised.alarms(service.db, arm, closed=closed, most=most)]
+
+
+@router.post("/alarms/{number}/ack")
+def acknowledge_alarm(service: Serving, who: Operator, number: Number, body: Remark) -> AlarmAnswer:
+    """A person's word that they know; the accepted set stays as it is."""
+    return AlarmAnswer(**raised.acknowledge_alarm(service.db, number, body.note, who.name, time.time()))
+
+
+def _arm(service: Service, arm: str) -> str:
+    return known_arm(service.db, service.state, arm).name
+
+
+def _told(service: Service, row: Row) -> ReidentificationAnswer:
+    return ReidentificationAnswer(**{**row, "detail": without_paths(row["detail"], str(service.state))})

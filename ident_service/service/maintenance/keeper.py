@@ -1,0 +1,143 @@
+"""Looks what is due, begins what may begin by itself, leads re-identifications on, and tells whoever is to know.
+
+An arm begins by itself only where its description says `unattended_motion: allowed`, and then only at the time: what is
+late, what was due before this process began, and an arm that has a latched fault, is moved or is waited for, all ask
+for a person. That is decided once, so that neither an acknowledged fault nor a new description sets an arm in motion.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from ident_service.errors import IdentError
+from ident_service.motion.control_file import in_use
+from ident_service.service.arm_state import control_path, fault_file
+from ident_service.service.jobs.engine import Engine
+from ident_service.service.maintenance.alarms import alarms
+from ident_service.service.maintenance.reidentification import SERVICE, Reidentifications, Wanted
+from ident_service.service.maintenance.schedules import LATE, dues, fall_due, schedules
+from ident_service.service.maintenance.webhook import Webhook
+from ident_service.service.registry.arms import known_arm
+from ident_service.service.registry.audit import note
+from ident_service.service.registry.database import Database, Row
+from ident_service.service.registry.jobs import LIVE, jobs
+
+_TICK = 0.5  # s between looks
+LOG = logging.getLogger("ident.maintenance")
+
+
+class Keeper:
+    """One for a service."""
+
+    def __init__(self, engine: Engine, webhook: Webhook | None = None, now: Callable[[], float] = time.time) -> None:
+        """Nothing is looked at before `start`.
+
+        Args:
+            engine: does the jobs.
+            webhook: is told; nobody is if None.
+            now: s since 1970 in UTC.
+        """
+        self.reidentifications = Reidentifications(engine, now)
+        self._engine, self._db, self._state = engine, engine.db, engine.state
+        self._webhook, self._now = webhook, now
+        self._looked: float | None = None
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="maintenance", daemon=True)
+
+    def start(self) -> None:
+        """Begin to look, after the engine has told what was interrupted; returns at once."""
+        self._thread.start()
+
+    @property
+    def healthy(self) -> bool:
+        """Whether anybody looks."""
+        return self._thread.is_alive()
+
+    def close(self) -> None:
+        """Look no more."""
+        self._ending.set()
+        if self._thread.ident is not None:
+            self._thread.join(30.0)
+        if self._webhook is not None:
+            self._webhook.close()
+
+    def look(self) -> None:
+        """One look; the thread's work."""
+        now = self._now()
+        fall_due(self._db, now)
+        self.reidentifications.advance()
+        for row in dues(self._db):
+            if not row["tried"] and not self._engine.closing:
+                self._decide(row, now)
+        self._looked = now
+        self._tell()
+
+    def _work(self) -> None:
+        while not self._ending.is_set():
+            try:
+                self.look()
+            except Exception:  # the next look may go better; a disk that was full, say
+                LOG.exception("what is due could not be looked at")
+            self._ending.wait(_TICK)
+
+    def _decide(self, row: Row, now: float) -> None:
+        """Whether what is due begins by itself; once. What is written comes before what moves."""
+        self._db.write("UPDATE dues SET tried = 1 WHERE id = ?", row["id"])
+        try:
+            why = self._against(row, now)
+            if not why:
+                found = next(one for one in schedules(self._db, row["arm"]) if one["id"] == row["schedule"])
+                self.reidentifications.begin(Wanted(row["arm"], found["motion"], unattended=True), SERVICE)
+        except IdentError as error:
+            why = str(error)
+        if why:
+            note(self._db, SERVICE, "due asks for a person", row["arm"], due=row["id"], why=why)
+
+    def _against(self, row: Row, now: float) -> str:
+        """What stands against beginning it without a person; empty if nothing does."""
+        arm = row["arm"]
+        found = [one for one in schedules(self._db, arm) if one["id"] == row["schedule"]]
+        if known_arm(self._db, self._state, arm).config.unattended_motion != "allowed":
+            return "the arm's description does not allow motion without a person"
+        if self._looked is None:
+            return "it was due when the service began"
+        if row["late"] or not 0.0 <= now - row["at"] <= LATE or not 0.0 <= now - self._looked <= LATE:
+            return "it is late, or the clock was changed"
+        if not found or not found[0]["enabled"]:
+            return "its schedule was removed or disabled"
+        if fault_file(self._state, arm).latched():
+            return "a fault waits to be acknowledged"
+        waiting = any(one["motion"] for one in jobs(self._db, states=LIVE, arm=arm, most=1000))
+        if waiting or in_use(control_path(self._state, arm)):
+            return "somebody moves it, or waits to"
+        return ""
+
+    def _tell(self) -> None:
+        """Each notice once; one for which there is no room waits for the next look."""
+        for table, rows in (("dues", dues(self._db)), ("alarms", alarms(self._db))):
+            for row in rows:
+                if not row["told"] and (self._webhook is None or self._webhook.send(_notice(table, row))):
+                    self._db.write(f"UPDATE {table} SET told = 1 WHERE id = ?", row["id"])  # noqa: S608 - ours
+
+
+def note_gave_up(db: Database, notice: Mapping[str, Any], why: str) -> None:
+    """Enter a notice that nobody took."""
+    about = {"kind": notice["kind"], "id": notice["id"], "why": why[:500]}
+    note(db, SERVICE, "webhook failed", str(notice["arm"]), **about)
+
+
+def _notice(table: str, row: Row) -> dict[str, Any]:
+    due = table == "dues"
+    return {
+        "format": "ident-notice",
+        "version": 1,
+        "kind": "due" if due else "drift alarm",
+        "id": row["id"],
+        "arm": row["arm"],
+        "what": row["cause"] if due else row["what"],
+        "at": row["at"],
+    }

@@ -1,0 +1,272 @@
+"""A re-identification: preflight, run, identification, and the comparison with the accepted set, each a job.
+
+Its row in the registry says which step it is at; the job of that step says how far. Whatever ends a step badly ends it.
+A person's word, or that of the schedule, is good for both motions, and for no longer than this process lives and nobody
+asks for a stop: after a restart only what computes goes on.
+
+The identification uses the description that the acceptance kept, so that both sets have the same parameters and the
+same shape of friction.
+Boundary: rows and jobs; what is due, and when, is `schedules.py` and `keeper.py`.
+"""
+
+from __future__ import annotations
+
+import logging
+import sqlite3
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from ident_service.config.load import arm_from_json
+from ident_service.config.schema import ArmConfig
+from ident_service.errors import IdentError, MotionRefused, UnknownId, UsageError
+from ident_service.service.acceptance import ARM, accepted_set
+from ident_service.service.jobs.asked import Asked, Check, Identify, Judge, RecordingOf, Run
+from ident_service.service.jobs.commands import JOBS
+from ident_service.service.jobs.engine import Engine
+from ident_service.service.jobs.outcome import said
+from ident_service.service.jobs.recovery import UNTOLD
+from ident_service.service.maintenance.alarms import raise_alarm
+from ident_service.service.maintenance.schedules import close_dues
+from ident_service.service.maintenance.verdict import Verdict, verdict_of
+from ident_service.service.registry.arms import known_arm
+from ident_service.service.registry.audit import note
+from ident_service.service.registry.database import Database, Row
+from ident_service.service.registry.jobs import LIVE, known_job
+from ident_service.service.registry.motions import new_id
+
+SERVICE: Final = "service"
+LOG = logging.getLogger("ident.maintenance")
+_SAME = ("kinematics", "gravity", "terms", "transmission")  # without which parameters are others
+
+
+def require_comparable(state: Path, config: ArmConfig, number: int | None = None) -> int:
+    """The number of the acceptance that an arm is to be compared with; the current one's if `number` is None.
+
+    Raises:
+        UsageError: nothing was accepted; or the mechanism in the description is another one since.
+        ParameterError: what was accepted was changed on the disk.
+    """
+    act, folder = accepted_set(state, config.name, number)
+    before = arm_from_json(folder / ARM)
+    other = [key for key in _SAME if getattr(before, key) != getattr(config, key)]
+    if other:
+        raise UsageError(
+            f"{config.name}: {', '.join(other)} of its description changed since acceptance {act.number}, so its "
+            "parameters are others; identify it and accept the result first"
+        )
+    return act.number
+
+
+def known_reidentification(db: Database, name: str) -> Row:
+    """The re-identification of this id.
+
+    Raises:
+        UnknownId: there is none.
+    """
+    row = db.row("SELECT * FROM reidentifications WHERE id = ?", name)
+    if row is None:
+        raise UnknownId(f"no re-identification {name!r} is known; their list names them")
+    return row
+
+
+def reidentifications(db: Database, arm: str | None = None, *, most: int = 100) -> list[Row]:
+    """All of them, or those of an arm, the newest first."""
+    return db.rows(
+        "SELECT * FROM reidentifications WHERE ?1 IS NULL OR arm = ?1 ORDER BY begun DESC, id LIMIT ?2", arm, most
+    )
+
+
+def conclude(db: Database, row: Row, verdict: Verdict, now: float) -> None:
+    """Enter a verdict: nothing is due any more, or a drift alarm is raised.
+
+    Args:
+        db: the registry.
+        row: of the re-identification.
+        verdict: what the comparison says.
+        now: s since 1970 in UTC.
+    """
+    with db.transaction():
+        if not _end(db, row, verdict.state, verdict.words, now):
+            return
+        if verdict.state != "impossible":
+            close_dues(db, row["arm"], row["begun"], f"{verdict.state}: {row['id']}", row["begun_by"], now)
+        if verdict.state == "changed":
+            raise_alarm(db, row["arm"], row["id"], row["run"], verdict.words, now)
+
+
+def enter_concluded(
+    db: Database, arm: str, against: int, recorded: str, run: str, verdict: Verdict, begun: float, by: str, now: float
+) -> str:
+    """Enter one whose steps were done at a terminal; its id.
+
+    Args:
+        db: the registry.
+        arm: name.
+        against: number of the acceptance.
+        recorded: id of the run with the recording.
+        run: id of the run with the parameters.
+        verdict: what the comparison says.
+        begun: s since 1970 in UTC.
+        by: who did it.
+        now: likewise.
+    """
+    name = new_id(arm)
+    with db.transaction():
+        db.write(
+            "INSERT INTO reidentifications (id, arm, step, state, against, unattended, recorded, run, begun, begun_by) "
+            "VALUES (?, ?, 'judge', 'interrupted', ?, 0, ?, ?, ?, ?)",
+            *(name, arm, against, recorded, run, begun, by),
+        )
+        # For this moment only; nobody sees it outside of the transaction.
+        db.write("UPDATE reidentifications SET state = 'running' WHERE id = ?", name)
+        conclude(db, known_reidentification(db, name), verdict, now)
+    return name
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is asked for.
+
+    Attributes:
+        arm: name.
+        motion: id; the description's own if None.
+        unattended: whether it begins by itself, under the service's own lease.
+    """
+
+    arm: str
+    motion: str | None = None
+    unattended: bool = False
+
+
+class Reidentifications:
+    """Those that run in this process."""
+
+    def __init__(self, engine: Engine, now: Callable[[], float] = time.time) -> None:
+        """Nothing is begun.
+
+        Args:
+            engine: does the jobs.
+            now: s since 1970 in UTC.
+        """
+        self._engine, self._db, self._state, self._now = engine, engine.db, engine.state, now
+        self._stops: dict[str, int] = {}
+        self._lock = threading.Lock()
+
+    def begin(self, wanted: Wanted, by: str) -> Row:
+        """Queue the first step.
+
+        Args:
+            wanted: what.
+            by: the name of a token, or `service`; it keeps the lease of the motions, unless unattended.
+
+        Raises:
+            UsageError: it names what is not known, or nothing can be compared.
+            ConfigError: the arm's description has mistakes.
+            MotionRefused: unattended, and the description does not allow it; or the arm is being re-identified already.
+        """
+        config = known_arm(self._db, self._state, wanted.arm).config
+        if wanted.unattended:
+            _require_allowed(config)
+        against = require_comparable(self._state, config)
+        name, stops = new_id(wanted.arm), self._engine.stops(wanted.arm)
+
+        def enter(job: Row) -> None:
+            try:
+                self._db.write(
+                    "INSERT INTO reidentifications (id, arm, step, state, motion, against, unattended, job, begun, "
+                    "begun_by) VALUES (?, ?, 'check', 'running', ?, ?, ?, ?, ?, ?)",
+                    *(name, wanted.arm, wanted.motion, against, int(wanted.unattended), job["id"], self._now(), by),
+                )
+            except sqlite3.IntegrityError:
+                raise MotionRefused(f"{wanted.arm}: is being re-identified already") from None
+            note(self._db, by, "re-identification begun", wanted.arm, id=name, unattended=wanted.unattended)
+
+        with self._lock:
+            check = Check(kind="check", arm=wanted.arm, motion=wanted.motion)
+            self._engine.create(check, by, own_lease=wanted.unattended, stops=stops, entering=enter)
+            self._stops[name] = stops
+        return known_reidentification(self._db, name)
+
+    def advance(self) -> None:
+        """Begin the next step of every one whose step has ended, or end it."""
+        with self._lock:
+            for row in self._db.rows("SELECT * FROM reidentifications WHERE state = 'running' ORDER BY begun"):
+                try:
+                    self._advance(row)
+                except IdentError as error:
+                    refused = isinstance(error, MotionRefused)
+                    self._ended(row, "cancelled" if refused else "failed", f"after {row['step']}: {error}")
+                except Exception as error:
+                    LOG.exception("a re-identification stumbled")
+                    self._ended(row, "failed", f"after {row['step']}: {type(error).__name__}: {error}")
+
+    def _advance(self, row: Row) -> None:
+        job = known_job(self._db, row["job"])
+        if job["state"] in LIVE or job["detail"] == UNTOLD or self._engine.closing:
+            return
+        judged = row["step"] == "judge" and job["state"] in ("done", "refused")
+        answer = said(self._state / JOBS / job["id"]).answer if judged else {}
+        if "verdict" in answer:
+            conclude(self._db, row, verdict_of(answer), self._now())
+            self._stops.pop(row["id"], None)
+        elif job["state"] != "done":
+            state = "failed" if judged else job["state"]
+            self._ended(row, state, f"{row['step']}: {job['detail'] or job['state']}{_kept(row)}")
+        elif row["step"] == "check" and row["id"] not in self._stops:
+            why = "the service ended between preflight and run; nothing has moved since, ask for it again"
+            self._ended(row, "interrupted", why)
+        else:
+            self._begin_next(row)
+
+    def _begin_next(self, row: Row) -> None:
+        arm, step = row["arm"], row["step"]
+        asked: Asked
+        if step == "check":
+            if row["unattended"]:
+                _require_allowed(known_arm(self._db, self._state, arm).config)
+            following, asked, column = "run", Run(kind="run", arm=arm, motion=row["motion"]), "recorded"
+        elif step == "run":
+            recording = RecordingOf(run=row["recorded"])
+            following, column = "identify", "run"
+            asked = Identify(kind="identify", arm=arm, recordings=(recording,), as_accepted=row["against"])
+        else:
+            following, column = "judge", "run"
+            asked = Judge(kind="judge", arm=arm, run=row["run"], against=row["against"])
+
+        def enter(job: Row) -> None:
+            self._db.write(
+                f"UPDATE reidentifications SET step = ?, job = ?, {column} = ? WHERE id = ?",  # noqa: S608 - ours
+                *(following, job["id"], job["run"], row["id"]),
+            )
+
+        stops = self._stops.get(row["id"]) if step == "check" else None
+        own = bool(row["unattended"])
+        self._engine.create(asked, row["begun_by"], own_lease=own, stops=stops, entering=enter)
+
+    def _ended(self, row: Row, state: str, detail: str) -> None:
+        _end(self._db, row, state, detail, self._now())
+        self._stops.pop(row["id"], None)
+
+
+def _end(db: Database, row: Row, state: str, detail: str, now: float) -> bool:
+    with db.transaction():
+        ended = db.write(
+            "UPDATE reidentifications SET state = ?, detail = ?, ended = ? WHERE id = ? AND state = 'running'",
+            *(state, detail, now, row["id"]),
+        )
+        if ended:
+            note(db, row["begun_by"], "re-identification ended", row["arm"], id=row["id"], state=state, detail=detail)
+    return bool(ended)
+
+
+def _kept(row: Row) -> str:
+    return f"; the recording is kept in the run {row['recorded']}" if row["step"] in ("identify", "judge") else ""
+
+
+def _require_allowed(config: ArmConfig) -> None:
+    if config.unattended_motion != "allowed":
+        raise MotionRefused(f"{config.name}: its description does not allow motion without a person")

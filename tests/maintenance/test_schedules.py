@@ -1,0 +1,212 @@
+"""What falls due and when, in a time that the test sets; rows of a real registry."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from maintenance.conftest import ARM, MONDAY, Clock
+
+from ident_service.errors import UnknownId, UsageError
+from ident_service.service.maintenance.alarms import acknowledge_alarm, alarms, raise_alarm
+from ident_service.service.maintenance.schedules import (
+    When,
+    add_event,
+    add_schedule,
+    dismiss,
+    dues,
+    enable_schedule,
+    events,
+    fall_due,
+    known_schedule,
+    remove_schedule,
+    schedules,
+)
+from ident_service.service.registry.arms import add_arm
+from ident_service.service.registry.audit import trail
+from ident_service.service.registry.database import Database
+from ident_service.service.registry.runs import _driven
+
+HOUR, DAY = 3600.0, 86400.0
+
+
+def drove(db: Database, run: str, hours: float) -> None:
+    """A run of the registry drove the arm."""
+    db.write(
+        "INSERT INTO runs (id, kind, arm, created, ending, indexed, seconds) VALUES (?, 'motion', ?, 0, 'done', 0, ?)",
+        *(run, ARM, hours * HOUR),
+    )
+
+
+def done(db: Database) -> int:
+    """How many are due; they are done now."""
+    rows = dues(db, ARM)
+    for row in rows:
+        dismiss(db, row["id"], "done", "me", 0.0)
+    return len(rows)
+
+
+def test_a_time_comes_once_however_often_somebody_looks(db: Database, clock: Clock) -> None:
+    row = add_schedule(db, ARM, When(cron="0 6 * * *"), "me", clock())
+    assert row["next"] == MONDAY + 6 * HOUR
+    for _ in range(3):
+        fall_due(db, clock())
+    assert dues(db) == []
+    clock.forward(6 * HOUR)
+    for _ in range(3):
+        fall_due(db, clock())
+    assert [(one["cause"], one["late"]) for one in dues(db)] == [("cron 0 6 * * *", 0)]
+    clock.forward(5 * DAY)  # due still, and not five times
+    fall_due(db, clock())
+    assert done(db) == 1
+    fall_due(db, clock())
+    assert dues(db) == []
+    clock.forward(DAY)
+    fall_due(db, clock())
+    assert done(db) == 1
+
+
+def test_times_that_were_missed_are_due_once_and_late(db: Database, clock: Clock) -> None:
+    add_schedule(db, ARM, When(cron="0 * * * *"), "me", clock())
+    clock.forward(30 * DAY + HOUR / 2)
+    fall_due(db, clock())
+    assert [one["late"] for one in dues(db)] == [1]
+    assert done(db) == 1
+    fall_due(db, clock())
+    assert dues(db) == []
+    assert known_schedule(db, 1)["next"] == MONDAY + 30 * DAY + HOUR
+
+
+def test_a_clock_that_is_put_back_makes_nothing_due_again(db: Database, clock: Clock) -> None:
+    add_schedule(db, ARM, When(cron="0 6 * * *"), "me", clock())
+    clock.forward(6 * HOUR)
+    fall_due(db, clock())
+    assert done(db) == 1
+    clock.forward(-HOUR)
+    for _ in range(13):
+        fall_due(db, clock())
+        clock.forward(HOUR / 6)
+    assert dues(db) == []
+    clock.at = MONDAY + DAY + 6 * HOUR
+    fall_due(db, clock())
+    assert done(db) == 1
+
+
+def test_a_clock_that_was_wrong_by_years_silences_nothing(db: Database, clock: Clock) -> None:
+    add_schedule(db, ARM, When(cron="0 6 * * *"), "me", clock())
+    clock.forward(20 * 365 * DAY)
+    fall_due(db, clock())
+    assert done(db) == 1
+    clock.at = MONDAY
+    fall_due(db, clock())
+    assert dues(db) == []
+    clock.forward(6 * HOUR)
+    fall_due(db, clock())
+    assert done(db) == 1
+
+
+def test_operating_hours_count_from_when_it_was_due_last(db: Database, clock: Clock) -> None:
+    drove(db, "before", 100.0)
+    add_schedule(db, ARM, When(hours=10.0), "me", clock())
+    drove(db, "a", 9.9)
+    fall_due(db, clock())
+    assert dues(db) == []
+    drove(db, "b", 0.2)
+    fall_due(db, clock())
+    assert [one["cause"] for one in dues(db)] == ["10 operating hours"]
+    assert done(db) == 1
+    drove(db, "c", 9.9)
+    fall_due(db, clock())
+    assert dues(db) == []
+    drove(db, "d", 35.0)
+    fall_due(db, clock())
+    assert done(db) == 1
+
+
+def test_hours_are_those_that_a_run_was_driven() -> None:
+    assert _driven({"control": {"rate": 500.0}}, {"state": "done", "cycles": 1500}) == 3.0
+    assert _driven({"control": {"rate": 500.0}}, {"error": "a fault"}) is None
+    assert _driven({}, None) is None
+
+
+def test_maintenance_makes_due_what_is_scheduled_after_it(db: Database, clock: Clock) -> None:
+    assert add_event(db, ARM, " gear oil changed ", "joint 2", "me", clock())["what"] == "gear oil changed"
+    assert dues(db) == []
+    add_schedule(db, ARM, When(maintenance=True), "me", clock())
+    add_schedule(db, ARM, When(cron="0 6 * * *"), "me", clock())
+    add_event(db, ARM, "belt changed", "", "me", clock())
+    add_event(db, ARM, "and the other", "", "me", clock())
+    assert [one["cause"] for one in dues(db)] == ["maintenance: belt changed"]
+    assert [one["what"] for one in events(db, ARM)] == ["and the other", "belt changed", "gear oil changed"]
+    for what, note in (("", ""), (" ", ""), ("x" * 201, ""), ("x", "y" * 2001)):
+        with pytest.raises(UsageError, match="say what was done"):
+            add_event(db, ARM, what, note, "me", clock())
+
+
+def test_disabled_ones_count_nothing_and_enabled_ones_count_from_then(db: Database, clock: Clock) -> None:
+    for when in (When(cron="0 6 * * *"), When(hours=1.0), When(maintenance=True)):
+        number = add_schedule(db, ARM, when, "me", clock())["id"]
+        enable_schedule(db, number, "me", clock(), enabled=False)
+    clock.forward(2 * DAY)
+    drove(db, "a", 5.0)
+    add_event(db, ARM, "belt", "", "me", clock())
+    fall_due(db, clock())
+    assert dues(db) == []
+    for row in schedules(db):
+        enable_schedule(db, row["id"], "me", clock(), enabled=True)
+    fall_due(db, clock())
+    assert dues(db) == []
+    clock.forward(7 * HOUR)
+    drove(db, "b", 1.0)
+    fall_due(db, clock())
+    assert sorted(one["schedule"] for one in dues(db)) == [1, 2]
+
+
+def test_what_cannot_be_meant_is_refused(db: Database, state: Path, clock: Clock) -> None:
+    for when in (When(), When(cron="0 6 * * *", maintenance=True), When(hours=0.0), When(hours=float("nan"))):
+        with pytest.raises(UsageError):
+            add_schedule(db, ARM, when, "me", clock())
+    with pytest.raises(UnknownId):
+        add_schedule(db, ARM, When(maintenance=True), "me", clock(), "nothing")
+    add_arm(
+        db,
+        state,
+        (state / next(iter(db.rows("SELECT folder FROM arms WHERE name = 'quick'")))["folder"] / "arm.yaml")
+        .read_text()
+        .replace("name: quick", "name: other"),
+        {},
+        "me",
+    )
+    add_schedule(db, "other", When(maintenance=True), "me", clock())
+    assert schedules(db, ARM) == []
+    for act in (lambda: known_schedule(db, 9), lambda: remove_schedule(db, 9, "me")):
+        with pytest.raises(UnknownId):
+            act()
+    with pytest.raises(UsageError, match="say why"):
+        dismiss(db, 1, " ", "me", clock())
+
+
+def test_a_number_never_comes_twice_and_the_trail_names_who(db: Database, clock: Clock) -> None:
+    first = add_schedule(db, ARM, When(maintenance=True), "ann", clock())["id"]
+    add_event(db, ARM, "belt", "", "bob", clock())
+    remove_schedule(db, first, "carl")
+    assert add_schedule(db, ARM, When(maintenance=True), "ann", clock())["id"] != first
+    assert len(dues(db)) == 1  # what was due by the one that is gone still is
+    told = {line["what"]: line["who"] for line in trail(db)}
+    assert told["schedule added"] == "ann"
+    assert told["maintenance"] == "bob"
+    assert told["schedule removed"] == "carl"
+    assert told["due"] == "service"
+
+
+def test_an_alarm_stands_until_a_person_says_why_it_may_go(db: Database, clock: Clock) -> None:
+    raise_alarm(db, ARM, "r", "run", "friction of joint elbow", clock())
+    for remark in ("", "  ", "x" * 2001):
+        with pytest.raises(UsageError, match="note"):
+            acknowledge_alarm(db, 1, remark, "me", clock())
+    assert [row["what"] for row in alarms(db, ARM)] == ["friction of joint elbow"]
+    assert acknowledge_alarm(db, 1, "seal replaced next week", "me", clock())["closed_by"] == "me"
+    assert alarms(db) == []
+    assert len(alarms(db, closed=True)) == 1
+    with pytest.raises(UnknownId):
+        acknowledge_alarm(db, 1, "again", "me", clock())
