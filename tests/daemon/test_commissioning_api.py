@@ -174,8 +174,8 @@ def test_a_motion_ends_with_its_arm_at_rest(state: Path, how: str) -> None:
     ending = state / "runs" / ended["run"] / "ended.json"
     if ending.exists():  # a lease may lapse before the arm is taken
         assert json.loads(ending.read_text())["state"] == "stopped"
-    else:
-        assert how == "silence"
+    else:  # or a stop may come while the way is still planned
+        assert how == "silence" or "before the arm was energised" in ended["detail"]
 
 
 @pytest.mark.timeout(300)

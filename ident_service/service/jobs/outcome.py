@@ -82,7 +82,7 @@ def outcome(heard: Said, exit_code: int | None, asked_to_end: str) -> Outcome:
         words = "; ".join([f"its process ended without an answer{how}", *last])
         return Outcome("cancelled", asked_to_end, exit_code) if asked_to_end else Outcome("failed", words, exit_code)
     message = _message(heard.answer)
-    if code == 0 and _report(heard.answer).get("state") == STOPPED:
+    if _report(heard.answer).get("state") == STOPPED:
         return Outcome("cancelled", asked_to_end or "the arm was brought to rest: somebody asked for a stop", code)
     state = _STATES.get(code, "failed")
     if asked_to_end and state in ("failed", "refused"):
