@@ -228,7 +228,7 @@ def test_a_rehearsal_ends_with_the_key(
                 hands.let_go()
 
         monkeypatch.setattr("ident_service.cli.moving.tell", told)
-        assert main(["rehearse", str(path), "--out", str(tmp_path / "run"), *state]) == 0
+        assert main(["rehearse", str(path), "--out", str(tmp_path / "run"), *state]) == 1
     assert "stopped after" in capsys.readouterr().out
     assert said[-2:] == ["stopping", "stopped"]
     assert "exciting" not in said or "returning" not in said

@@ -109,7 +109,7 @@ def test_a_second_ctrl_c_waits_for_the_stop_and_tells_the_truth(
 
     said = when(monkeypatch, {"exciting": interrupt, "stopping": interrupt})
     before = signal.getsignal(signal.SIGINT)
-    assert main(words) == 0
+    assert main(words) == 1
     assert signal.getsignal(signal.SIGINT) is before
     assert "interrupted: the arm is being stopped under control; waiting 30 s at most" in said
     assert said[-1] == "stopped"
@@ -130,7 +130,7 @@ def test_a_terminal_that_closes_stops_the_arm_under_control(
         signal.raise_signal(signal.SIGHUP)
 
     when(monkeypatch, {"exciting": hang_up, "stopping": hang_up})
-    assert main(words) == 0
+    assert main(words) == 1
     assert json.loads((tmp_path / "run" / "ended.json").read_text())["state"] == "stopped"
     assert fault_file(tmp_path / "state", "planar2").latched() == {}
 
