@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from cli.conftest import Commissioned, Ended, Ident, Samples, left_over, quick_arm
 
-from ident_service import __version__
-from ident_service.cli import main
 from ident_service.config.load import shipped_arms
 from ident_service.record.open import open_recording
 from ident_service.results.parameter_file import read_parameters
@@ -281,107 +277,6 @@ def test_more_delay_in_the_driver_is_more_delay_in_the_check(ident: Ident, tmp_p
         for arm in ("planar2", late)
     )
     assert far == pytest.approx(near - 19e-3, abs=1e-6)
-
-
-@pytest.mark.parametrize("words", [(), ("simulate",), ("identify",), ("config",), ("config", "check"), ("correct",)])
-def test_help(ident: Ident, words: tuple[str, ...]) -> None:
-    ended = ident(*words, "--help")
-    assert ended.code == 0
-    assert ended.out.startswith("usage: ident")
-
-
-def test_version(ident: Ident) -> None:
-    assert ident("--version").out == f"ident-service {__version__}\n"
-
-
-def test_state_folder_is_the_option_s_then_the_variable_s_then_the_user_s(
-    quick: Commissioned, ident: Ident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    words = ("identify", quick.folder / "identification.mcap", "--arm", quick.arm, "--json")
-
-    def parent(*more: object) -> Path:
-        return Path(ident(*words, *more).json["folder"]).parent
-
-    assert parent("--state", tmp_path / "mine") == tmp_path / "mine" / "runs"
-    assert parent() == tmp_path / "state" / "runs"
-    monkeypatch.delenv("IDENT_STATE")
-    assert parent() == tmp_path / "xdg" / "ident" / "runs"
-    monkeypatch.delenv("XDG_STATE_HOME")
-    assert parent() == tmp_path / "home" / ".local" / "state" / "ident" / "runs"
-
-
-def test_runs_of_the_same_second_get_folders_of_their_own(quick: Commissioned, ident: Ident, state: Path) -> None:
-    words = ("identify", quick.folder / "identification.mcap", "--arm", quick.arm, "--json")
-    folders = {ident(*words).json["folder"] for _ in range(3)}
-    assert len(folders) == 3
-    assert {str(path) for path in (state / "runs").iterdir()} == folders
-
-
-@pytest.mark.slow
-def test_a_seed_gives_the_same_numbers_again(quick: Commissioned, ident: Ident, tmp_path: Path) -> None:
-    same = ident("simulate", quick.arm, "--seed", 1, "--out", tmp_path / "same", "--json").json
-    assert same["score"] == json.loads((quick.folder / "score.json").read_text())
-    other = ident("simulate", quick.arm, "--seed", 2, "--out", tmp_path / "other", "--json").json
-    assert other["score"] != same["score"]
-
-
-def test_module_runs_as_a_process_of_its_own(tmp_path: Path) -> None:
-    def run(*words: object) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-W", "error", "-m", "ident_service", *map(str, words)]
-        return subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False, timeout=60)
-
-    good = run("base", "planar2", "--json")
-    assert good.returncode == 0, good.stderr
-    assert json.loads(good.stdout)["arm"] == "planar2"
-    no = run("feasible", table(tmp_path, INFEASIBLE))
-    assert (no.returncode, no.stderr) == (3, "")
-    usage = run("feasible")
-    assert usage.returncode == 2
-    assert usage.stdout == ""
-    assert "usage: ident" in usage.stderr
-    missing = run("feasible", "none.json")
-    assert (missing.returncode, missing.stderr) == (2, "ident: no such file: none.json\n")
-    assert left_over(tmp_path) == ["table.json"]
-
-
-@pytest.mark.parametrize("words", [["--help"], ["simulate", "--help"], ["--version"]])
-def test_help_loads_no_large_library(words: list[str]) -> None:
-    program = (
-        "import sys\n"
-        "from ident_service.cli import main\n"
-        "try:\n"
-        f"    main({words!r})\n"
-        "except SystemExit:\n"
-        "    pass\n"
-        "large = ('numpy', 'scipy', 'pinocchio', 'clarabel', 'ruckig', 'pydantic', 'mcap', 'yaml', 'jsonschema')\n"
-        "print([name for name in large if name in sys.modules], file=sys.stderr)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
-    assert done.stderr == "[]\n"
-
-
-def test_foreign_packages_of_the_same_name_are_refused(
-    ident: Ident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "drivers").mkdir()
-    (tmp_path / "drivers" / "__init__.py").write_text("")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    for name in [name for name in sys.modules if name.split(".")[0] == "drivers"]:
-        monkeypatch.delitem(sys.modules, name)
-    ended = ident("base", "planar2")
-    assert ended.code == 2
-    assert "the package 'drivers' was found at" in ended.err
-
-
-def test_main_is_the_console_script() -> None:
-    from importlib.metadata import entry_points
-
-    (script,) = entry_points(group="console_scripts", name="ident")
-    assert script.load() is main
-
-
-def test_quick_arm_is_a_good_description(ident: Ident, tmp_path: Path) -> None:
-    assert ident("config", "check", quick_arm(tmp_path)).code == 0
 
 
 def test_correction_in_the_metric_of_the_covariance(quick: Commissioned, ident: Ident, tmp_path: Path) -> None:

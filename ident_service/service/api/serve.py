@@ -18,6 +18,7 @@ from typing import Final
 import uvicorn
 
 from ident_service.errors import UsageError
+from ident_service.record.files import write_atomically
 from ident_service.service.api.app import create_app
 from ident_service.service.api.asking import Service
 from ident_service.service.api.notify import tell_manager, watchdog_seconds
@@ -45,7 +46,7 @@ def serve(settings: Settings, tell: Callable[[str], None] = lambda _: None) -> N
 
         def ready(_: Service) -> None:
             # In the file for programs that start us and let us choose the port.
-            (settings.state / URL_FILE).write_text(url + "\n", encoding="ascii")
+            write_atomically(settings.state / URL_FILE, url + "\n")
             tell(url)
             tell_manager("READY=1")
 
