@@ -48,6 +48,8 @@ class ArmDescription:
         position_resolution: smallest step of the position [rad or m], shape (joints,); 0 where continuous.
         identities: per axis, what hardware answered (vendor, product, serial, firmware), for the record.
         software: name and version of the driver.
+        scheduled_stamps: whether stamps are those of a schedule, whole periods apart, as of a plant that moves by whole
+            periods; how late a cycle came only the loop's clock says then. Otherwise stamps are the clock's.
     """
 
     joint_names: tuple[str, ...]
@@ -57,6 +59,7 @@ class ArmDescription:
     position_resolution: Vector
     identities: tuple[str, ...]
     software: str
+    scheduled_stamps: bool = False
 
 
 @dataclass(frozen=True, slots=True)

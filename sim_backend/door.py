@@ -43,4 +43,5 @@ def description(machine: Machine) -> ArmDescription:
         position_resolution=machine.imperfections.encoder_resolution,
         identities=tuple(f"simulated axis {name}, seed {machine.seed}" for name in names),
         software=f"sim_backend {version('ident-service')}",
+        scheduled_stamps=True,
     )

@@ -10,6 +10,8 @@ one encoder step is a tenth of a radian per second. An arm that is only held, or
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from drivers.arm import Flags, Vector
@@ -45,30 +47,39 @@ class ComputedTorque:
         self._dynamics = dynamics
         self._kp, self._kd = limits.kp, limits.kd
         self._period = period
-        self._gain = 1.0 - float(np.exp(-2.0 * np.pi * velocity_cutoff * period))
+        self._cutoff = velocity_cutoff
+        self._gain = _gain(velocity_cutoff, period)
         self.position = position.copy()
         self.velocity = np.zeros_like(position)
         self._none = np.zeros_like(position)
         self.correction = self.answer = self._none
 
-    def torque(self, position: Vector, valid: Flags, reference: Setpoint) -> Vector:
+    def torque(self, position: Vector, valid: Flags, reference: Setpoint, elapsed: float | None = None) -> Vector:
         """One update.
 
         Args:
             position: measured [rad or m], shape (joints,).
             valid: where `position` is fresh; elsewhere the arm is taken to have gone on as it went.
             reference: where it should be.
+            elapsed: since the update before [s]; one period when None.
 
         Returns:
             Torque [N m or N], shape (joints,), not yet limited.
         """
-        position = self._filtered(position, valid)
+        position = self._filtered(position, valid, elapsed)
         self.answer = self._kd * (reference.velocity - self.velocity) + self._kp * (reference.position - position)
         torque = self._dynamics.torque(position, self.velocity, reference.acceleration + self.answer)
         self.correction = torque - self._dynamics.torque(position, self.velocity, reference.acceleration)
         return torque
 
-    def damping(self, position: Vector, valid: Flags, share: float = 1.0, added: Vector | float = 0.0) -> Vector:
+    def damping(
+        self,
+        position: Vector,
+        valid: Flags,
+        share: float = 1.0,
+        added: Vector | float = 0.0,
+        elapsed: float | None = None,
+    ) -> Vector:
         """One update without a reference.
 
         Args:
@@ -76,21 +87,29 @@ class ComputedTorque:
             valid: as for `torque`.
             share: of gravity to compensate.
             added: tau_0, what else is needed to stand [N m or N], shape (joints,).
+            elapsed: as for `torque`.
 
         Returns:
             Torque [N m or N], shape (joints,), not yet limited.
         """
-        position = self._filtered(position, valid)
+        position = self._filtered(position, valid, elapsed)
         self.correction = self.answer = self._none
         torque = self._dynamics.torque(position, self.velocity, -self._kd * self.velocity) + added
         if share < 1.0:
             torque = torque - (1.0 - share) * self._dynamics.torque(position, self._none, self._none)
         return torque
 
-    def _filtered(self, position: Vector, valid: Flags) -> Vector:
+    def _filtered(self, position: Vector, valid: Flags, elapsed: float | None) -> Vector:
         """Update the velocity; the position, with predictions where it was not measured."""
+        seconds = self._period if elapsed is None else elapsed
+        gain = self._gain if seconds == self._period else _gain(self._cutoff, seconds)
         if not valid.all():
-            position = np.where(valid, position, self.position + self._period * self.velocity)
-        self.velocity = self.velocity + self._gain * ((position - self.position) / self._period - self.velocity)
+            position = np.where(valid, position, self.position + seconds * self.velocity)
+        self.velocity = self.velocity + gain * ((position - self.position) / seconds - self.velocity)
         self.position = position
         return position
+
+
+def _gain(cutoff: float, seconds: float) -> float:
+    """Of a first-order low-pass [Hz] over a time [s], whatever its length."""
+    return 1.0 - math.exp(-2.0 * math.pi * cutoff * seconds)

@@ -76,6 +76,7 @@ class Guard:
         self.findings = Findings()
         self.rate = np.minimum(TORQUE_RATE, TORQUE_RATE_SHARE * limits.torque) * period
         self._names, self._limits, self._period = joint_names, limits, period
+        self._elapsed = period
         self._units = tuple("rad" if turns else "m" for turns in revolute or (True,) * joints)
         self._contact = contact if contact is not None and contact.pairs else None
         self._pairs = contact.pairs if contact is not None else ()
@@ -114,6 +115,7 @@ class Guard:
         velocity: Vector,
         correction: Vector,
         answer: Vector | None = None,
+        elapsed: float | None = None,
     ) -> tuple[Flags, Fault | None]:
         """Judge a sample.
 
@@ -123,11 +125,13 @@ class Guard:
             velocity: filtered velocity before this sample [rad/s or m/s], shape (joints,).
             correction: of the torque before this sample, what the errors added to it [N m or N], shape (joints,).
             answer: the acceleration in it [rad/s^2 or m/s^2], shape (joints,); without, nothing is owed.
+            elapsed: since the sample before [s]; one period when None.
 
         Returns:
             Which axes' positions may be used, and the most severe fault found, if any.
         """
         self.findings.cycle += 1
+        self._elapsed = self._period if elapsed is None else elapsed
         answered = bool(sample.valid.all())
         self._count_still(sample, correction)
         self._count_unchanged(sample, velocity)
@@ -205,7 +209,7 @@ class Guard:
         np.subtract(wanted, position, out=away)
         np.abs(away, out=away)
         np.subtract(position, self._position, out=jump)
-        np.subtract(jump, velocity * self._period, out=jump)
+        np.subtract(jump, velocity * self._elapsed, out=jump)
         np.abs(jump, out=jump)
         return bool((self._values <= self._bounds).all())
 
@@ -238,7 +242,7 @@ class Guard:
         """A sample with which something may be wrong."""
         position = sample.position
         # A window that only grew with the age would let the second reading of a wrong position in.
-        expected = self._position + velocity * self._period * (1 + self._age)
+        expected = self._position + velocity * (self._elapsed + self._period * self._age)
         jumped = sample.valid & (np.abs(position - expected) > self._jump)
         usable = sample.valid & ~jumped
         self._jumps = np.where(jumped, self._jumps + 1, 0)

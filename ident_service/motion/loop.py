@@ -110,7 +110,12 @@ class Loop:
         if free:  # no position is asked for
             reference = rest(self.control.position)
         usable, fault = self.guard.feedback(
-            sample, reference, self.control.velocity, self.control.correction, self.control.answer
+            sample,
+            reference,
+            self.control.velocity,
+            self.control.correction,
+            self.control.answer,
+            self.deadlines.elapsed,
         )
         torque, torque_fault = self.guard.torque(self._law(sample, usable, reference, free))
         compute_ns = self.arm.clock.now_ns() - woken_ns
@@ -126,12 +131,13 @@ class Loop:
 
     def _law(self, sample: Sample, usable: Flags, reference: Setpoint, free: bool) -> Vector:
         """The torque wanted [N m or N], shape (joints,)."""
+        elapsed = self.deadlines.elapsed
         if not free:
-            return self.control.torque(sample.position, usable, reference)
+            return self.control.torque(sample.position, usable, reference, elapsed)
         if not self._lowering:
-            return self.control.damping(sample.position, usable, added=self._needed / REST_CYCLES)
+            return self.control.damping(sample.position, usable, added=self._needed / REST_CYCLES, elapsed=elapsed)
         left = 1.0 - ((sample.stamp_ns - self._since_ns) * 1e-9 - LOWER_AFTER) / LOWER
-        return self.control.damping(sample.position, usable, min(max(left, 0.0), 1.0))
+        return self.control.damping(sample.position, usable, min(max(left, 0.0), 1.0), elapsed=elapsed)
 
     def _react(self, fault: Fault, stamp_ns: int) -> None:
         """Do what the table says, unless something as severe is being done already.

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.arm import Arm, Sample, StopKind, Vector
+from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector
 from ident_service.config.limits import MotionLimits, motion_limits
 from ident_service.errors import ArmFault, DriverError, MotionRefused
 from ident_service.excitation.excitation import Excitation
@@ -187,19 +187,19 @@ class _Run:
         sample = self._look(limits, period)
         with attended(arm):
             dynamics = InverseDynamics(chain, model.layout, model.prior)
-            loop, torque = self._planned(dynamics, sample, limits, period, described.position_resolution)
+            loop, torque = self._planned(dynamics, sample, limits, described)
         self._loop = loop
         self._stamp_ns = sample.stamp_ns
         return loop, torque
 
     def _planned(
-        self, dynamics: InverseDynamics, sample: Sample, limits: MotionLimits, period: float, resolution: Vector
+        self, dynamics: InverseDynamics, sample: Sample, limits: MotionLimits, described: ArmDescription
     ) -> tuple[Loop, Vector]:
-        model, chain = self.model, self.model.chain
+        model, chain, period = self.model, self.model.chain, 1.0 / described.rate
         home = sample.position.copy()
         admitted = self.plan.admits(model, home, limits)
         legs, limits = self.plan.legs(model, home, limits), admitted
-        owed = owed_ways(dynamics, model, limits, period, resolution)
+        owed = owed_ways(dynamics, model, limits, period, described.position_resolution)
         contact = Contact(model)
         guard = Guard(chain.names, limits, period, home, revolute=chain.revolute, contact=contact, owed=owed)
         control = ComputedTorque(dynamics, limits, period, model.config.control.velocity_cutoff, home)
@@ -221,7 +221,7 @@ class _Run:
                 held=self.plan.held,
             ),
             self.states,
-            Deadlines(guard.findings, period),
+            Deadlines(guard.findings, period, scheduled_stamps=described.scheduled_stamps),
             self.controls,
             self.sink,
             self.latch,

@@ -24,6 +24,7 @@ from sim_backend.pucks.motor import Motor, Power
 
 # An interval of up to this many nominal periods is one step.
 _LONGEST = 1.5
+_OVERDUE = 1.2  # periods; less than one step
 
 
 class Body:
@@ -129,6 +130,11 @@ class Body:
         """Move the plant after a silence of more than a step, before what ends the silence has any effect."""
         if now_ns - self.now_ns > _LONGEST * self._period_ns:
             self.advance(now_ns)
+
+    @property
+    def overdue_ns(self) -> int | None:
+        """When a moving plant has waited for the next cycle for clearly more than its period; None while it is held."""
+        return None if self.supported else self.now_ns + round(_OVERDUE * self._period_ns)
 
     def truth(self, stamp_ns: int) -> Truth:
         """What the plant does now; torques at the joints, without noise and braking."""

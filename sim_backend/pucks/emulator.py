@@ -162,6 +162,18 @@ class Emulator:
         self._now_ns = max(now_ns, self._now_ns)
         return sent
 
+    def go_on(self, now_ns: int) -> None:
+        """The next cycle is late, by `Body.overdue_ns`: the arm moves meanwhile instead of when the cycle comes.
+
+        To move it is what takes longest; a cycle that came late would have its answers late, too.
+        """
+        overdue = self.body.overdue_ns
+        if overdue is not None and overdue <= now_ns:
+            self.body.advance(now_ns)
+            self._watch(now_ns)
+            self._now_ns = max(now_ns, self._now_ns)
+            self._deadline = None
+
     def inject(self, faults: Iterable[PuckFault], now_ns: int) -> None:
         """Have faults come, counted from now on; what they do comes with `tick`."""
         for fault in faults:

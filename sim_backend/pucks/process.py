@@ -118,10 +118,11 @@ class _Run:
         self._rested = True
         self._stirred_ns = 0
         self._quit = False
+        self._streaming = False  # whether somebody sends cycles
 
     def until(self, seconds: float | None, stop_requested: Callable[[], bool]) -> Emulated:
         emulator, clock = self._emulator, self._clock
-        begun = looked = clock.now_ns()
+        begun = looked = heard_ns = clock.now_ns()
         end = None if seconds is None else begun + round(seconds * 1e9)
         # What has been built stays; the collector need not look at it again in the middle of a cycle.
         collecting = gc.isenabled()
@@ -143,9 +144,14 @@ class _Run:
                     at_once += 1
                     self._pass_on(emulator.receive(*heard, clock.now_ns()))
                     heard = self._station.receive(0.0) if at_once < _AT_ONCE else None
-                self._heard += at_once
+                if at_once:
+                    self._heard += at_once
+                    heard_ns = clock.now_ns()
                 # What was due while frames waited comes after them: a drive's firmware would have had them in time.
                 self._pass_on(emulator.tick(clock.now_ns()))
+                self._streaming = clock.now_ns() - heard_ns < _POLL_NS
+                if self._streaming:
+                    emulator.go_on(clock.now_ns())
         finally:
             gc.unfreeze()
             if collecting:
@@ -160,6 +166,8 @@ class _Run:
         due = [looked_ns + _POLL_NS, *(item[0] for item in self._later[:1])]
         if (deadline := self._emulator.next_deadline_ns) is not None:
             due.append(deadline)
+        if self._streaming and (overdue := self._emulator.body.overdue_ns) is not None:
+            due.append(overdue)
         return max(0, min(due) - now_ns) * 1e-9
 
     def _pass_on(self, sent: Sequence[Sent]) -> None:

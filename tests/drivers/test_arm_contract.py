@@ -99,6 +99,17 @@ def test_stamps_are_exactly_one_period_apart_and_on_the_clock(running):
     np.testing.assert_array_equal(np.diff(stamps), PERIOD_NS)
 
 
+def test_a_cycle_that_begins_late_says_so_in_its_stamp_or_stamps_are_those_of_a_schedule(running):
+    before = running.arm.exchange(NONE).stamp_ns
+    late_ns = running.arm.clock.now_ns() + PERIOD_NS // 4 + PERIOD_NS
+    running.arm.clock.sleep_until_ns(late_ns)
+    stamp_ns = running.arm.exchange(NONE).stamp_ns
+    if running.arm.describe().scheduled_stamps:
+        assert (stamp_ns - before) % PERIOD_NS == 0
+    else:
+        assert late_ns <= stamp_ns <= late_ns + PERIOD_NS
+
+
 def test_looking_needs_no_enabling_and_moves_nothing(bench):
     with bench.arm as arm:
         first = arm.exchange(None)

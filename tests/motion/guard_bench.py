@@ -45,6 +45,7 @@ class Bench:
         correction: Array = STILL,
         answer: Array | None = None,
         measured: Array | None = None,
+        elapsed: float | None = None,
         **other: Any,
     ) -> tuple[list[bool], Fault | None]:
         flags = np.array(valid)
@@ -53,7 +54,7 @@ class Bench:
         sample = replace(sample, **other)
         self.cycle += 1
         setpoint = rest(position if reference is None else reference)
-        usable, fault = self.guard.feedback(sample, setpoint, velocity, correction, answer)
+        usable, fault = self.guard.feedback(sample, setpoint, velocity, correction, answer, elapsed)
         return usable.tolist(), fault
 
 

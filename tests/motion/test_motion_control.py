@@ -93,6 +93,18 @@ def test_a_steady_velocity_passes_in_full() -> None:
     np.testing.assert_allclose(control.velocity, speed, rtol=1e-6)
 
 
+def test_samples_that_come_late_or_not_at_all_give_the_velocity_of_the_time_that_has_passed() -> None:
+    speed, time = np.array([1.5, -0.5]), 0.0
+    control = controller(np.zeros(2))
+    for cycle in range(1, 200):
+        elapsed = PERIOD * (5.3 if cycle == 150 else 0.8 if cycle == 170 else 1.0)
+        time += elapsed
+        control.torque(time * speed, ALL, rest(np.zeros(2)), elapsed)
+        if cycle > 140:
+            np.testing.assert_allclose(control.velocity, speed, rtol=1e-3)
+    np.testing.assert_allclose(control.velocity, speed, rtol=1e-6)
+
+
 @pytest.mark.parametrize("shown", [np.nan, 1e6, 0.0])
 def test_an_invalid_axis_is_taken_to_go_on_as_it_went(shown: float) -> None:
     speed = np.array([1.5, -0.5])

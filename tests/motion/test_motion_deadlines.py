@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
-from ident_service.motion.deadlines import LATE, LONGEST_GAP, Deadlines
+from ident_service.motion.deadlines import LATE, LONGEST_GAP, Deadlines, Elapsed
 from ident_service.motion.faults import FAULTS, WINDOW, Fault, Findings
 
 MS = 1_000_000
@@ -14,8 +16,8 @@ MS = 1_000_000
 class Times:
     """Deadlines, and cycles that come one period after another unless something else is said."""
 
-    def __init__(self) -> None:
-        self.deadlines = Deadlines(Findings(), 1e-3)
+    def __init__(self, *, scheduled: bool = True) -> None:
+        self.deadlines = Deadlines(Findings(), 1e-3, scheduled_stamps=scheduled)
         self.stamp = self.woken = 0
         self.cycle()
 
@@ -44,6 +46,22 @@ def test_the_threshold_of_lateness(share: float) -> None:
         fault = times.cycle(stamp, woken)
         assert code(fault) == ("late_cycle" if share > 1.0 else None)
         assert times.deadlines.lateness_ns == woken - MS
+
+
+@pytest.mark.parametrize("share", [0.99, 1.01])
+def test_stamps_of_the_clock_say_all_about_lateness(share: float) -> None:
+    late = round(share * LATE * MS)
+    times = Times(scheduled=False)
+    assert code(times.cycle(MS + late, MS)) == ("late_cycle" if share > 1.0 else None)
+    assert times.deadlines.lateness_ns == late
+
+
+def test_answers_that_come_late_are_not_late_cycles_while_the_next_cycle_begins_in_time() -> None:
+    times = Times(scheduled=False)
+    answers = [0, 0.9, 0.1, 0.6, 0.0] * 40  # of a period after the stamp
+    for before, after in itertools.pairwise(answers):
+        assert times.cycle(MS, MS + round((after - before) * MS)) is None
+        assert times.deadlines.lateness_ns == 0
 
 
 def test_lateness_counts_from_the_schedule_and_a_burst_is_not_late() -> None:
@@ -85,8 +103,9 @@ def test_a_long_silence_is_one_whatever_the_stamps_say() -> None:
     assert code(Times().cycle(LONGEST_GAP * MS, LONGEST_GAP * MS)) == "late_cycle"
 
 
-def test_the_first_cycle_has_no_schedule() -> None:
-    deadlines = Deadlines(Findings(), 1e-3)
+@pytest.mark.parametrize("scheduled", [False, True])
+def test_the_first_cycle_has_no_schedule(scheduled: bool) -> None:
+    deadlines = Deadlines(Findings(), 1e-3, scheduled_stamps=scheduled)
     assert deadlines.cycle(10**12, 10**15) is None
     assert deadlines.lateness_ns == 0
 
@@ -99,7 +118,24 @@ def test_answers_that_come_now_sooner_now_later_are_not_late_while_stamps_are_in
 
 
 @pytest.mark.parametrize(("lost", "keeps"), [(0.002, True), (0.02, False)])
-def test_a_loop_that_loses_a_little_of_every_period_does_not_keep_the_rate(lost: float, keeps: bool) -> None:
-    times = Times()
-    found = {code(times.cycle(MS, MS + round(lost * MS))) for _ in range(1000)}
+@pytest.mark.parametrize("scheduled", [False, True])
+def test_a_loop_that_loses_a_little_of_every_period_does_not_keep_the_rate(
+    scheduled: bool, lost: float, keeps: bool
+) -> None:
+    times, late = Times(scheduled=scheduled), MS + round(lost * MS)
+    found = {code(times.cycle(MS if scheduled else late, late)) for _ in range(1000)}
     assert ("late_cycles" not in found) == keeps
+
+
+def test_the_time_between_samples_is_that_of_their_stamps() -> None:
+    elapsed = Elapsed(2e-3)
+    assert elapsed(10**15) == 2e-3
+    assert elapsed(10**15 + 2 * MS) == 2e-3
+    assert elapsed(10**15 + 9 * MS) == pytest.approx(7e-3)
+
+
+@pytest.mark.parametrize(("gap", "periods"), [(0, 0.5), (-5 * MS, 0.5), (10**12, LONGEST_GAP)])
+def test_nobody_divides_by_stamps_that_make_no_sense(gap: int, periods: float) -> None:
+    elapsed = Elapsed(2e-3)
+    elapsed(10**15)
+    assert elapsed(10**15 + gap) == pytest.approx(periods * 2e-3)

@@ -103,6 +103,17 @@ def test_a_jump_that_stays_is_never_let_in(times: float) -> None:
     is_fault(fault, "feedback_gone", 1)
 
 
+@pytest.mark.parametrize("skipped", [1, 5, 15])
+def test_after_skipped_cycles_the_arm_is_expected_where_it_has_gone_meanwhile(skipped: int) -> None:
+    velocity = 0.9 * LIMITS.velocity
+    there = HOME + velocity * PERIOD * (1 + skipped)
+    assert Bench().see(there, velocity=velocity, elapsed=PERIOD * (1 + skipped)) == ([True, True], None)
+    beyond = there + 1.001 * WINDOW * unit(1)
+    usable, fault = Bench().see(beyond, velocity=velocity, elapsed=PERIOD * (1 + skipped))
+    assert usable == [True, False]
+    is_fault(fault, "encoder_jump", 1)
+
+
 def test_one_jump_is_discarded_and_forgiven() -> None:
     bench = Bench()
     for _ in range(3):

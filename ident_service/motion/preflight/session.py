@@ -24,6 +24,7 @@ from ident_service.excitation.following import ExpectedFriction
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.rigid_body import InverseDynamics
 from ident_service.motion.control import ComputedTorque
+from ident_service.motion.deadlines import Elapsed
 from ident_service.motion.guard import Guard, Reaction
 from ident_service.motion.reference import Reference, Setpoint
 
@@ -121,6 +122,7 @@ class Session:
         )
         self._guard = Guard(model.chain.names, narrow, period, home, revolute=model.chain.revolute)
         self._control = ComputedTorque(dynamics, limits, period, model.config.control.velocity_cutoff, home)
+        self._since = Elapsed(period)
         self._torque = self.gravity.copy()
         self._rows: list[tuple[Sample, Setpoint]] = []
         self._friction = still
@@ -161,10 +163,12 @@ class Session:
             elapsed = (sample.stamp_ns - begin_ns) * 1e-9
             setpoint = reference.at(elapsed)
             self._rows.append((sample, setpoint))
-            usable, fault = self._guard.feedback(sample, setpoint, self._control.velocity, self._control.correction)
+            since = self._since(sample.stamp_ns)
+            control = self._control
+            usable, fault = self._guard.feedback(sample, setpoint, control.velocity, control.correction, elapsed=since)
             if fault is not None and fault.reaction is not Reaction.WARN:
                 raise ArmFault(fault.code, fault.message, [row[0] for row in self._rows[-100:]])
-            wanted = self._control.torque(sample.position, usable, setpoint)
+            wanted = control.torque(sample.position, usable, setpoint, since)
             self._torque = self._limited(wanted + self._against_friction(setpoint, learning))
             if elapsed >= seconds:
                 return self._rows
