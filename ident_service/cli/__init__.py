@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import sys
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -75,6 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = sys.argv[1:] if argv is None else argv
     try:
         arguments = parser().parse_args(words)
+        arguments.asked_ns = time.monotonic_ns()
     except WrongWords as wrong:
         if asks_for_json(words):
             print_error(UsageError.__name__, wrong.message, USAGE)

@@ -124,7 +124,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
     # ends it at once, a question too; a program's polite signal waits for the next cycle.
     with (
         nullcontext() if lease is None else stopping,
-        ControlFile.take(control_path(state, config.name), None) as controls,
+        ControlFile.take(control_path(state, config.name), None, asked_ns=arguments.asked_ns) as controls,
     ):
         stoppable = StoppableArm(arm, until(lambda: controls.stop or stopping.requested(), lease))
         # The rate is measured with what a run gets of the kernel.
@@ -191,12 +191,14 @@ def _ask(arguments: argparse.Namespace) -> Answer:
     from ident_service.motion.control_file import ControlFile
 
     name, path = _control(arguments)
-    with ControlFile.reach(path) as controls:
-        if arguments.asks == "stop":
-            controls.ask_stop()
-        else:
+    if arguments.asks == "stop":
+        pid = ControlFile.stop_all(path)
+        if pid is None:
+            raise UsageError(f"nobody moves {name}; no motion will begin that was asked for before now ({path})")
+    else:
+        with ControlFile.reach(path) as controls:
             controls.ask_pause(arguments.asks == "pause")
-        pid = controls.pid
+            pid = controls.pid
     document: dict[str, Any] = {"arm": name, "asked": arguments.asks, "pid": pid}
     return DONE, f"{name}: {arguments.asks} asked of process {pid}\n", document
 

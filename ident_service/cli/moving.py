@@ -161,6 +161,7 @@ def moved(
             lease=LEASE_SECONDS if lease is None else lease,
             log_frames=arguments.can_log,
             begin=begin,
+            asked_ns=arguments.asked_ns,
             tell=lambda word: tell(arguments, word),
             stop_requested=stop_requested,
         )

@@ -189,7 +189,7 @@ REMOTE: dict[str, Verb] = {
 
 
 # What of each verb a daemon is told; anything else that is given must not be lost in silence.
-_OURS = frozenset({"json", "state", "server", "verb", "word", "words", "asks"})
+_OURS = frozenset({"json", "state", "server", "verb", "word", "words", "asks", "asked_ns"})
 _MOTION = frozenset({"arm", "motion", "confirm"})
 _CARRIED: dict[str, frozenset[str]] = {
     "simulate": frozenset({"arm", "motion", "seed", "feasible_set"}),

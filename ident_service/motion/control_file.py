@@ -9,6 +9,10 @@
 | 17 | uint8 | pause: not 0 while the arm shall stand |
 | 24 | int64 | when the lease was renewed last [ns of the machine's monotonic clock] |
 | 32 | int64 | how long it lasts [ns]; 0 for none |
+| 40 | int64 | when a stop was asked for last, whether or not the arm moved then [ns of the same]; 0 for never |
+
+A motion takes seconds to begin, in which nobody can be reached yet. So a stop leaves its time behind, and a motion that
+was asked for before it takes the controls with the stop in them.
 
 Every word is written by one side at a time and read whole. The loop reads memory, so asking costs it nothing and nobody
 can make it wait. Whoever moves the arm holds an exclusive lock on the file, which vanishes with the process: a second
@@ -33,7 +37,7 @@ from typing import Self
 from ident_service.errors import DriverError, UsageError
 
 _MAGIC, _VERSION, _SIZE = b"identctl", 1, 64
-_PID, _STOP, _PAUSE, _RENEWED, _LENGTH = 12, 16, 17, 24, 32
+_PID, _STOP, _PAUSE, _RENEWED, _LENGTH, _STOPPED = 12, 16, 17, 24, 32, 40
 _TRIES, _TRY_AGAIN = 20, 0.005  # s; who looks whether the file is in use holds it for a moment
 
 
@@ -44,13 +48,22 @@ class ControlFile:
         self._fd, self._memory, self._now_ns = fd, memory, now_ns
 
     @classmethod
-    def take(cls, path: Path, lease_seconds: float | None, now_ns: Callable[[], int] = time.monotonic_ns) -> Self:
+    def take(
+        cls,
+        path: Path,
+        lease_seconds: float | None,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+        asked_ns: int | None = None,
+    ) -> Self:
         """Become the one who moves the arm, with all controls off and the lease renewed.
+
+        Only a stop that was asked for after `asked_ns` is there from the beginning.
 
         Args:
             path: of the file; made where it is missing.
             lease_seconds: how long the arm may move after `renew` [s]; None for a run that needs no lease.
             now_ns: the lease's clock.
+            asked_ns: when the motion was asked for, on that clock [ns]; now when None.
 
         Raises:
             DriverError: another process moves the arm.
@@ -68,8 +81,14 @@ class ControlFile:
         os.ftruncate(fd, _SIZE)
         memory = mmap.mmap(fd, _SIZE)
         length = 0 if lease_seconds is None else round(lease_seconds * 1e9)
-        memory[:] = _MAGIC + struct.pack("<IIBB6xqq24x", _VERSION, os.getpid(), 0, 0, now_ns(), length)
-        return cls(fd, memory, now_ns)
+        now = now_ns()
+        memory[:_STOPPED] = _MAGIC + struct.pack("<IIBB6xqq", _VERSION, os.getpid(), 0, 0, now, length)
+        taken = cls(fd, memory, now_ns)
+        # Read last: a stop either finds these controls in place, or has left its time behind before.
+        stopped = struct.unpack_from("<q", memory, _STOPPED)[0]
+        if asked_ns is not None and asked_ns <= stopped <= now:  # a later one is from before the machine was started
+            taken.ask_stop()
+        return taken
 
     @classmethod
     def reach(cls, path: Path, now_ns: Callable[[], int] = time.monotonic_ns) -> Self:
@@ -89,6 +108,39 @@ class ControlFile:
                 return cls(fd, mmap.mmap(fd, _SIZE), now_ns)
         os.close(fd)
         raise UsageError(f"nobody moves the arm ({path} is left from a run that has ended)")
+
+    @classmethod
+    def stop_all(cls, path: Path, now_ns: Callable[[], int] = time.monotonic_ns) -> int | None:
+        """Bring an arm to a controlled stop, and let no motion begin that has been asked for already.
+
+        Args:
+            path: of the file; made where it is missing.
+            now_ns: the clock of `take`.
+
+        Returns:
+            The process that moves the arm; None where nobody does.
+
+        Raises:
+            UsageError: the file cannot be written; an arm that moves has been stopped all the same.
+        """
+        refusal: OSError | None = None
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            try:
+                os.pwrite(fd, struct.pack("<q", now_ns()), _STOPPED)
+            finally:
+                os.close(fd)
+        except OSError as error:
+            refusal = error
+        try:
+            with cls.reach(path, now_ns) as controls:
+                controls.ask_stop()
+                return controls.pid
+        except UsageError:
+            if refusal is not None:
+                raise UsageError(f"{path}: cannot be written: {refusal.strerror}; nobody moves the arm now") from None
+            return None
 
     @property
     def pid(self) -> int:

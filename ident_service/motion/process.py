@@ -105,7 +105,8 @@ def main() -> int:
 def _ended(request: dict[str, Any]) -> tuple[int, dict[str, Any]]:
     """Do it; the exit code, and the last line for the parent."""
     try:
-        with ControlFile.take(Path(request["arm_folder"]) / CONTROLS, request["lease"]) as controls:
+        place = Path(request["arm_folder"]) / CONTROLS
+        with ControlFile.take(place, request["lease"], asked_ns=request["asked_ns"]) as controls:
             signal.signal(signal.SIGTERM, lambda *_: controls.ask_stop())
             say({"pid": os.getpid()})
             return 0, {"report": _latching(request, controls)}

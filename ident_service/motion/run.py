@@ -141,6 +141,8 @@ class _Run:
         loop, torque = self._prepared()
         if self.controls.stop:  # planning takes a second or more; nobody wants to see the arm energised after a stop
             raise MotionRefused("a stop was asked for before the arm was energised; nothing has moved")
+        if not self.controls.lease_ok(self.arm.clock.now_ns()):
+            raise MotionRefused("whoever asked for the motion is gone, or is silent; nothing has moved")
         try:
             self.states.enter(State.CHECKED)
             self.arm.enable()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import time
 from collections.abc import Callable
 from dataclasses import astuple, dataclass
 from datetime import UTC, datetime
@@ -60,6 +61,7 @@ def run_motion(
     begin: Callable[[], None] = lambda: None,
     tell: Callable[[str], None] = lambda _: None,
     stop_requested: Callable[[], bool] = lambda: False,
+    asked_ns: int | None = None,
 ) -> Ran:
     """Move an arm along a motion, or to a destination, and record it.
 
@@ -75,6 +77,8 @@ def run_motion(
         begin: called when nothing that is known without the arm stands against the run, and its folder exists.
         tell: called with each state that is entered.
         stop_requested: asked several times a second.
+        asked_ns: when a person asked for the motion, on the machine's monotonic clock [ns]; now when None. A stop that
+            was asked for since then keeps it from beginning.
 
     Raises:
         UsageError: the run folder exists or cannot be made, or the state folder cannot be written; nothing has moved.
@@ -83,6 +87,7 @@ def run_motion(
         DriverError: the arm cannot be had.
         RecordingError: the recording failed, which has stopped the arm.
     """
+    asked_ns = time.monotonic_ns() if asked_ns is None else asked_ns
     faults = fault_file(state, config.name)
     faults.require_none(faults.latched())
     if folder.exists():
@@ -124,6 +129,7 @@ def run_motion(
         "folder": str(folder),
         "arm_folder": str(arm_folder(state, config.name)),
         "lease": lease,
+        "asked_ns": asked_ns,
         "ticket": ticket.to_json(),
         "speed": speed,
         "log_frames": log_frames,

@@ -147,6 +147,13 @@ def test_an_arm_that_nobody_watches_stops(make: Callable[..., Bench], wish: str,
     assert len(bench.story.errors) == 1
 
 
+def test_a_lease_lost_while_a_motion_is_planned_energises_nothing(make: Callable[..., Bench]) -> None:
+    bench = make()
+    with pytest.raises(MotionRefused, match="whoever asked for the motion is gone"):
+        played(bench, Hands(gone=-1000))
+    assert "armed" not in bench.story.states
+
+
 def test_a_lease_lost_in_a_pause_stops_and_one_lost_in_a_stop_is_nothing(make: Callable[..., Bench]) -> None:
     bench = make()
     with pytest.raises(ArmFault, match="lease_lost"):

@@ -83,3 +83,43 @@ def test_a_killed_process_leaves_no_lock(tmp_path: Path) -> None:
     subprocess.run([sys.executable, "-c", code, str(loop_path(tmp_path))], check=False)
     with ControlFile.take(loop_path(tmp_path), None) as again:
         assert not again.stop  # what was asked of the dead run is not asked of this one
+
+
+@pytest.mark.parametrize(("asked", "stops"), [(-1, True), (0, True), (1, False), (None, False)])
+def test_a_stop_reaches_a_motion_that_was_asked_for_before_it(tmp_path: Path, asked: int | None, stops: bool) -> None:
+    time = Time()
+    assert ControlFile.stop_all(loop_path(tmp_path), time) is None
+    asked_ns = None if asked is None else time.now + asked
+    time.now += 2_000_000_000
+    with ControlFile.take(loop_path(tmp_path), 2.0, time, asked_ns) as loop:
+        assert loop.stop == stops
+        assert not loop.pause
+        assert loop.lease_ok(0)
+
+
+def test_a_stop_before_the_machine_was_started_anew_is_none(tmp_path: Path) -> None:
+    time = Time()
+    ControlFile.stop_all(loop_path(tmp_path), time)
+    time.now -= 3_000_000_000
+    with ControlFile.take(loop_path(tmp_path), None, time, asked_ns=time.now - 1) as loop:
+        assert not loop.stop
+
+
+def test_a_stop_reaches_who_moves_the_arm_and_who_waits_for_it(tmp_path: Path) -> None:
+    time = Time()
+    asked_ns = time.now
+    with ControlFile.take(loop_path(tmp_path), None, time) as loop:
+        time.now += 1
+        assert ControlFile.stop_all(loop_path(tmp_path), time) == loop.pid
+        assert loop.stop
+    time.now += 1
+    with ControlFile.take(loop_path(tmp_path), None, time, asked_ns) as waited:
+        assert waited.stop
+    with ControlFile.take(loop_path(tmp_path), None, time, time.now) as later:
+        assert not later.stop
+
+
+def test_a_stop_that_cannot_be_written_says_so(tmp_path: Path) -> None:
+    (tmp_path / "arm").write_text("", encoding="utf-8")
+    with pytest.raises(UsageError, match="cannot be written"):
+        ControlFile.stop_all(loop_path(tmp_path))

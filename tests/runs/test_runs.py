@@ -20,6 +20,7 @@ from kill_bench import TRIES
 
 from ident_service.cli import main
 from ident_service.config.load import load_arm
+from ident_service.errors import MotionRefused
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.preflight.ticket import read_ticket
@@ -120,6 +121,21 @@ def test_a_machine_that_stalls_in_virtual_time_loses_no_lease(virtual_arm: Path,
     assert ran.report["state"] == "done"
 
 
+@pytest.mark.slow
+def test_a_stop_while_a_run_is_being_prepared_keeps_it_from_beginning(virtual_arm: Path, tmp_path: Path) -> None:
+    state = tmp_path / "state"
+    checked(virtual_arm, state)
+    config = load_arm(virtual_arm)
+    motion = excitation(arm_model(config), "identification")
+    ticket, asked_ns = read_ticket(ticket_path(state, config.name)), time.monotonic_ns()
+    assert main(["stop", str(virtual_arm), "--state", str(state)]) == 2  # nobody moves it yet
+    with pytest.raises(MotionRefused, match="a stop was asked for before the arm was energised"):
+        run_motion(config, motion, tmp_path / "run", state, ticket, asked_ns=asked_ns)
+    assert not (tmp_path / "run").exists()
+    assert not fault_file(state, config.name).latched()
+    assert run_motion(config, motion, tmp_path / "run", state, ticket).report["state"] == "done"
+
+
 @pytest.mark.campaign
 def test_a_parent_that_hangs_loses_its_lease(started: Started, tmp_path: Path) -> None:
     started.reaches("exciting")
@@ -171,7 +187,7 @@ def test_a_second_terminal_pauses_resumes_and_stops(started: Started, real_arm: 
         assert main([word, str(real_arm), "--state", str(tmp_path / "state")]) == 0
         started.reaches(reached)
     code, out, err = started.end()
-    assert code == 0, err
+    assert code == 1, err
     assert out.startswith("stopped after")
     assert readable(started.folder) > 0
 
@@ -191,5 +207,5 @@ def test_ctrl_c_stops_the_arm_under_control(started: Started) -> None:
     started.reaches("exciting")
     started.process.send_signal(signal.SIGINT)
     code, out, err = started.end()
-    assert code == 0, err
+    assert code == 1, err
     assert "stopped after" in out

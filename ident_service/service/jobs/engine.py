@@ -15,12 +15,13 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ident_service.errors import IdentError, MotionRefused, UsageError
-from ident_service.motion.control_file import ControlFile
+from ident_service.motion.control_file import ControlFile, mover
 from ident_service.service.arm_state import control_path
 from ident_service.service.jobs.asked import Asked
 from ident_service.service.jobs.child import RENEW, STOP, Child, OwnChild, UnitChild
@@ -188,7 +189,7 @@ class Engine:
 
         Waits for nobody: the control file is memory, and the word to our own children a line in a pipe.
         """
-        reached, ended = self._reach(arm, lambda controls: controls.ask_stop()), []
+        reached, ended = self._reach(arm, ControlFile.stop_all), []
         with self._lock:
             self._stops[arm] += 1
             for live in list(self._live.values()):
@@ -203,7 +204,13 @@ class Engine:
 
     def pause(self, arm: str, by: str, *, wanted: bool) -> bool:
         """Let an arm stand, or go on; whether anybody moves it."""
-        reached = self._reach(arm, lambda controls: controls.ask_pause(wanted))
+
+        def ask(path: Path) -> int:
+            with ControlFile.reach(path) as controls:
+                controls.ask_pause(wanted)
+                return controls.pid
+
+        reached = self._reach(arm, ask)
         note(self.db, by, "pause" if wanted else "resume", arm, reached=reached)
         return bool(reached)
 
@@ -216,7 +223,7 @@ class Engine:
 
     def moving(self) -> list[str]:
         """Names of the arms that anybody moves."""
-        return self._reach(None, lambda _: None)
+        return self._reach(None, mover)
 
     def begin_closing(self) -> None:
         """Stop all arms and begin nothing more; returns at once."""
@@ -354,18 +361,15 @@ class Engine:
     def _lapsed(self, live: _Live) -> bool:
         return self._now() - live.renewed > self._factor * live.order.lease
 
-    def _reach(self, arm: str | None, act: Callable[[ControlFile], Any]) -> list[str]:
-        """Do something to the controls of an arm, or of all, where anybody moves it; their names."""
+    def _reach(self, arm: str | None, act: Callable[[Path], int | None]) -> list[str]:
+        """Do something with the control file of an arm, or of all that ever moved; the names of those that move."""
         place = self.state / "arms"
-        names = [arm] if arm is not None else [path.name for path in place.iterdir()] if place.is_dir() else []
+        there = [path.name for path in place.iterdir()] if place.is_dir() else []
         reached = []
-        for name in names:
-            try:
-                with ControlFile.reach(control_path(self.state, name)) as controls:
-                    act(controls)
-            except UsageError:
-                continue
-            reached.append(name)
+        for name in there if arm is None else [arm] if arm in there else []:
+            with suppress(UsageError):
+                if act(control_path(self.state, name)) is not None:
+                    reached.append(name)
         return sorted(reached)
 
     def _requeue(self) -> None:
