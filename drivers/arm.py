@@ -50,6 +50,7 @@ class ArmDescription:
         software: name and version of the driver.
         scheduled_stamps: whether stamps are those of a schedule, whole periods apart, as of a plant that moves by whole
             periods; how late a cycle came only the loop's clock says then. Otherwise stamps are the clock's.
+        lost_cycles: in a row, without an axis' position, after which it counts as gone.
     """
 
     joint_names: tuple[str, ...]
@@ -60,6 +61,7 @@ class ArmDescription:
     identities: tuple[str, ...]
     software: str
     scheduled_stamps: bool = False
+    lost_cycles: int = 3
 
 
 @dataclass(frozen=True, slots=True)

@@ -172,6 +172,7 @@ class CanopenArm(Arm):
             found.position_resolution,
             self._identities,
             "drivers.canopen",
+            lost_cycles=self._driver.lost_cycles,
         )
 
     def enable(self) -> None:

@@ -137,7 +137,8 @@ class CanopenDriver(Section):
     """Drives in cyclic synchronous torque mode.
 
     `torque_frames` says whether up to four drives share a frame, by dummy mapping, or each has its own.
-    `torque_deadline` [s] without torque frames makes a drive stop by itself (1400h:05). `bring_up` [s] is how long all
+    `torque_deadline` [s] without torque frames makes a drive stop by itself (1400h:05). After `lost_cycles` in a row
+    without its position a joint counts as gone (FIELDBUS.md: 3 to 5). `bring_up` [s] is how long all
     drives together may take for one step to `operation enabled`. `zero` says whether encoders know where they stand
     (`absolute`), or count from where they were when power came; then a person leads the arm to the joints' `home` and
     says so, `ident home ARM --zero`, after every loss of power.
@@ -149,6 +150,7 @@ class CanopenDriver(Section):
     drives: Annotated[tuple[CanopenDrive, ...], Field(min_length=1)]
     torque_frames: Literal["shared", "single"] = "shared"
     torque_deadline: Seconds = 0.01
+    lost_cycles: Annotated[int, Field(ge=3, le=5)] = 3
     bring_up: Positive = 0.5
     zero: Literal["absolute", "at_home"] = "absolute"
     heartbeats: Heartbeats = Heartbeats()

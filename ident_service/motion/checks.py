@@ -14,7 +14,7 @@ from drivers.arm import Counts, Flags, Sample, Vector
 from drivers.status import AxisStatus
 from ident_service.config.limits import MotionLimits
 
-MAX_AGE = 3  # cycles without an axis' feedback before it counts as gone (FIELDBUS.md: 3 to 5)
+MAX_AGE = 3  # cycles without an axis' feedback before it counts as gone, where its driver does not say (FIELDBUS.md)
 VELOCITY_STOP, VELOCITY_OFF = 1.2, 2.0  # times the velocity limit (ODrive stops at 1.2)
 JUMP = 4.0  # times what the velocity limit allows in one cycle, away from where the arm should have gone on to
 # A position that stays the same to the last bit for so many cycles, while the controller asks for more than this share
@@ -65,6 +65,7 @@ class Seen:
         frozen: which encoders stand still although the joint cannot.
         was_powered: which axes' drives have said so before.
         sent: last torque asked for [N m or N], shape (joints,), or None.
+        max_age: cycles without an axis' feedback before it counts as gone.
         depths: how deep pairs of solids reach into each other [m].
         pairs: names for them.
     """
@@ -80,6 +81,7 @@ class Seen:
     frozen: Flags
     was_powered: Flags
     sent: Vector | None
+    max_age: int
     depths: Vector
     pairs: tuple[str, ...]
 
@@ -116,7 +118,7 @@ def _what_has_failed(seen: Seen) -> Iterator[Check]:
     yield Check("drive_watchdog", _says(seen, AxisStatus.WATCHDOG), "the drive's watchdog has struck")
     unpowered = seen.was_powered & ~_says(seen, AxisStatus.POWERED) & bool(seen.sample.status)
     yield Check("drive_fault", unpowered, "the drive is no longer energised")
-    yield Check("feedback_gone", seen.age >= MAX_AGE, f"no usable feedback for {MAX_AGE} cycles")
+    yield Check("feedback_gone", seen.age >= seen.max_age, f"no usable feedback for {seen.max_age} cycles")
 
 
 def _what_must_end(seen: Seen, limits: MotionLimits) -> Iterator[Check]:

@@ -21,6 +21,7 @@ from ident_service.motion.checks import (
     FROZEN_CYCLES,
     FROZEN_EFFORT,
     JUMP,
+    MAX_AGE,
     NOT_APPLIED,
     SUDDEN_CYCLES,
     SUDDEN_SPEED,
@@ -60,6 +61,7 @@ class Guard:
         revolute: tuple[bool, ...] | None = None,
         contact: Contact | None = None,
         owed: Owed | None = None,
+        max_age: int = MAX_AGE,
     ) -> None:
         """Begin with the arm standing somewhere.
 
@@ -71,12 +73,13 @@ class Guard:
             revolute: which joints turn, for the units in the sentences; all when None.
             contact: what may not touch; without it, nothing is checked.
             owed: of joints that stand still; without it, only hard pushes and full motion tell frozen encoders.
+            max_age: cycles without an axis' feedback before it counts as gone (`ArmDescription.lost_cycles`).
         """
         joints = len(position)
         self.findings = Findings()
         self.rate = np.minimum(TORQUE_RATE, TORQUE_RATE_SHARE * limits.torque) * period
         self._names, self._limits, self._period = joint_names, limits, period
-        self._elapsed = period
+        self._elapsed, self._max_age = period, max_age
         self._units = tuple("rad" if turns else "m" for turns in revolute or (True,) * joints)
         self._contact = contact if contact is not None and contact.pairs else None
         self._pairs = contact.pairs if contact is not None else ()
@@ -266,6 +269,7 @@ class Guard:
             self._frozen(),
             self._was_powered,
             self._sent,
+            self._max_age,
             self._depths,
             self._pairs,
         )

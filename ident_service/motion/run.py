@@ -203,7 +203,16 @@ class _Run:
         legs, limits = self.plan.legs(model, home, limits), admitted
         owed = owed_ways(dynamics, model, limits, period, described.position_resolution)
         contact = Contact(model)
-        guard = Guard(chain.names, limits, period, home, revolute=chain.revolute, contact=contact, owed=owed)
+        guard = Guard(
+            chain.names,
+            limits,
+            period,
+            home,
+            revolute=chain.revolute,
+            contact=contact,
+            owed=owed,
+            max_age=described.lost_cycles,
+        )
         control = ComputedTorque(dynamics, limits, period, model.config.control.velocity_cutoff, home)
         torque, cannot_hold = guard.torque(control.torque(home, sample.valid, rest(home)))
         if cannot_hold is not None:

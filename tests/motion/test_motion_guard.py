@@ -150,6 +150,17 @@ def test_an_axis_that_comes_back_elsewhere_has_jumped() -> None:
     is_fault(fault, "feedback_gone", 0)
 
 
+@pytest.mark.parametrize("most", [3, 5])
+def test_an_axis_is_gone_after_as_many_cycles_as_its_driver_says(most: int) -> None:
+    bench = Bench(max_age=most)
+    for _ in range(most - 1):
+        is_fault(bench.see(HOME, valid=(True, False))[1], "lost_feedback", 1)
+    fault = bench.see(HOME, valid=(True, False))[1]
+    is_fault(fault, "feedback_gone", 1)
+    assert fault is not None
+    assert f"for {most} cycles" in fault.message
+
+
 def test_age_counts_again_from_every_answer() -> None:
     bench = Bench()
     for _ in range(5):

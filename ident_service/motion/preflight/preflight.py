@@ -189,7 +189,7 @@ class _Preflight:
         with attended(self.arm):
             limits = limits if self.excitation is not None else admitting(home, limits)
             friction = expected_friction(self.model, limits, self.model.config.design.friction_guess)
-            session = Session(self.arm, self.model, limits, period, home, friction)
+            session = Session(self.arm, self.model, limits, self.described, home, friction)
             planned = self._planned(session)
         self._touched(session, planned, _Gravity(session.gravity, limits, friction), try_watchdog=agreed.given)
 
@@ -213,7 +213,7 @@ class _Preflight:
             self._passed(ways_check(self.model, limits, self.excitation, home))
         self._passed(rate_check(looked, self.arm.clock.lock_step))
         friction = expected_friction(self.model, limits, self.model.config.design.friction_guess)
-        session = Session(self.arm, self.model, limits, 1.0 / self.described.rate, home, friction)
+        session = Session(self.arm, self.model, limits, self.described, home, friction)
         self._passed(noise_check(looked, self.described, self.model, limits, session.mass))
         if any(c.verdict is Verdict.FAILED and c.code not in ABOUT_THE_MOTION for c in self.checks.values()):
             return None

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivers.arm import Arm, Sample, StopKind, Vector
+from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector
 from ident_service.config.limits import MotionLimits
 from ident_service.errors import ArmFault
 from ident_service.excitation.following import ExpectedFriction
@@ -94,7 +94,13 @@ class Session:
     """
 
     def __init__(
-        self, arm: Arm, model: ArmModel, limits: MotionLimits, period: float, home: Vector, friction: ExpectedFriction
+        self,
+        arm: Arm,
+        model: ArmModel,
+        limits: MotionLimits,
+        described: ArmDescription,
+        home: Vector,
+        friction: ExpectedFriction,
     ) -> None:
         """Prepare; nothing is sent.
 
@@ -102,10 +108,11 @@ class Session:
             arm: open, at rest, not enabled.
             model: with a prior.
             limits: of the arm.
-            period: [s].
+            described: what the arm says of itself.
             home: where it stands [rad or m], shape (joints,).
             friction: widens the band of torques.
         """
+        period = 1.0 / described.rate
         prior = np.zeros(model.layout.size) if model.prior is None else model.prior
         dynamics = InverseDynamics(model.chain, model.layout, prior)
         still = np.zeros_like(home)
@@ -120,7 +127,9 @@ class Session:
             following_error=np.minimum(limits.following_error, FARTHEST),
             velocity=np.minimum(limits.velocity, FASTEST),
         )
-        self._guard = Guard(model.chain.names, narrow, period, home, revolute=model.chain.revolute)
+        self._guard = Guard(
+            model.chain.names, narrow, period, home, revolute=model.chain.revolute, max_age=described.lost_cycles
+        )
         self._control = ComputedTorque(dynamics, limits, period, model.config.control.velocity_cutoff, home)
         self._since = Elapsed(period)
         self._torque = self.gravity.copy()
