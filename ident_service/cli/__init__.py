@@ -98,7 +98,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         if arguments.json:
             print_error(type(error).__name__, str(error), code, {**({"notes": notes} if notes else {}), **error.facts})
         return code
-    print_answer(arguments, code, text, document)
+    try:
+        print_answer(arguments, code, text, document)
+    except OSError as error:
+        print_to_person(f"ident: done, but the answer cannot be written: {error.strerror}\n")
+        return FAILED
     return code
 
 

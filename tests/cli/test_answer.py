@@ -91,3 +91,16 @@ def nohup() -> Iterator[None]:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     yield
     signal.signal(signal.SIGHUP, before)
+
+
+def test_an_answer_that_cannot_be_written_is_no_success_and_no_traceback() -> None:
+    with open("/dev/full", "w") as full:  # noqa: PTH123 - a device
+        ended = subprocess.run(
+            [sys.executable, "-m", "ident_service", "config", "check", "planar2"],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert ended.returncode == 1
+    assert ended.stderr == "ident: done, but the answer cannot be written: No space left on device\n"

@@ -171,3 +171,22 @@ def test_an_encoder_counts_motor_turns_from_the_zero_of_the_joints(tmp_path: Pat
     relative = build_emulator(pucks_config(tmp_path, gears=gears, zero="at_home"))
     relative.power_up(0)
     assert [motor.encoder(0) for motor in relative.body.motors] == [0, 0]
+
+
+def test_a_late_host_finds_the_arm_moved_on_already(tmp_path: Path) -> None:
+    emulator = build_emulator(pucks_config(tmp_path))
+    emulator.power_up(0)
+    body = emulator.body
+    emulator.go_on(100 * MS)
+    assert (body.overdue_ns, body.now_ns) == (None, 0)  # somebody holds it
+    for motor in body.motors:
+        motor.drive(0.5, 0)
+    body.advance(MS)
+    assert not body.supported
+    start = body.plant.position
+    emulator.go_on(MS + MS)  # a cycle that is in time needs nothing
+    assert body.plant.position is start
+    assert body.overdue_ns is not None
+    assert 2 * MS < body.overdue_ns <= MS + 1.5 * MS
+    emulator.go_on(body.overdue_ns)
+    assert (body.plant.position != start).any()

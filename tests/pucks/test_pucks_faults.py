@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import struct
 from pathlib import Path
 
@@ -282,3 +283,9 @@ def test_a_fault_that_nobody_understands(text: str, complaint: str) -> None:
     with pytest.raises(DriverError) as refused:
         parse_fault(text, NAMES)
     assert complaint in str(refused.value)
+
+
+def test_the_document_lists_every_fault_as_it_is() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "fieldbus.md").read_text(encoding="utf-8")
+    listed = dict(re.findall(r"^\| `(\w+)` \| (.*?) \| .*? \| (?:a drive, or all|the arm) \| ", text, re.MULTILINE))
+    assert listed == {kind: rule.does for kind, rule in PUCK_FAULTS.items()}
