@@ -219,6 +219,7 @@ def test_the_package_loads_no_large_library() -> None:
     assert loaded_after("import ident_service") == set()
 
 
+@pytest.mark.slow
 def test_the_probe_would_see_a_large_library() -> None:
     assert loaded_after("import ident_service.model.rigid_body") == {"pinocchio"}
 

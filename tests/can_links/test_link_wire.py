@@ -254,6 +254,7 @@ def test_an_end_of_another_version_is_told_so(wire: Wire) -> None:
         assert packets.unpack_welcome(sock.recv(packets.MAX_BYTES)).answer == packets.OTHER_VERSION
 
 
+@pytest.mark.slow
 def test_something_else_at_the_address_is_told_from_a_wire(name: str) -> None:
     with address.listen(name) as listener:
         listener.setblocking(True)

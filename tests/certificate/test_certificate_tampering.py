@@ -71,6 +71,7 @@ def _fails(document: Document, change: Callable[[Document], None]) -> str:
     return result.message
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["witness", "dual"])
 def test_every_digit_of_a_base_parameter_counts(kind: str, request: pytest.FixtureRequest) -> None:
     document = request.getfixturevalue(kind)

@@ -26,6 +26,7 @@ def test_an_arm_that_moves_is_neither_checked_nor_watched(ident: Ident, state: P
     assert not (state / "arms" / "planar2" / "ticket.json").exists()
 
 
+@pytest.mark.slow
 def test_a_check_comes_after_the_faults(ident: Ident, state: Path) -> None:
     fault_file(state, "planar2").latch("lease_lost", "nobody was there")
     ended = ident("check", "planar2", "--confirm", "planar2")

@@ -56,6 +56,7 @@ def test_a_seed_gives_the_same_numbers_again(quick: Commissioned, ident: Ident, 
     assert other["score"] != same["score"]
 
 
+@pytest.mark.slow
 def test_module_runs_as_a_process_of_its_own(tmp_path: Path) -> None:
     def run(*words: object) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-W", "error", "-m", "ident_service", *map(str, words)]

@@ -69,11 +69,13 @@ def test_a_search_without_time_says_so_and_is_no_success(tmp_path: Path, ident: 
     assert "before its first start was finished" in ended.json["warnings"][0]
 
 
+@pytest.mark.slow
 def test_blanks_in_an_expression_do_not_matter(tmp_path: Path, ident: Ident) -> None:
     words = ("--parameter", "Lzz2-0.25*m2", "--out", tmp_path / "m", "--json")
     assert ident("design", quick_arm(tmp_path), *QUICK, *words).json["criterion"] == "a_optimal"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("key", "value"), [("a", 1e300), ("base_frequency", 1e12), ("q0", -1e7)])
 def test_numbers_that_no_arm_can_mean_are_refused(key: str, value: float, tmp_path: Path, ident: Ident) -> None:
     assert ident("design", quick_arm(tmp_path), *QUICK, "--out", tmp_path / "m").code == 0

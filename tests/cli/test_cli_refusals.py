@@ -274,6 +274,7 @@ def test_a_motion_beyond_the_limits_is_a_no(place: Path, ident: Ident) -> None:
     refused(place, ident, ("simulate", arm, "--out", place / "run"), 3, "planar2: gravity alone asks for more than")
 
 
+@pytest.mark.slow
 def test_a_fault_stops_the_arm(place: Path, ident: Ident) -> None:
     # An elbow a hundred times as sticky as the controller's model has it stands still however hard it is pushed.
     arm = quick_arm(place, ("fc2: 0.3", "fc2: 30"))
@@ -281,6 +282,7 @@ def test_a_fault_stops_the_arm(place: Path, ident: Ident) -> None:
     assert "stands still" in ended.err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cycles", "motion"), [(100, "identification"), (9000, "identification"), (18000, "validation")]
 )

@@ -96,6 +96,7 @@ def test_a_page_does_not_go_over_a_result(folder: Path, ident: Ident, tmp_path: 
     read_results(folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["svg", "png"])
 def test_figures(folder: Path, ident: Ident, tmp_path: Path, form: str) -> None:
     if form == "png":
@@ -109,6 +110,7 @@ def test_figures(folder: Path, ident: Ident, tmp_path: Path, form: str) -> None:
     assert all(path.read_bytes().startswith(start) for path in out.iterdir())
 
 
+@pytest.mark.slow
 def test_letters_are_in_a_png(folder: Path, ident: Ident, tmp_path: Path) -> None:
     resvg = pytest.importorskip("resvg_py")
     assert ident("figures", folder, "--format", "png", "--out", tmp_path / "png").code == 0

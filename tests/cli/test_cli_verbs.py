@@ -245,6 +245,7 @@ def test_table_1_through_the_command(ident: Ident, wam7_data: Path, tmp_path: Pa
     np.testing.assert_allclose(document["values"], [row[3] for row in rows], rtol=0, atol=2e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arm", sorted(shipped_arms()))
 def test_shipped_descriptions_are_good(ident: Ident, arm: str) -> None:
     words = ident("config", "check", arm)

@@ -37,6 +37,7 @@ def uniform(p: list[float]) -> float:
     return float(scipy.stats.kstest(p, "uniform").pvalue)
 
 
+@pytest.mark.slow
 def test_p_is_uniform_under_the_null_where_covariances_are_known() -> None:
     rng = np.random.default_rng(1)
     S1, S2 = covariance(1), covariance(2)
@@ -49,6 +50,7 @@ def test_p_is_uniform_under_the_null_where_covariances_are_known() -> None:
     assert false <= scipy.stats.binom.ppf(0.999, 600, ALPHA)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blocks", [(40, 40), (30, 80)])
 def test_p_is_uniform_where_covariances_come_from_few_blocks(blocks: tuple[int, int]) -> None:
     rng = np.random.default_rng(2)
@@ -61,6 +63,7 @@ def test_p_is_uniform_where_covariances_come_from_few_blocks(blocks: tuple[int, 
     assert naive > 0.1
 
 
+@pytest.mark.slow
 def test_more_parameters_than_blocks_give_no_false_alarms() -> None:
     rng = np.random.default_rng(3)
     S = covariance(5)
@@ -80,6 +83,7 @@ def test_a_change_of_one_friction_is_found_and_named() -> None:
         assert [(one.kind, one.number) for one in found.changes] == [("friction", 2)]
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1))
 def test_neither_order_nor_units_matter(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -280,6 +280,7 @@ def test_only_whoever_asked_renews_a_lease(daemon: Asked) -> None:
     daemon.post("/api/v1/stop")
 
 
+@pytest.mark.slow
 def test_no_answer_names_a_place_or_lets_itself_be_framed_or_kept(daemon: Asked, state: Path) -> None:
     job = daemon.begin({"kind": "simulate", "arm": "wam7"})  # not a simulated arm
     ended = daemon.follow(job["id"])

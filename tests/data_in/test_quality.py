@@ -48,6 +48,7 @@ def test_stamps() -> None:
     assert found == quality(recording, PLAIN, None, grid(recording, PLAIN))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("samples", [4096, 37, 5])
 def test_saturation(samples: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A sine of 10 N m that a drive cuts at 8 N m, and one that it lets pass."""
@@ -83,6 +84,7 @@ def test_a_touch_of_the_extreme_is_no_saturation() -> None:
     assert quality(recording, PLAIN).joints[0].saturated == pytest.approx(0.005)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("samples", [4096, 7])
 def test_standstill_and_encoder_steps(samples: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The joint moves at 0.1 rad/s for a quarter of the time; read by an encoder of 1e-4 rad."""

@@ -64,6 +64,7 @@ def test_the_description_has_kinematics_only(arm: str) -> None:
         assert word not in urdf.text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("arm", "name"), RECORDINGS)
 def test_it_opens_on_the_joint_side_and_within_the_limits(shared: Path, arm: str, name: str) -> None:
     config = load_arm(arm)
@@ -81,6 +82,7 @@ def test_it_opens_on_the_joint_side_and_within_the_limits(shared: Path, arm: str
         assert 0.1 < np.abs(speed).max() < 1.01 * joint.velocity
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("arm", "name"), RECORDINGS[:2])
 def test_the_kuka_s_stamps_jitter_but_its_motion_does_not(shared: Path, arm: str, name: str) -> None:
     recording, form = opened(shared, arm, name), load_arm(arm).recording

@@ -31,6 +31,7 @@ def recorded(seed: int, *, memory: float = 0.0, blocks: int = 80, samples: int =
     return Equations(tuple(one_joint_information(*pair) for pair in pairs), samples)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("memory", "share"), [(0.0, 0.005), (12.0, 0.05)])
 def test_zeros_leave_and_large_ones_stay(memory: float, share: float) -> None:
     dropped = np.zeros(10)

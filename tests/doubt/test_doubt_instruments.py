@@ -62,6 +62,7 @@ def test_least_squares_is_biased_in_a_noisy_loop_and_instruments_are_not(given: 
     assert np.all(ratio < 5.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("given", [False, True])
 def test_without_noise_nothing_changes(given: bool) -> None:
     model, truth = pendulum_model()
@@ -90,6 +91,7 @@ def test_two_joints_with_everything_between_them() -> None:
     np.testing.assert_array_equal(result.covariance, result.covariance.T)
 
 
+@pytest.mark.slow
 def test_the_covariance_is_the_jackknife_over_blocks() -> None:
     # One round by hand, on explicit rows.
     model, truth = pendulum_model()

@@ -67,6 +67,7 @@ def test_a_closed_arm_does_nothing(bench):
             act()
 
 
+@pytest.mark.slow
 def test_describes_itself_in_the_shape_of_its_joints(bench):
     with bench.arm as arm:
         says = arm.describe()

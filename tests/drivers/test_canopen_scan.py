@@ -251,6 +251,7 @@ def arm_file(folder: Path, *nodes: int) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_the_command_scans_a_bus_of_python_can(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     there, other = arm_file(tmp_path, 1, 5), arm_file(tmp_path, 1, 2)
     end = threading.Event()

@@ -202,6 +202,7 @@ def test_a_crossing_where_two_cells_meet_is_not_missed(edge: int) -> None:
     assert -1e-2 < clear.lower_bound <= 0.0
 
 
+@pytest.mark.slow
 @settings(max_examples=30)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_bound_of_the_speed_is_enough(seed: int) -> None:

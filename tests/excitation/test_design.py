@@ -105,10 +105,12 @@ def test_a_design_that_is_cancelled_at_once_is_a_motion_too() -> None:
     assert excitation_from_json(designed.excitation.to_json()).duration > 0.0
 
 
+@pytest.mark.slow
 def test_an_arm_with_a_sliding_joint_moves_too() -> None:
     assert_good(small("threelink"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [1.02, 1.2])
 def test_an_arm_whose_torque_hardly_holds_it_moves(share: float) -> None:
     # Stretched out, shoulder and elbow need 12.26 and 2.45 N m; there is a little more than that.
@@ -116,6 +118,7 @@ def test_an_arm_whose_torque_hardly_holds_it_moves(share: float) -> None:
     assert_good(model, torque_margin=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("torque", [3.0, 0.5])
 def test_an_arm_that_can_only_hang_moves_about_hanging(torque: float) -> None:
     # Far too weak to be stretched out; about hanging straight down there is room for little.

@@ -56,6 +56,7 @@ def test_many_random_chains_are_solved(seed: int) -> None:
     check_all_answers(seed)
 
 
+@pytest.mark.slow
 def test_twenty_links_are_solved_to_the_truth_without_noise() -> None:
     case = random_case(7, joints=20, noise=0.0)
     truth = case.base.K @ case.delta

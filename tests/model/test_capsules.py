@@ -32,6 +32,7 @@ def collision_model(model: ArmModel) -> CollisionModel:
         raise
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 7))
 def test_distances_are_those_of_coal(seed: int, joints: int) -> None:
     model = arm_with_bodies(seed, joints)
@@ -44,6 +45,7 @@ def test_distances_are_those_of_coal(seed: int, joints: int) -> None:
     assert np.all(found[~apart] < 1e-6)
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1))
 def test_distances_of_other_solids_are_never_too_large(seed: int) -> None:
     model = urdf_arm(np.random.default_rng(seed))
@@ -84,6 +86,7 @@ def urdf_arm(rng: np.random.Generator) -> ArmModel:
     )
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 6), step=st.just(1e-6))
 def test_the_pull_is_the_gradient(seed: int, joints: int, step: float) -> None:
     model = arm_with_bodies(seed, joints)

@@ -228,6 +228,7 @@ def free_model(seed: int, joints: int) -> tuple[ArmModel, CollisionModel]:
         raise
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 7), step=st.sampled_from([1e-3, 0.1, 1.0]))
 def test_no_distance_changes_faster_than_the_reach_says(seed: int, joints: int, step: float) -> None:
     model, collision = free_model(seed, joints)

@@ -37,6 +37,7 @@ def deepest(contact: Contact, position: Array) -> dict[str, float]:
     return found
 
 
+@pytest.mark.slow
 @given(st.integers(0, 2**32 - 1), st.integers(1, 6))
 def test_what_touches_is_as_deep_as_the_exact_distance_says(seed: int, joints: int) -> None:
     model = arm_with_bodies(seed, joints)

@@ -110,6 +110,7 @@ def dh_urdf(table: DHTable, bodies: Array) -> str:
     return "".join(parts).replace("np.float64(", "").replace(")", "") + "</robot>"
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 6))
 def test_standard_dh_torque_is_that_of_the_equivalent_urdf_in_pinocchio(seed: int, joints: int) -> None:
     rng = np.random.default_rng(seed)

@@ -133,6 +133,7 @@ def test_residuals_torques_and_scores_are_those_of_the_rows(seed: int, joints: i
     np.testing.assert_allclose(information.scores(beta), score, rtol=0, atol=1e-9 * np.linalg.norm(score))
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(seed=st.integers(0, 10_000), joints=st.integers(1, 5))
 def test_supports_are_the_columns_that_a_joint_feels(seed: int, joints: int) -> None:

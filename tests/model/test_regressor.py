@@ -27,6 +27,7 @@ ALL = ("drive_inertia", "viscous", "coulomb", "offset")
 FROM_PINOCCHIO = [4, 5, 7, 6, 8, 9, 1, 2, 3, 0]
 
 
+@pytest.mark.slow
 @given(
     seed=st.integers(0, 2**32 - 1),
     joints=st.integers(1, 7),
@@ -48,6 +49,7 @@ def test_regressor_times_parameters_is_the_inverse_dynamics(
     np.testing.assert_allclose(actual, expected, rtol=1e-10, atol=1e-10 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 7), branches=st.booleans(), square=st.booleans())
 def test_inertial_columns_are_those_of_pinocchios_regressor(
     seed: int, joints: int, branches: bool, square: bool
@@ -65,6 +67,7 @@ def test_inertial_columns_are_those_of_pinocchios_regressor(
         np.testing.assert_allclose(H[:, :, sample], expected, rtol=0, atol=1e-10 * max(1.0, np.abs(expected).max()))
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 5), data=st.data())
 def test_some_columns_are_those_columns_of_all(seed: int, joints: int, data: st.DataObject) -> None:
     rng = np.random.default_rng(seed)
@@ -86,6 +89,7 @@ def test_samples_do_not_touch_each_other(wam7: ArmModel) -> None:
         np.testing.assert_allclose(together[:, :, sample], alone[:, :, 0], rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("samples", [0, 1, 4095, 4096, 4097, 10_000])
 def test_blocks_of_any_length_are_one_regressor(wam7: ArmModel, samples: int) -> None:
     states = random_states(np.random.default_rng(2), samples, 7)

@@ -68,6 +68,7 @@ def test_every_kind_of_fault_has_its_promise() -> None:
         assert promise.codes <= set(FAULTS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", sample(), ids=str)
 def test_a_sample_of_the_campaign(case: Case, tmp_path: Path) -> None:
     keeps_its_promise(case, tmp_path)

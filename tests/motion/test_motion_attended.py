@@ -70,6 +70,7 @@ def test_what_a_driver_should_not_raise_is_told_too() -> None:
         during(Looked(RealClock(), fails_at=1, error=ZeroDivisionError()), lambda: None)
 
 
+@pytest.mark.slow
 def test_cycles_go_on_beside_work_that_has_real_time() -> None:
     """Work and cycles share a core and a priority there, and the work never waits."""
     with asked() as granted:

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from drivers.arm import Sample
+from drivers.status import AxisStatus
 from ident_service.motion.checks import (
     FROZEN_CYCLES,
     FROZEN_EFFORT,
@@ -148,6 +149,13 @@ def test_an_axis_that_comes_back_elsewhere_has_jumped() -> None:
     usable, fault = bench.see(HOME + 1.01 * WINDOW * unit(0), HOME)
     assert usable == [False, True]
     is_fault(fault, "feedback_gone", 0)
+
+
+def test_a_status_that_is_read_anew_but_says_the_same_is_the_same() -> None:
+    bench = Bench()
+    for _ in range(3):
+        assert bench.see(HOME, status=tuple([int(AxisStatus.POWERED)] * 2)) == ([True, True], None)
+    is_fault(bench.see(HOME, status=(int(AxisStatus.POWERED), 0))[1], "drive_fault", 1)
 
 
 @pytest.mark.parametrize("most", [3, 5])

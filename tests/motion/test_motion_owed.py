@@ -159,6 +159,7 @@ def freezes_are_found(arm: str, joint: int, speed: float) -> None:
     assert found >= 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("joint", [0, 1])
 @pytest.mark.parametrize("speed", [1.0, 0.2])
 def test_a_slowly_begun_freeze_of_the_small_arm_is_found(joint: int, speed: float) -> None:
@@ -176,6 +177,7 @@ def stuck_share(truth: Array) -> float:
     return float((truth == 0.0).mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("times", [1.0, 1.4])
 def test_a_slow_joint_that_sticks_is_not_taken_for_a_frozen_one(times: float) -> None:
     """Dry friction of more than the guess, at a twentieth of the speed."""

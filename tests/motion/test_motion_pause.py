@@ -22,6 +22,7 @@ MOTION = PathReference(bench_excitation().path)
 SHARES = st.floats(0.0, 1.0)
 
 
+@pytest.mark.slow
 @settings(max_examples=50)
 @given(st.integers(0, 2**32 - 1), SHARES)
 def test_pause_and_resume_keep_to_all_limits_and_have_no_step(seed: int, share: float) -> None:

@@ -85,6 +85,7 @@ def test_an_arm_that_has_nowhere_to_go_is_done_at_once(make: Callable[..., Bench
     assert (report.peak_following_error < 1e-3).all()
 
 
+@pytest.mark.slow
 def test_two_runs_are_the_same_to_the_last_bit(make: Callable[..., Bench]) -> None:
     one, other = make(), make()
     one.run()
@@ -107,6 +108,7 @@ def test_enabling_may_take_its_time(make: Callable[..., Bench]) -> None:
     assert (steps <= LIMITS.velocity * PERIOD).all()
 
 
+@pytest.mark.slow
 def test_a_rehearsal_is_the_same_run_in_slow_motion(make: Callable[..., Bench]) -> None:
     full, slow = make(), make()
     full.run()
@@ -124,6 +126,7 @@ def test_a_rehearsal_is_the_same_run_in_slow_motion(make: Callable[..., Bench]) 
     assert (np.abs(np.diff(velocity, axis=0)) <= 0.04 * LIMITS.acceleration * PERIOD * 1.001).all()
 
 
+@pytest.mark.slow
 def test_a_stop_out_of_a_rehearsal_is_not_slowed(make: Callable[..., Bench]) -> None:
     bench = make()
     stopping = 5 * MIDWAY

@@ -18,6 +18,7 @@ from sim_backend.faults import Fault, FaultKind
 Array = np.ndarray
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("joint", [0, 1, None])
 @pytest.mark.parametrize("cycles", [1, 2])
 def test_feedback_lost_for_a_moment_is_bridged(make: Callable[..., Bench], joint: int | None, cycles: int) -> None:
@@ -40,6 +41,7 @@ def test_feedback_gone_takes_the_torque(make: Callable[..., Bench], joint: int |
     assert bench.story.column("cycle")[-1] == MIDWAY + 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("joint", [0, 1])
 def test_one_encoder_jump_is_passed_over(make: Callable[..., Bench], joint: int) -> None:
     healthy, bench = make(), make(Fault(MIDWAY, FaultKind.ENCODER_JUMP, joint, 1, 1.0))

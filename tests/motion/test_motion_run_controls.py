@@ -68,6 +68,7 @@ def no_step_anywhere(bench: Bench) -> None:
     assert (np.abs(np.diff(velocity, axis=0)) <= LIMITS.acceleration * PERIOD * 1.001).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cycle", [200, MIDWAY, 1900])
 def test_a_pause_is_gone_on_from(make: Callable[..., Bench], cycle: int) -> None:
     bench = make()

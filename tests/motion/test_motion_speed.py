@@ -22,6 +22,7 @@ MOTION = PathReference(PATH)
 SEEDS, FACTORS, SHARES = st.integers(0, 2**32 - 1), st.floats(0.05, 1.0), st.floats(0.0, 1.0)
 
 
+@pytest.mark.slow
 @settings(max_examples=50)
 @given(SEEDS, FACTORS)
 def test_a_slowed_motion_goes_the_same_way_within_smaller_limits(seed: int, factor: float) -> None:

@@ -56,6 +56,7 @@ def test_a_stop_ends_at_rest_within_limits(start: Setpoint) -> None:
     assert reference.duration <= longest.max() + 1e-9
 
 
+@pytest.mark.slow
 @given(st.floats(0.0, 1.0))
 def test_a_stop_out_of_an_excitation_passes_no_velocity_limit(share: float) -> None:
     exciting = PathReference(bench_excitation().path)
@@ -175,6 +176,7 @@ def test_a_stop_exists_from_far_beyond_the_limits(size: float, signs: tuple[floa
     assert (np.abs(acceleration) <= np.maximum(size, LIMITS.acceleration) * (1 + 1e-9)).all()
 
 
+@pytest.mark.slow
 @given(setpoints(LIMITS, 3.0))
 def test_an_acceleration_beyond_its_limit_is_led_back_first(start: Setpoint) -> None:
     reference = stop(start, LIMITS)
@@ -193,6 +195,7 @@ def test_a_stop_from_what_is_no_number_is_no_number_and_raises_nothing(which: st
     assert np.isfinite(reference.at(0.1).position[0])
 
 
+@pytest.mark.slow
 @settings(max_examples=10)
 @given(SEEDS)
 def test_the_extent_of_the_stops_is_that_of_every_single_one(seed: int) -> None:

@@ -117,6 +117,7 @@ def test_the_ticket_is_stamped_by_the_clock_it_is_given() -> None:
     assert ticket.expires - ticket.created == timedelta(minutes=3)
 
 
+@pytest.mark.slow
 def test_the_watchdog_of_a_plant_in_its_own_process_is_seen_to_act() -> None:
     driver = {"kind": "simulated", "truth": TRUTH, "encoder_resolution": 2e-5, "process": "separate"}
     flight = Flight(changes={"driver": driver})
@@ -128,6 +129,7 @@ def test_the_watchdog_of_a_plant_in_its_own_process_is_seen_to_act() -> None:
     assert took == pytest.approx([0.008, 0.008], abs=0.003)
 
 
+@pytest.mark.slow
 def test_a_shipped_arm_with_geometry_and_noise_passes() -> None:
     model = arm_model(load_arm("planar2"))
     motion = excitation(model, "identification")

@@ -32,6 +32,7 @@ def shown_furthest(flight: Flight) -> tuple[Ticket, float]:
     return flight.ticket(), max(seen)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [-1.0, 1.5, UPPER + 0.5 * AWAY])
 def test_an_arm_inside_or_a_little_outside_passes(start: float) -> None:
     flight = standing(start)

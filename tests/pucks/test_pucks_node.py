@@ -164,6 +164,7 @@ frames = st.builds(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(
     st.lists(
@@ -179,6 +180,7 @@ def test_no_frame_breaks_a_node(enabled: Host, sent: list[Frame]) -> None:
         assert enabled.read(node, 0x1000, 0, "I") == 0x00020192
 
 
+@pytest.mark.slow
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(st.lists(frames, max_size=20))
 def test_no_frame_for_others_moves_a_motor(enabled: Host, sent: list[Frame]) -> None:

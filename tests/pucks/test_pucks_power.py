@@ -79,6 +79,7 @@ def test_where_a_quick_stop_ends(enabled: Host, option: int, end: int) -> None:
     assert word_of(enabled) == end
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("option", "state", "power"), [(0, 0x08, Power.COAST), (2, 0x0F, Power.BRAKE)])
 def test_a_fault_its_reaction_and_its_reset(enabled: Host, option: int, state: int, power: Power) -> None:
     assert enabled.write(1, 0x605E, 0, "h", option) == 0

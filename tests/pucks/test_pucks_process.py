@@ -174,6 +174,7 @@ def test_two_interfaces_are_served_at_once(tmp_path: Path) -> None:
     assert result.heard > 20
 
 
+@pytest.mark.slow
 def test_a_fault_and_an_interface_are_checked_before_anything_runs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -89,6 +89,7 @@ def test_torn_at_any_place_a_prefix_is_read(whole: Path, tmp_path: Path) -> None
     assert min(lengths) < 150
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_damage_never_passes_for_samples(whole: Path, tmp_path: Path, data: st.DataObject) -> None:
@@ -125,6 +126,7 @@ def test_bombs_are_not_expanded(tmp_path: Path, compression: str, declared: int)
         McapRecording(path)
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_damage_without_checksums_is_a_recording_error_at_worst(tmp_path: Path, data: st.DataObject) -> None:

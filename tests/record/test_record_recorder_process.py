@@ -47,6 +47,7 @@ def fds() -> dict[str, str]:
     return {name: target for name, target in found.items() if "/proc/" not in target}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lock_step", [False, True])
 def test_the_file_is_the_same_to_the_byte_as_from_a_writer_in_process(tmp_path: Path, lock_step: bool) -> None:
     with RecordingWriter(tmp_path / "in", *WHAT) as inside:
@@ -71,6 +72,7 @@ def test_the_file_is_the_same_to_the_byte_as_from_a_writer_in_process(tmp_path: 
         store(outside, 3000)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 0.5])
 def test_lock_step_loses_nothing_at_full_speed(tmp_path: Path, share: float) -> None:
     count = 1500 if share == 0.0 else 20_000
@@ -81,6 +83,7 @@ def test_lock_step_loses_nothing_at_full_speed(tmp_path: Path, share: float) -> 
     assert len(read_all(McapRecording(tmp_path / "run")).stamp_ns) == len(cycles(count))
 
 
+@pytest.mark.slow
 def test_a_file_that_cannot_be_made_is_refused_at_the_door(tmp_path: Path) -> None:
     (tmp_path / "there").touch()
     (tmp_path / "left.partial").touch()

@@ -108,6 +108,7 @@ def test_a_person_who_says_so_makes_the_arm_usable(config: ArmConfig, behind: Lo
     np.testing.assert_allclose(found.seen.position, HOME, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_zeroed_arm_passes_its_preflight_and_is_moved(config: ArmConfig, behind: LockStepArm, state: Path) -> None:
     take_home(config, state, sure)
     ticket = checked(config)
@@ -116,6 +117,7 @@ def test_a_zeroed_arm_passes_its_preflight_and_is_moved(config: ArmConfig, behin
         np.testing.assert_allclose(arm.exchange(None).position, behind.emulator.body.plant.position, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_ticket_dies_with_the_zero_that_it_was_made_for(config: ArmConfig, behind: LockStepArm, state: Path) -> None:
     assert not take_home(config, state, sure).ticket_removed
     ticket = checked(config)
@@ -129,6 +131,7 @@ def test_a_ticket_dies_with_the_zero_that_it_was_made_for(config: ArmConfig, beh
     assert any("others than those that were checked" in reason for reason in why), why
 
 
+@pytest.mark.slow
 def test_no_ticket_outlives_a_zeroing_that_is_cut_short(
     config: ArmConfig, behind: LockStepArm, state: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

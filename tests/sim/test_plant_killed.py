@@ -52,6 +52,7 @@ def killed_story(tmp_path, delay, **driver):
     return config, status
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["virtual", "real"])
 def test_the_plant_outlives_its_killed_client_until_it_rests(tmp_path, mode):
     killed(tmp_path, 0.1, time=mode)
@@ -73,6 +74,7 @@ def test_the_wam_with_its_client_killed_at_most_creeps(tmp_path, mode):
     assert (np.abs(status.velocity) <= 0.05 * limits(config)[0]).all()
 
 
+@pytest.mark.slow
 def test_a_client_that_hangs_loses_the_drives_in_real_time(tmp_path):
     path = tmp_path / "status"
     client = Client(remote_config(status=str(path), watchdog=WATCHDOG, time="real"))
@@ -117,6 +119,7 @@ def swing(arm):
         arm.exchange(np.zeros(2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["virtual", "real"])
 def test_a_killed_plant_is_noticed_within_the_deadline(mode):
     arm = from_config(remote_config(time=mode, deadline=5.0))
@@ -138,6 +141,7 @@ def test_a_killed_plant_is_noticed_within_the_deadline(mode):
     arm.end_plant()
 
 
+@pytest.mark.slow
 def test_a_plant_that_hangs_is_noticed_at_the_deadline():
     arm = from_config(remote_config(deadline=0.3))
     arm.open()

@@ -111,6 +111,7 @@ def fault(kind, at=40):
     return Fault(at, kind, joint, 30, SIZES.get(kind, 0.0), offset)
 
 
+@pytest.mark.slow
 def test_faults_in_turn_are_those_of_a_plant_in_this_process_bit_for_bit():
     last = (FaultKind.NODE_SILENT, FaultKind.DRIVE_FAULT, FaultKind.EMERGENCY_STOP)
     kinds = sorted(FaultKind, key=lambda kind: kind in last)
@@ -123,6 +124,7 @@ def test_each_fault_is_that_of_a_plant_in_this_process_bit_for_bit(kind):
     the_same_here_and_there(fault(kind))
 
 
+@pytest.mark.slow
 def test_faults_from_the_configuration_reach_the_plant():
     config = remote_config(faults=({"kind": "drive_fault", "joint": "elbow", "cycle": 3},))
     arm = from_config(config)
@@ -166,6 +168,7 @@ def second(config):
     ).stdout.strip()
 
 
+@pytest.mark.slow
 def test_a_second_client_is_refused_for_as_long_as_the_first_one_has_the_arm():
     config = remote_config(bus=f"test-{os.getpid()}")
     first = from_config(config)
@@ -316,6 +319,7 @@ def remote():
     arm.end_plant()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "bad",
     [b"\0", wire.encode(wire.Hello(bytes(32)), 1, 2), wire.encode(wire.Exchange(0, 1, np.array([np.nan, 0.0])), 1, 2)],
