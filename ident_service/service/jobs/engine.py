@@ -132,7 +132,8 @@ class Engine:
         Raises:
             UsageError: it names what is not known.
             ConfigError: the arm's description has mistakes.
-            MotionRefused: the service is ending, or somebody has asked for a stop meanwhile.
+            MotionRefused: the service is ending, or somebody has asked for a stop meanwhile; or it may not wait, and
+                would have to.
         """
         order = command(self.db, self.state, asked)
         if self.closing:
@@ -142,6 +143,8 @@ class Engine:
         with self._lock, self.db.transaction():
             if stops is not None and stops != self.stops(order.arm):
                 raise MotionRefused("somebody asked for a stop meanwhile; nothing more is begun")
+            if not order.waits and (before := self._before(order)):
+                raise MotionRefused(f"{order.arm}: {before} has it or waits for it; ask again when that has ended")
             row = rows.add_job(
                 *(self.db, job, asked.kind, order.arm, asked.model_dump(mode="json"), list(order.words), by),
                 motion=order.moves,
@@ -284,6 +287,11 @@ class Engine:
             elif (earlier or other.child is not None) and needed & set(other.order.resources):
                 return False
         return True
+
+    def _before(self, order: Command) -> str:
+        """Which job has, or waits for, what this one needs; empty if none."""
+        needed = set(order.resources)
+        return next((job for job, live in self._live.items() if needed & set(live.order.resources)), "")
 
     def _begin(self, live: _Live) -> None:
         folder = self.state / JOBS / live.job
