@@ -99,14 +99,8 @@ def test_what_would_be_lost_is_refused(words: list[str], state: Path, capsys: py
 @pytest.mark.parametrize("path", ["/etc/passwd", "../runs/x", "runs/x", ".hidden", "a b", ""])
 def test_no_run_is_a_path(path: str, state: Path, capsys: pytest.CaptureFixture[str]) -> None:
     server = ["--server", "http://127.0.0.1:1", "--state", str(state)]
-    for words in (
-        ["report"],
-        ["export"],
-        ["verify"],
-        ["feasible"],
-        ["accept", "--note", "n"],
-        ["figures", "--out", "x"],
-    ):
+    more = {"accept": ["--note", "n"], "figures": ["--out", "x"]}
+    for verb in ("report", "export", "verify", "feasible", "accept", "figures"):
         assert main([verb, path or ".", *more.get(verb, []), *server]) == 2
         assert "named by id" in capsys.readouterr().err
 
@@ -192,8 +186,12 @@ def test_verbs_are_done_by_a_daemon(
 
         assert done("verify", RUN)["answer"]["verdict"] == "feasible"
         assert done("feasible", RUN, "--arm", "quick")["answer"]["feasible"] is True
-        done("correct", RUN, "--metric", "covariance", "--out", tmp_path / "near.json")
-        assert json.loads((tmp_path / "near.json").read_text())["method"] == "correction"
+        singular = done("correct", RUN, "--metric", "covariance", "--out", tmp_path / "none.json", code=1)
+        assert "singular" in singular["job"]["detail"]  # the metric was told
+        assert not (tmp_path / "none.json").exists()
+        done("correct", RUN, "--feasible-set", "inertia", "--out", tmp_path / "near.json")
+        corrected = json.loads((tmp_path / "near.json").read_text())
+        assert (corrected["method"], corrected["feasible_set"]) == ("correction", "inertia")
         assert done("compare", RUN, other)["answer"]["verdict"] == "unchanged"
         done("compare", RUN, other, RUN, code=2)
         assert done("payload", RUN, f"{RUN}/validation.mcap", "--out", tmp_path / "load", code=3)["export"]

@@ -299,7 +299,8 @@ class Engine:
             self._live.pop(live.job, None)
             return
         try:
-            if live.order.moves and self._door is not None:
+            # Where the motions' unit is, the bus is there, too.
+            if live.order.resources and self._door is not None:
                 live.child = UnitChild(live.order.words, folder, self._door)
             else:
                 live.child = OwnChild(live.order.words, folder)
