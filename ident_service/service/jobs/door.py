@@ -1,8 +1,8 @@
 """What a motion's own unit runs: takes one request from its socket and becomes the command that was asked for.
 
 The socket is standard input, and stays it: its end stops the arm. Only verbs that move an arm under a lease are taken,
-and those that look at it or its bus without a torque, because the bus is here. The service is believed no more than that:
-it can ask for nothing here but looks, and motions, which preflight and guard judge.
+and those that look at it or its bus without a torque, because the bus is here. The service is believed no more than
+that: it can ask for nothing here but looks, and motions, which preflight and guard judge.
 """
 
 from __future__ import annotations
