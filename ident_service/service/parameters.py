@@ -22,7 +22,6 @@ from ident_service.estimation.feasible.feasibility import (
 from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
 from ident_service.estimation.proof.certificate import certify
 from ident_service.model.arm_model import arm_model
-from ident_service.record.files import require_writable
 from ident_service.results.parameter_file import ParameterFile, read_parameters, write_parameters
 
 
@@ -71,7 +70,7 @@ def correct_file(
 
     Args:
         path: the file.
-        out: where the corrected one goes; its folder is made.
+        out: where the corrected one goes.
         kind: feasible set; the file's own when None, or else `pseudo_inertia`.
         arm: a description whose physical constraints are added.
         metric: what nearest means: the paper's, in the units of the parameters, or that of the file's covariance, which
@@ -82,7 +81,6 @@ def correct_file(
         SolverError: the solver stopped without an optimum.
     """
     file, conditions = _read(path, kind, arm)
-    require_writable(out.parent)
     result = feasibility_correction(
         file.values, file.base, conditions, _covariance(path, file) if metric == "covariance" else None
     )

@@ -44,6 +44,9 @@ def test_what_is_made_of_a_run_is_listed_and_fetched(daemon: Asked, state: Path,
     corrected = json.loads(content.content)
     assert corrected["method"] == "correction"
     assert corrected["base_parameters"]["values"] == said["values"]
+    ended, _ = answered(daemon, {"kind": "correct", "run": run, "metric": "covariance"})
+    assert ended["state"] == "failed"  # the covariance of this run is singular
+    assert [path.name for path in (state / "exports").iterdir()] == [export["id"]]
 
     ended, said = answered(daemon, {"kind": "figures", "run": run})
     assert ended["state"] == "done", ended

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 from ident_service.results.manifest import MANIFEST, write_manifest
-from ident_service.service.jobs.commands import FOLDERS
+from ident_service.service.jobs.commands import EXPORTS, FOLDERS
 from ident_service.service.registry.database import Database, Row
 from ident_service.service.registry.motions import MOTION_FILE, MOTIONS, index_motion
 from ident_service.service.registry.runs import RUNS, index_run
@@ -37,6 +38,9 @@ def keep(db: Database, state: Path, row: Row, by: str) -> None:
         index_run(db, state, made)
     elif row["kind"] == "design" and (state / MOTIONS / made / MOTION_FILE).is_file():
         index_motion(db, state, made, row["arm"], by)
+    elif row["kind"] == "correct":
+        with suppress(OSError):  # there is a file in it, or it is gone
+            (state / EXPORTS / made).rmdir()
 
 
 def folder_of(state: Path, row: Row) -> Path | None:
