@@ -215,6 +215,31 @@ def test_verbs_are_done_by_a_daemon(
         assert "base_parameters:\n  expressions: " in said
 
 
+@pytest.mark.parametrize(("said", "why"), [(b"stop\n", "a stop was asked for"), (b"", "is gone"), (None, "")])
+def test_a_zeroing_that_nobody_asks_for_any_more_is_not_done(
+    said: bytes | None,
+    why: str,
+    state: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    body = on_a_bus()
+    (tmp_path / "arm.yaml").write_text(body["description"])
+    (tmp_path / "puck.eds").write_text(body["files"]["puck.eds"])
+    words = ["home", str(tmp_path / "arm.yaml"), "--zero", "--confirm", ON_A_BUS, "--lease-from-stdin"]
+    reading, writing = os.pipe()
+    os.write(writing, b"\n" if said is None else said)
+    with os.fdopen(reading) as stdin, os.fdopen(writing, "wb") as held:
+        monkeypatch.setattr("sys.stdin", stdin)
+        if said == b"":
+            held.close()
+        assert main([*words, "--state", str(state)]) == (0 if said is None else 3)
+    heard = capsys.readouterr()
+    assert why in heard.err
+    assert ("zeroed, until its drives lose their power" in heard.out) == (said is None)
+
+
 class Hands:
     """The space bar of a terminal, held until it is let go."""
 
