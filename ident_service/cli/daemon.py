@@ -6,8 +6,10 @@ Boundary: words to calls, results to words; the work is `service/api` and `servi
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from ident_service.cli.answer import DONE, Answer, print_to_person, state_folder
 from ident_service.cli.words import Verbs
@@ -77,11 +79,17 @@ def _list(arguments: argparse.Namespace) -> Answer:
 
     with Database(state_folder(arguments)) as db:
         rows = tokens(db)
-    lines = []
-    for row in rows:
-        since = datetime.fromtimestamp(row["created"], UTC).strftime("%Y-%m-%d")
-        lines.append(f"{row['name']:<24} {row['role']:<9} since {since}{', revoked' if row['revoked'] else ''}\n")
-    return DONE, "".join(lines) or "no tokens yet; `ident serve` makes the first\n", {"tokens": [dict(r) for r in rows]}
+    return (
+        DONE,
+        "".join(map(token_line, rows)) or "no tokens yet; `ident serve` makes the first\n",
+        {"tokens": [dict(r) for r in rows]},
+    )
+
+
+def token_line(row: Mapping[str, Any]) -> str:
+    """A token in the list."""
+    since = datetime.fromtimestamp(row["created"], UTC).strftime("%Y-%m-%d")
+    return f"{row['name']:<24} {row['role']:<9} since {since}{', revoked' if row['revoked'] else ''}\n"
 
 
 def _revoke(arguments: argparse.Namespace) -> Answer:

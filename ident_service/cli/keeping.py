@@ -8,8 +8,10 @@ from __future__ import annotations
 import argparse
 import os
 import pwd
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from ident_service.cli.answer import DONE, Answer, state_folder
 from ident_service.cli.words import Parser, Verbs, count
@@ -118,18 +120,18 @@ def _prune(arguments: argparse.Namespace) -> Answer:
             if arguments.yes
             else expendable(db, state, arguments.keep)
         )
-    size = sum(one.bytes for one in gone)
-    verb = "deleted" if arguments.yes else "would be deleted; say --yes"
-    text = "".join(f"{one.run}/{one.name}  {one.bytes / 2**20:.1f} MiB\n" for one in gone)
-    text += "".join(f"left alone: {line}\n" for line in untold)
-    text += f"{len(gone)} recordings, {size / 2**20:.1f} MiB, {verb}\n"
-    return (
-        DONE,
-        text,
-        {
-            "deleted": arguments.yes,
-            "bytes": size,
-            "recordings": [asdict(one) for one in gone],
-            "left_alone": untold,
-        },
-    )
+    document = {
+        "deleted": arguments.yes,
+        "bytes": sum(one.bytes for one in gone),
+        "recordings": [asdict(one) for one in gone],
+        "left_alone": untold,
+    }
+    return DONE, pruned_text(document), document
+
+
+def pruned_text(document: Mapping[str, Any]) -> str:
+    """What `prune` did, or would do."""
+    gone, verb = document["recordings"], "deleted" if document["deleted"] else "would be deleted; say --yes"
+    text = "".join(f"{one['run']}/{one['name']}  {one['bytes'] / 2**20:.1f} MiB\n" for one in gone)
+    text += "".join(f"left alone: {line}\n" for line in document["left_alone"])
+    return f"{text}{len(gone)} recordings, {document['bytes'] / 2**20:.1f} MiB, {verb}\n"

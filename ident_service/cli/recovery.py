@@ -16,7 +16,7 @@ from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, sta
 from ident_service.cli.lease import add_lease, asked_lease, until
 from ident_service.cli.moving import add_can_log, moved
 from ident_service.cli.words import Verbs
-from ident_service.errors import UsageError
+from ident_service.errors import MotionRefused, UsageError
 
 if TYPE_CHECKING:
     from ident_service.config.schema import ArmConfig
@@ -66,12 +66,14 @@ def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
     from ident_service.config.canopen import CanopenDriver
     from ident_service.service.zeroing import home_posture, take_home
 
-    posture = home_posture(config)
+    posture, lease = home_posture(config), asked_lease(arguments, config)
     tell(arguments, f"{config.name}: nothing will move. From now on the arm stands, by what you say, in this posture:")
     for joint in posture:
         tell(arguments, f"  {joint}")
 
     def confirm(question: str) -> str:
+        if lease is not None and lease.over():
+            raise MotionRefused(f"{config.name}: not zeroed: {lease.reason}; nothing has changed")
         if arguments.confirm is not None:
             return str(arguments.confirm)
         return input(f"{question} ") if sys.stdin.isatty() and not arguments.json else ""

@@ -22,10 +22,11 @@ if TYPE_CHECKING:
     from ident_service.service.client import Client
 
 Verb = Callable[["Client", argparse.Namespace], Answer]
+Ended = Callable[["Client", argparse.Namespace, Answer], Answer]
 _LOOK = 0.4  # s between looks at a job, and between renewals of its lease
 _CODES = {"done": DONE, "refused": VERDICT_NO, "faulted": FAULTED}
-_LIVE = ("queued", "running")
-_MOVE = ("check", "run", "home")
+LIVE = ("queued", "running")
+_MOVE = ("check", "run", "home", "leave_limit", "zero")  # a rehearsal has its own way, `remote_watching.py`
 
 
 def add(verbs: Verbs) -> None:
@@ -49,17 +50,28 @@ def remotely(arguments: argparse.Namespace) -> Answer:
         UsageError: a verb that no daemon does.
         IdentError: as the daemon says.
     """
-    from ident_service.cli.remote_maintenance import CARRIED, VERBS
-
-    verbs, carried = REMOTE | VERBS, _CARRIED | CARRIED
+    verbs, carried = table()
     verb = verbs.get(arguments.word)
     if verb is None:
-        raise UsageError(f"{arguments.word}: no daemon does this; --server is for {', '.join(sorted(verbs))}")
+        why = LOCAL_ONLY.get(arguments.word, "no daemon does this")
+        raise UsageError(f"{arguments.word}: {why}; --server is for {', '.join(sorted(verbs))}")
     given = {name for name, value in vars(arguments).items() if value != arguments.words.get_default(name)}
     if lost := sorted(given - carried[arguments.word] - _OURS):
         options = ", ".join(f"--{name.replace('_', '-')}" for name in lost)
         raise UsageError(f"{arguments.word} --server: {options} would be lost; a daemon is not told of it")
     return _with_client(verb)(arguments)
+
+
+def table() -> tuple[dict[str, Verb], dict[str, frozenset[str]]]:
+    """Every verb that a daemon does, and what of it a daemon is told."""
+    from ident_service.cli import remote_maintenance, remote_results, remote_watching
+
+    groups = (remote_maintenance, remote_results, remote_watching)
+    verbs, carried = dict(REMOTE), dict(_CARRIED)
+    for group in groups:
+        verbs |= group.VERBS
+        carried |= group.CARRIED
+    return verbs, carried
 
 
 def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
@@ -72,17 +84,28 @@ def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
     return connected
 
 
-def _asked(make: Callable[[Client, argparse.Namespace], dict[str, Any]]) -> Verb:
-    """A verb that is a job."""
+def as_it_is(_: Client, __: argparse.Namespace, answer: Answer) -> Answer:
+    """What most verbs do with the answer of their job."""
+    return answer
+
+
+def asked(make: Callable[[Client, argparse.Namespace], dict[str, Any]], ended: Ended = as_it_is) -> Verb:
+    """A verb that is a job.
+
+    Args:
+        make: the job of the words; its kind is the verb if it does not say another.
+        ended: what becomes of the answer.
+    """
 
     def verb(client: Client, arguments: argparse.Namespace) -> Answer:
         job = {key: value for key, value in make(client, arguments).items() if value is not None}
-        body: dict[str, Any] = {"job": {**job, "kind": arguments.word}}
-        if arguments.word in _MOVE:
+        body: dict[str, Any] = {"job": {"kind": arguments.word, **job}}
+        moves = body["job"]["kind"] in _MOVE
+        if moves:
             body["confirm"] = confirmation(client, arguments)
         made = client.post("/api/v1/jobs", body)
         tell(arguments, f"job {made['id']}")
-        return _followed(client, arguments, made, moves=arguments.word in _MOVE)
+        return ended(client, arguments, _followed(client, arguments, made, moves=moves))
 
     return verb
 
@@ -100,8 +123,8 @@ def _simulate(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
 def _identify(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
     return {
         "arm": arguments.arm,
-        "recordings": [_recording(path) for path in arguments.recordings],
-        "validate_on": [_recording(path) for path in arguments.validate],
+        "recordings": [recording(path) for path in arguments.recordings],
+        "validate_on": [recording(path) for path in arguments.validate],
         "method": arguments.method,
         "feasible_set": arguments.feasible_set,
         "prior": arguments.prior,
@@ -118,7 +141,7 @@ def _design(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
         "criterion": arguments.criterion,
         "parameters": arguments.chosen,
         "motion": arguments.motion,
-        "after": [_recording(path) for path in arguments.after],
+        "after": [recording(path) for path in arguments.after],
     }
 
 
@@ -135,8 +158,16 @@ def _run(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def _home(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
-    return {"arm": arguments.arm}
+def _home(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+    if not arguments.zero:
+        return {"arm": arguments.arm}
+    posture = client.get(f"/api/v1/arms/{word_of_address(arguments.arm)}/home")
+    tell(
+        arguments, f"{arguments.arm}: nothing will move. From now on the arm stands, by what you say, in this posture:"
+    )
+    for joint in posture:
+        tell(arguments, f"  {joint['joint']} at {joint['position']:g} {joint['unit']}")
+    return {"kind": "zero", "arm": arguments.arm}
 
 
 def _ask(client: Client, arguments: argparse.Namespace) -> Answer:
@@ -159,7 +190,7 @@ def _list(client: Client, arguments: argparse.Namespace) -> Answer:
 
 
 def _show(client: Client, arguments: argparse.Namespace) -> Answer:
-    return _told(client, client.get(f"/api/v1/jobs/{word_of_address(arguments.job)}"), DONE)
+    return told(client, client.get(f"/api/v1/jobs/{word_of_address(arguments.job)}"), DONE)
 
 
 def _watch(client: Client, arguments: argparse.Namespace) -> Answer:
@@ -169,16 +200,16 @@ def _watch(client: Client, arguments: argparse.Namespace) -> Answer:
 
 
 def _cancel(client: Client, arguments: argparse.Namespace) -> Answer:
-    return _told(client, client.post(f"/api/v1/jobs/{word_of_address(arguments.job)}/cancel"), DONE)
+    return told(client, client.post(f"/api/v1/jobs/{word_of_address(arguments.job)}/cancel"), DONE)
 
 
 REMOTE: dict[str, Verb] = {
-    "simulate": _asked(_simulate),
-    "identify": _asked(_identify),
-    "design": _asked(_design),
-    "check": _asked(_check),
-    "run": _asked(_run),
-    "home": _asked(_home),
+    "simulate": asked(_simulate),
+    "identify": asked(_identify),
+    "design": asked(_design),
+    "check": asked(_check),
+    "run": asked(_run),
+    "home": asked(_home),
     **dict.fromkeys(("stop", "pause", "resume"), _ask),
     "ack": _ack,
     "jobs list": _list,
@@ -187,6 +218,15 @@ REMOTE: dict[str, Verb] = {
     "jobs cancel": _cancel,
 }
 
+
+LOCAL_ONLY: dict[str, str] = {
+    "serve": "it is the daemon",
+    "emulate": "it is drives on a bus of this machine, until they are switched off",
+    "import": "a run with its recordings is larger than a request may be; copy its folder to the daemon's machine",
+    "token add": "whoever got hold of an operator's token could make others that outlive it; "
+    "it is an act at the daemon's state folder",
+}
+"""Verbs that no daemon does, each with the reason."""
 
 # What of each verb a daemon is told; anything else that is given must not be lost in silence.
 _OURS = frozenset({"json", "state", "server", "verb", "word", "words", "asks", "asked_ns"})
@@ -197,7 +237,7 @@ _CARRIED: dict[str, frozenset[str]] = {
     "design": frozenset({"arm", "seconds", "starts", "seed", "criterion", "chosen", "motion", "after"}),
     "check": _MOTION | {"home"},
     "run": _MOTION | {"speed"},
-    "home": _MOTION,
+    "home": frozenset({"arm", "confirm", "zero"}),
     **dict.fromkeys(("stop", "pause", "resume"), frozenset({"arm"})),
     "ack": frozenset({"arm", "fault"}),
     "jobs list": frozenset({"most"}),
@@ -211,25 +251,25 @@ def _followed(
     """Wait for the end of a job, its lease renewed meanwhile; Ctrl-C has it end, if it is ours."""
     stopping, cancelled, phase = StopOnSignal(), False, ""
     with stopping:
-        while job["state"] in _LIVE:
+        while job["state"] in LIVE:
             if stopping.requested() and not cancelled:
                 cancelled = True
                 if not ours:
                     break
                 client.post(f"/api/v1/jobs/{job['id']}/cancel")
             elif moves and not cancelled:
-                _renew(client, job["id"])
+                renew(client, job["id"])
             time.sleep(_LOOK)
             job = client.get(f"/api/v1/jobs/{job['id']}")
             said = (job["progress"] or {}).get("phase", job["state"])
             if said != phase:
                 phase = said
                 tell(arguments, phase)
-    return _told(client, job, _CODES.get(job["state"], FAILED))
+    return told(client, job)
 
 
-def _renew(client: Client, job: str) -> None:
-    """A lease that cannot be renewed any more is that of a motion that ends, which the next look tells."""
+def renew(client: Client, job: str) -> None:
+    """Renew it. A lease that cannot be renewed any more is that of a motion that ends, which the next look tells."""
     try:
         client.post(f"/api/v1/jobs/{job}/lease")
     except IdentError as error:
@@ -237,21 +277,34 @@ def _renew(client: Client, job: str) -> None:
             raise
 
 
-def _told(client: Client, job: dict[str, Any], code: int) -> Answer:
+def told(client: Client, job: dict[str, Any], code: int | None = None) -> Answer:
+    """How a job stands and what its command answered; the exit code is that of its state unless one is given."""
     result = client.get(f"/api/v1/jobs/{job['id']}/result")["answer"]
     lines = [f"job {job['id']}: {job['kind']}, {job['state']}"]
     lines += [job["detail"]] if job["detail"] else []
     lines += [f"run {job['run']}"] if job["run"] else []
+    code = _CODES.get(job["state"], FAILED) if code is None else code
     return code, "\n".join([*lines, ""]), {"job": job, "answer": result}
 
 
-def confirmation(client: Client, arguments: argparse.Namespace) -> dict[str, str]:
-    """The arm's name as a person types it, now or as `--confirm`, and a challenge for it."""
+def typed(arguments: argparse.Namespace) -> str:
+    """The arm's name as a person types it, now or as `--confirm`.
+
+    Raises:
+        UsageError: another word, or nobody to ask.
+    """
     name = arguments.confirm
     if name is None and sys.stdin.isatty() and not arguments.json:
-        name = input(f"{arguments.arm} will move where you may not see it. Type its name to confirm: ").strip()
+        what = "is zeroed" if getattr(arguments, "zero", False) else "will move"
+        name = input(f"{arguments.arm} {what} where you may not see it. Type its name to confirm: ").strip()
     if name != arguments.arm:
         raise UsageError(f"a motion is confirmed by the arm's name, typed: --confirm {arguments.arm}")
+    return str(name)
+
+
+def confirmation(client: Client, arguments: argparse.Namespace, name: str | None = None) -> dict[str, str]:
+    """The arm's name as a person types it, or has typed it already, and a challenge for it."""
+    name = typed(arguments) if name is None else name
     word = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/challenge")["challenge"]
     return {"name": name, "challenge": word}
 
@@ -266,7 +319,7 @@ def motion_id(client: Client, arm: str, motion: Path | None) -> str | None:
     return str(motion)
 
 
-def _recording(path: Path) -> dict[str, str]:
+def recording(path: Path) -> dict[str, str]:
     """`RUN` or `RUN/NAME`, both as the daemon calls them."""
     run, _, name = str(path).partition("/")
     return {"run": run, **({"name": name} if name else {})}

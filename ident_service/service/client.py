@@ -68,12 +68,33 @@ class Client:
         """Have something done."""
         return self.ask("POST", path, {} if body is None else body)
 
+    def content(self, path: str) -> bytes:
+        """A file that stands at a path.
+
+        Raises:
+            IdentError: as `ask`; or it is larger than what is taken.
+        """
+        status, content = self._exchange("GET", path, None)
+        if status >= 400:
+            raise _error(self._url, status, self._document(status, content))
+        if len(content) >= _MOST:
+            raise ArmError(f"{self._url}{path}: has {_MOST} bytes or more; fetch it by other means")
+        return content
+
     def ask(self, method: str, path: str, body: Any = None) -> Any:
         """One request; its answer as JSON values.
 
         Raises:
             IdentError: the daemon refused, with its own error; or it cannot be reached.
         """
+        status, content = self._exchange(method, path, body)
+        document = self._document(status, content)
+        if status >= 400:
+            raise _error(self._url, status, document)
+        return document
+
+    def _exchange(self, method: str, path: str, body: Any) -> tuple[int, bytes]:
+        """Status and body of an answer, of which `_MOST` bytes are read."""
         content = None if body is None else json.dumps(body).encode()
         headers = self._headers if content is None else {**self._headers, "Content-Type": "application/json"}
         # A connection that lay idle may have been closed meanwhile: what only reads is asked again.
@@ -87,13 +108,13 @@ class Client:
                 self._connection.close()
                 if last or isinstance(error, socket.gaierror | ssl.SSLError):
                     raise ArmError(f"{self._url}: cannot be reached: {error or type(error).__name__}") from None
+        return status, text
+
+    def _document(self, status: int, content: bytes) -> Any:
         try:
-            document = json.loads(text) if text else None
+            return json.loads(content) if content else None
         except ValueError:
             raise ArmError(f"{self._url}: answered {status} with what is not JSON; is it the daemon?") from None
-        if status >= 400:
-            raise _error(self._url, status, document)
-        return document
 
     def close(self) -> None:
         """End the connection."""

@@ -66,10 +66,10 @@ def test_where_nothing_moves_there_is_no_lease(ident: Ident) -> None:
 
 
 def test_no_daemon_does_what_is_the_terminals(ident: Ident) -> None:
-    ended = ident("accept", "run", "--note", "x", "--server", "http://127.0.0.1:1")
+    ended = ident("import", "run", "--server", "http://127.0.0.1:1")
     assert ended.code == 2
-    assert "no daemon does this" in ended.err
-    for words in (("run", "planar2", "--can-log"), ("home", "planar2", "--zero"), ("simulate", "--out", "x")):
+    assert "larger than a request may be" in ended.err
+    for words in (("run", "planar2", "--can-log"), ("home", "planar2", "--can-log"), ("simulate", "--out", "x")):
         ended = ident(*words, "--server", "http://127.0.0.1:1")
         assert (ended.code, f"{words[-1] if words[-1] != 'x' else '--out'} would be lost" in ended.err) == (2, True)
     ended = ident("jobs", "list")

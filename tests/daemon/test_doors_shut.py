@@ -22,7 +22,17 @@ from ident_service.service.registry.tokens import add_token, revoke_token
 
 OPEN = {("GET", "/healthz"), ("POST", "/api/v1/login"), ("POST", "/api/v1/logout")}
 STOPS = {("POST", "/api/v1/stop"), ("POST", "/api/v1/arms/{arm}/stop")}
-FILLED = {"arm": "planar2", "job": "j", "run": "r", "motion": "m", "name": "n", "code": "c", "number": 1}
+FILLED = {
+    "arm": "planar2",
+    "job": "j",
+    "run": "r",
+    "motion": "m",
+    "name": "n",
+    "code": "c",
+    "number": 1,
+    "export": "e",
+    "token": "t",
+}
 MOTION = {"kind": "run", "arm": "planar2"}
 FAR = "203.0.113.9"
 
@@ -74,6 +84,8 @@ def test_a_viewer_changes_nothing(daemon: Asked, viewer: str) -> None:
         "/api/v1/due/{number}/dismiss": {"note": "n"},
         "/api/v1/reidentifications": {"arm": "planar2"},
         "/api/v1/alarms/{number}/ack": {"note": "n"},
+        "/api/v1/descriptions/check": {"description": "x"},
+        "/api/v1/recordings/prune": {"keep": 1},
     }
     tried = 0
     for method, path in routes(daemon):
@@ -164,7 +176,15 @@ def test_the_throttle_counts_addresses_and_all_of_them() -> None:
     throttle.require("10.0.1.1")
 
 
-@pytest.mark.parametrize(("path", "most"), [("/api/v1/jobs", MOST_BODY), ("/api/v1/arms", MOST_UPLOAD)])
+@pytest.mark.parametrize(
+    ("path", "most"),
+    [
+        ("/api/v1/jobs", MOST_BODY),
+        ("/api/v1/recordings/prune", MOST_BODY),
+        ("/api/v1/arms", MOST_UPLOAD),
+        ("/api/v1/descriptions/check", MOST_UPLOAD),
+    ],
+)
 def test_a_body_is_counted_as_it_comes(daemon: Asked, path: str, most: int) -> None:
     def pieces() -> object:
         sent = 0
@@ -187,23 +207,32 @@ def test_a_body_is_counted_as_it_comes(daemon: Asked, path: str, most: int) -> N
     ["..", "../token", "..%2f..%2ftoken", "%2e%2e%2ftoken", "/etc/passwd", "a/b", "a\\..\\b", ".hid", "a%00b"],
 )
 def test_no_id_is_a_path(daemon: Asked, word: str) -> None:
-    for place in ("runs/{}", "runs/{}/files/arm.json", "runs/x/files/{}", "jobs/{}/log", "motions/{}", "arms/{}"):
+    places = ("runs/{}", "runs/{}/files/arm.json", "runs/x/files/{}", "jobs/{}/log", "motions/{}", "arms/{}")
+    for place in (*places, "exports/{}", "exports/{}/files/n", "exports/x/files/{}", "arms/{}/home"):
         answer = daemon.get("/api/v1/" + place.format(word))
         assert answer.status_code in (404, 422), (place, answer.text)
         assert "ident_" not in answer.text.replace("ident_session", "")
-    for job in ({"kind": "report", "run": word}, {"kind": "identify", "arm": "planar2", "recordings": [{"run": word}]}):
+    jobs: list[dict[str, object]] = [
+        *({"kind": kind, "run": word} for kind in ("report", "feasible", "correct", "figures", "verify")),
+        *({"kind": kind, "arm": word} for kind in ("bus_load", "bus_scan", "config_check")),
+        {"kind": "identify", "arm": "planar2", "recordings": [{"run": word}]},
+        {"kind": "payload", "run": "r", "recordings": [{"run": "r", "name": word}]},
+        {"kind": "feasible", "run": "r", "arm": word},
+    ]
+    for job in jobs:
         assert daemon.post("/api/v1/jobs", {"job": job}).status_code in (404, 422)
 
 
 @pytest.mark.parametrize("reach", ["/etc/passwd", "../../token", "../../registry.sqlite", "../../../outside.urdf"])
-def test_an_upload_leads_nowhere(daemon: Asked, state: Path, reach: str) -> None:
+@pytest.mark.parametrize("door", ["arms", "descriptions/check"])
+def test_an_upload_leads_nowhere(daemon: Asked, state: Path, reach: str, door: str) -> None:
     (state.parent / "outside.urdf").write_text("<robot name='outside'/>")
     for text in (
         f"format: ident-arm\nversion: 1\nname: spy\nkinematics: {{urdf: {reach}}}\n",
         f"extends: {reach}\nname: spy\n",
         f"format: ident-arm\nversion: 1\nname: spy\nkinematics: {{urdf: own.urdf}}\nprior: {reach}\n",
     ):
-        answer = daemon.post("/api/v1/arms", {"description": text, "files": {"own.urdf": "<robot name='x'/>"}})
+        answer = daemon.post(f"/api/v1/{door}", {"description": text, "files": {"own.urdf": "<robot name='x'/>"}})
         refusal(answer, 422, "leads out of the upload|extends a shipped arm|extends: an uploaded")
         assert "root:" not in answer.text
         assert str(state) not in answer.text
@@ -220,7 +249,7 @@ def test_a_motion_needs_the_typed_name_and_a_fresh_challenge(daemon: Asked, view
     def asked(confirm: object) -> httpx.Response:
         return daemon.post("/api/v1/jobs", {"job": MOTION, "confirm": confirm})
 
-    for kind in ("check", "rehearse", "run", "home"):
+    for kind in ("check", "rehearse", "run", "home", "leave_limit", "zero"):
         refusal(daemon.post("/api/v1/jobs", {"job": {"kind": kind, "arm": "planar2"}}), 409, "challenge")
     refusal(asked({"name": "planar2", "challenge": ""}), 409)
     refusal(asked({"name": "planar2", "challenge": "made up"}), 409)

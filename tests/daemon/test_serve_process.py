@@ -175,7 +175,18 @@ def door(folder: Path, request: dict[str, Any], more: bytes = b"") -> tuple[int,
 def test_a_unit_of_its_own_does_motions_under_a_lease_and_nothing_else(state: Path, tmp_path: Path) -> None:
     folder = tmp_path / "job"
     folder.mkdir()
-    for words in (["serve"], ["simulate", "planar2", "--json"], ["run", "planar2"], [], ["-c", "x"]):
+    forbidden = [
+        ["serve"],
+        ["simulate", "planar2", "--json"],
+        ["run", "planar2"],
+        [],
+        ["-c", "x"],
+        ["bus", "load", "x"],
+    ]
+    # What looks may not move; argparse would take the beginning of an option for the whole.
+    forbidden += [["bus", "load", "planar2"], ["token", "list"]]
+    forbidden += [["recover", "planar2", option, "--json"] for option in ("--leave-limit", "--leave", "--l", "--out=x")]
+    for words in forbidden:
         code, said = door(folder, {"folder": str(folder), "words": words})
         assert (code, "only motions" in said) == (2, True), words
     assert list(folder.iterdir()) == []
@@ -185,6 +196,12 @@ def test_a_unit_of_its_own_does_motions_under_a_lease_and_nothing_else(state: Pa
     assert json.loads((folder / ANSWER).read_text())["error"]["kind"] == "MotionRefused"
     assert "not checked yet" in (folder / LOG).read_text()
     assert not alive((folder / PROCESS).read_text().strip())
+    # And it looks at the arm, whose bus is here.
+    looks = folder / "looks"
+    looks.mkdir()
+    seen = ["watch", "planar2", "--seconds=0.1", "--json", "--state", str(state)]
+    assert door(looks, {"folder": str(looks), "words": seen})[0] == 0
+    assert json.loads((looks / ANSWER).read_text())["exit_code"] == 0
     # Files that are there already are nobody's to overwrite.
     assert door(folder, {"folder": str(folder), "words": words})[0] == 2
 

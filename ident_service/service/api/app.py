@@ -11,7 +11,7 @@ from fastapi.routing import APIRoute
 
 from ident_service import __version__
 from ident_service.service.acceptance import settle
-from ident_service.service.api import about, arms, jobs, maintenance, runs
+from ident_service.service.api import about, access, arms, descriptions, exports, jobs, maintenance, pruning, runs
 from ident_service.service.api.asking import Service
 from ident_service.service.api.doors import Doors
 from ident_service.service.api.gate import Gate
@@ -28,7 +28,10 @@ from ident_service.service.registry.database import Database
 from ident_service.service.registry.runs import rebuild_runs
 from ident_service.service.registry.tokens import first_token
 
-ROUTERS = (about.router, arms.router, jobs.router, runs.router, maintenance.router, *PAGES)
+ROUTERS = (
+    *(about.router, access.router, arms.router, descriptions.router, jobs.router, runs.router, pruning.router),
+    *(exports.router, maintenance.router, *PAGES),
+)
 """In this order."""
 
 

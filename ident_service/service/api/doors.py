@@ -26,7 +26,7 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 MOST_BODY: Final = 64 * 1024
 MOST_UPLOAD: Final = 16 * 2**20
-UPLOADS: Final = ("/api/v1/arms", "/api/v1/motions")
+UPLOADS: Final = ("/api/v1/arms", "/api/v1/motions", "/api/v1/descriptions/check")
 _SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
 _LOG = logging.getLogger("ident.http")
 _HEADERS: Final = (

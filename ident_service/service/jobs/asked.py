@@ -84,6 +84,13 @@ class Home(Ask):
     arm: ArmName
 
 
+class Zero(Ask):
+    """Take the arm's drives for home where they stand, by a person's word; nothing moves, and it never waits."""
+
+    kind: Literal["zero"]
+    arm: ArmName
+
+
 class LeaveLimit(Ask):
     """Lead an arm that stands outside its position limits back inside, slowly."""
 
@@ -104,6 +111,28 @@ class Watch(Ask):
     kind: Literal["watch"]
     arm: ArmName
     seconds: Annotated[float, Field(gt=0, le=60)] = 2.0
+
+
+class BusLoad(Ask):
+    """What every frame costs on the arm's buses, and whether all of them fit."""
+
+    kind: Literal["bus_load"]
+    arm: ArmName
+    rate: Annotated[float, Field(gt=0, le=1e6)] | None = None
+
+
+class BusScan(Ask):
+    """Who is on the arm's buses; reads only."""
+
+    kind: Literal["bus_scan"]
+    arm: ArmName
+
+
+class ConfigCheck(Ask):
+    """The arm's description: bus budget, and whether its gains are stable."""
+
+    kind: Literal["config_check"]
+    arm: ArmName
 
 
 class Base(Ask):
@@ -167,6 +196,42 @@ class Verify(Ask):
     run: Id
 
 
+class Feasible(Ask):
+    """Whether a real body could have a run's parameters; `arm` adds the conditions of its description."""
+
+    kind: Literal["feasible"]
+    run: Id
+    feasible_set: Literal["pseudo_inertia", "inertia"] | None = None
+    arm: ArmName | None = None
+
+
+class Correct(Ask):
+    """The feasible parameters nearest to a run's, as a file of their own; the run stays as it is."""
+
+    kind: Literal["correct"]
+    run: Id
+    metric: Literal["euclidean", "covariance"] = "euclidean"
+    feasible_set: Literal["pseudo_inertia", "inertia"] | None = None
+    arm: ArmName | None = None
+
+
+class Figures(Ask):
+    """The drawings of a run's report as files."""
+
+    kind: Literal["figures"]
+    run: Id
+    format: Literal["svg", "png"] = "svg"
+
+
+class Payload(Ask):
+    """What the arm of a run carries in recordings of other runs."""
+
+    kind: Literal["payload"]
+    run: Id
+    recordings: Annotated[tuple[RecordingOf, ...], Field(min_length=1, max_length=16)]
+    refit_offsets: bool = False
+
+
 class Compare(Ask):
     """Two runs: what changed, and by how many deviations."""
 
@@ -194,17 +259,25 @@ Asked = Annotated[
     | Rehearse
     | Run
     | Home
+    | Zero
     | LeaveLimit
+    | BusLoad
+    | BusScan
+    | ConfigCheck
     | Identify
     | Simulate
     | Report
     | Export
     | Verify
+    | Feasible
+    | Correct
+    | Figures
+    | Payload
     | Compare
     | Judge,
     Field(discriminator="kind"),
 ]
 """Any of them; `kind` says which."""
 
-MOVES = frozenset({"check", "rehearse", "run", "home", "leave_limit"})
-"""Kinds that may give an arm a torque: they need a lease, and a person's word."""
+MOVES = frozenset({"check", "rehearse", "run", "home", "leave_limit", "zero"})
+"""Kinds that may give an arm a torque, or decide where it believes to stand: they need a lease, and a person's word."""

@@ -14,14 +14,21 @@ from ident_service.service.jobs.asked import (
     MOVES,
     Asked,
     Base,
+    BusLoad,
+    BusScan,
     Check,
     Compare,
+    ConfigCheck,
+    Correct,
     Design,
     Export,
+    Feasible,
+    Figures,
     Home,
     Identify,
     Judge,
     LeaveLimit,
+    Payload,
     Preview,
     RecordingOf,
     Recover,
@@ -31,6 +38,7 @@ from ident_service.service.jobs.asked import (
     Simulate,
     Verify,
     Watch,
+    Zero,
 )
 from ident_service.service.registry.arms import KnownArm, known_arm, resources
 from ident_service.service.registry.database import Database
@@ -38,9 +46,18 @@ from ident_service.service.registry.motions import MOTIONS, motion_path, new_id
 from ident_service.service.registry.runs import RUNS, known_run, run_file, run_folder
 
 JOBS, REPORTS, EXPORTS = "jobs", "reports", "exports"
-_LOOKS = (Check, Watch, Recover, Base, Preview)  # that make no folder
-_VERBS: Final = {"leave_limit": "recover"}
-FOLDERS: Final = {"design": MOTIONS, "export": EXPORTS}
+_LOOKS = (Check, Watch, Recover, Base, Preview, Zero, BusLoad, BusScan, ConfigCheck)  # that make no folder
+_OF_A_RUN = (Report, Export, Verify, Compare, Feasible, Correct, Figures, Payload)
+_VERBS: Final = {
+    "leave_limit": ("recover",),
+    "zero": ("home",),
+    "bus_load": ("bus", "load"),
+    "bus_scan": ("bus", "scan"),
+    "config_check": ("config", "check"),
+}
+TAKEN_AWAY: Final = frozenset({"export", "figures", "payload", "correct"})
+"""Kinds whose files are made for somebody to fetch: a folder of its own below `EXPORTS`."""
+FOLDERS: Final = {"design": MOTIONS, **dict.fromkeys(TAKEN_AWAY, EXPORTS)}
 
 
 @dataclass(frozen=True)
@@ -50,10 +67,11 @@ class Command:
     Attributes:
         words: after `ident`.
         arm: name, None where it is about none.
-        moves: whether an arm may get a torque.
+        moves: whether an arm may get a torque, or another zero.
         run: id of the folder that is made, or that it is about; None for a preflight.
         resources: that it has for itself while it runs; none for one that only computes.
         lease: how long its motion goes on after a renewal [s].
+        waits: whether it may wait for its resources; what a person says of an arm as it stands now may not.
     """
 
     words: tuple[str, ...]
@@ -62,6 +80,7 @@ class Command:
     run: str | None
     resources: tuple[str, ...]
     lease: float
+    waits: bool = True
 
 
 def command(db: Database, state: Path, asked: Asked) -> Command:
@@ -71,13 +90,13 @@ def command(db: Database, state: Path, asked: Asked) -> Command:
         UsageError: it names what is not known.
         ConfigError: the arm's description has mistakes.
     """
-    if isinstance(asked, Report | Export | Verify | Compare):
+    if isinstance(asked, _OF_A_RUN):
         return _about_a_run(db, state, asked)
     if isinstance(asked, Judge):
         return _judgement(db, state, asked)
     arm = known_arm(db, state, asked.arm)
     made = None if isinstance(asked, _LOOKS) else new_id(arm.name)
-    words = [_VERBS.get(asked.kind, asked.kind), *_words(db, state, asked, arm)]
+    words = [*_VERBS.get(asked.kind, (asked.kind,)), *_words(db, state, asked, arm)]
     if made is not None:
         words += ["--out", str(state / FOLDERS.get(asked.kind, RUNS) / made)]
     moves = asked.kind in MOVES
@@ -88,8 +107,9 @@ def command(db: Database, state: Path, asked: Asked) -> Command:
         arm.name,
         moves,
         made,
-        resources(arm.config) if moves or isinstance(asked, Watch | Recover) else (),
+        resources(arm.config) if moves or isinstance(asked, Watch | Recover | BusScan) else (),
         HOLD_TO_RUN_SECONDS if isinstance(asked, Rehearse) else LEASE_SECONDS,
+        waits=not isinstance(asked, Zero),
     )
 
 
@@ -107,8 +127,12 @@ def _words(db: Database, state: Path, asked: Asked, arm: KnownArm) -> list[str]:
     if isinstance(asked, Simulate):
         motion = [] if asked.motion is None else [f"--motion={motion_path(db, state, asked.motion)}"]
         return [path, *motion, *_given({"seed": asked.seed, "feasible-set": asked.feasible_set})]
-    if isinstance(asked, Home | Base | Recover):
+    if isinstance(asked, Home | Base | Recover | BusScan | ConfigCheck):
         return [path]
+    if isinstance(asked, BusLoad):
+        return [path, *_given({"rate": asked.rate})]
+    if isinstance(asked, Zero):
+        return [path, "--zero", "--confirm", arm.name]
     if isinstance(asked, LeaveLimit):
         return [path, "--leave-limit"]
     if isinstance(asked, Watch):
@@ -130,22 +154,35 @@ def _design(db: Database, state: Path, asked: Design) -> list[str]:
     return [*after, *parameters, *_given({**chosen, "motion": asked.motion})]
 
 
-def _about_a_run(db: Database, state: Path, asked: Report | Export | Verify | Compare) -> Command:
+def _about_a_run(
+    db: Database,
+    state: Path,
+    asked: Report | Export | Verify | Compare | Feasible | Correct | Figures | Payload,
+) -> Command:
     folder, arm = run_folder(db, state, asked.run), str(known_run(db, asked.run)["arm"])
+    made = new_id(arm) if asked.kind in TAKEN_AWAY else None
+    place = state / (REPORTS if isinstance(asked, Report) else EXPORTS)
     if isinstance(asked, Verify):
         words = ["verify", str(run_file(db, state, asked.run, PARAMETERS))]
-        return Command((*words, *_always(state)), arm, False, asked.run, (), LEASE_SECONDS)
-    if isinstance(asked, Compare):
+    elif isinstance(asked, Compare):
         words = ["compare", str(folder), str(run_folder(db, state, asked.other))]
-        return Command((*words, *_always(state)), arm, False, asked.run, (), LEASE_SECONDS)
-    if isinstance(asked, Report):
-        made: str | None = None
-        place = state / REPORTS
+    elif isinstance(asked, Feasible | Correct):
+        conditions = None if asked.arm is None else str(known_arm(db, state, asked.arm).path)
+        words = [asked.kind, str(run_file(db, state, asked.run, PARAMETERS))]
+        words += _given({"feasible-set": asked.feasible_set, "arm": conditions})
+        if isinstance(asked, Correct):
+            words += [f"--metric={asked.metric}", "--out", str(place / str(made) / PARAMETERS)]
+    elif isinstance(asked, Report):
         words = ["report", str(folder), "--out", str(place / f"{asked.run}.html")]
+    elif isinstance(asked, Payload):
+        words = ["payload", str(folder), *_recordings(db, state, asked.recordings), "--out", str(place / str(made))]
+        words += ["--refit-offsets"] if asked.refit_offsets else []
     else:
-        made, place = new_id(arm), state / EXPORTS
-        words = ["export", str(folder), "--format", ",".join(asked.formats), "--out", str(place / made)]
-    place.mkdir(parents=True, exist_ok=True)
+        formats = asked.format if isinstance(asked, Figures) else ",".join(asked.formats)
+        words = [asked.kind, str(folder), "--format", formats, "--out", str(place / str(made))]
+    if made is not None or isinstance(asked, Report):
+        # The one command that writes a file, not a folder; `keep` takes away what stays empty.
+        (place / str(made) if isinstance(asked, Correct) else place).mkdir(parents=True, exist_ok=True)
     return Command((*words, *_always(state)), arm, False, made or asked.run, (), LEASE_SECONDS)
 
 

@@ -133,7 +133,8 @@ class Engine:
         Raises:
             UsageError: it names what is not known.
             ConfigError: the arm's description has mistakes.
-            MotionRefused: the service is ending, or somebody has asked for a stop meanwhile.
+            MotionRefused: the service is ending, or somebody has asked for a stop meanwhile; or it may not wait, and
+                would have to.
         """
         order = command(self.db, self.state, asked)
         if self.closing:
@@ -143,6 +144,8 @@ class Engine:
         with self._lock, self.db.transaction():
             if stops is not None and stops != self.stops(order.arm):
                 raise MotionRefused("somebody asked for a stop meanwhile; nothing more is begun")
+            if not order.waits and (before := self._before(order)):
+                raise MotionRefused(f"{order.arm}: {before} has it or waits for it; ask again when that has ended")
             row = rows.add_job(
                 *(self.db, job, asked.kind, order.arm, asked.model_dump(mode="json"), list(order.words), by),
                 motion=order.moves,
@@ -292,13 +295,19 @@ class Engine:
                 return False
         return True
 
+    def _before(self, order: Command) -> str:
+        """Which job has, or waits for, what this one needs; empty if none."""
+        needed = set(order.resources)
+        return next((job for job, live in self._live.items() if needed & set(live.order.resources)), "")
+
     def _begin(self, live: _Live) -> None:
         folder = self.state / JOBS / live.job
         if not rows.started(self.db, live.job, ""):
             self._live.pop(live.job, None)
             return
         try:
-            if live.order.moves and self._door is not None:
+            # Where the motions' unit is, the bus is there, too.
+            if live.order.resources and self._door is not None:
                 live.child = UnitChild(live.order.words, folder, self._door)
             else:
                 live.child = OwnChild(live.order.words, folder)

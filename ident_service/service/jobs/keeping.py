@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 from ident_service.results.manifest import MANIFEST, write_manifest
-from ident_service.service.jobs.commands import EXPORTS
+from ident_service.service.jobs.commands import EXPORTS, FOLDERS
 from ident_service.service.registry.database import Database, Row
 from ident_service.service.registry.motions import MOTION_FILE, MOTIONS, index_motion
 from ident_service.service.registry.runs import RUNS, index_run
 
 _MAKES_A_RUN = frozenset({"run", "rehearse", "home", "leave_limit", "identify", "simulate", "judge"})
+
+_ABOUT_A_RUN = frozenset({"report", "verify", "compare", "judge", "feasible"})
 
 
 def keep(db: Database, state: Path, row: Row, by: str) -> None:
@@ -35,11 +38,13 @@ def keep(db: Database, state: Path, row: Row, by: str) -> None:
         index_run(db, state, made)
     elif row["kind"] == "design" and (state / MOTIONS / made / MOTION_FILE).is_file():
         index_motion(db, state, made, row["arm"], by)
+    elif row["kind"] == "correct":
+        with suppress(OSError):  # there is a file in it, or it is gone
+            (state / EXPORTS / made).rmdir()
 
 
 def folder_of(state: Path, row: Row) -> Path | None:
     """The folder that a job makes, there or not; None for one that makes none."""
-    if row["run"] is None or row["kind"] in ("report", "verify", "compare", "judge"):
+    if row["run"] is None or row["kind"] in _ABOUT_A_RUN:
         return None
-    place = {"design": MOTIONS, "export": EXPORTS}.get(row["kind"], RUNS)
-    return state / place / str(row["run"])
+    return state / FOLDERS.get(row["kind"], RUNS) / str(row["run"])

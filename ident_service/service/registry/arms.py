@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import json
 import re
+import secrets
 import shutil
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -110,6 +112,39 @@ def add_arm(db: Database, state: Path, text: str, files: Mapping[str, str], by: 
         UsageError: too large, or files whose names are none.
         ConfigError: every mistake in it, each with line and column.
     """
+    with uploaded(state, text, files) as path:
+        config = load_arm(path)
+        folder = state / DESCRIPTIONS / f"{config.name}-{config.sha256[:16]}"
+        if not folder.exists():
+            with appearing_folder(folder) as built:
+                for part in path.parent.iterdir():
+                    shutil.copyfile(part, built / part.name)
+    with db.transaction():
+        db.write(
+            "INSERT INTO arms VALUES (?, ?, ?, 'uploaded', ?, ?, 0, ?, ?) ON CONFLICT (name) DO UPDATE SET "
+            "sha256 = excluded.sha256, description = excluded.description, source = excluded.source, "
+            "folder = excluded.folder, resources = excluded.resources, added = excluded.added, "
+            "added_by = excluded.added_by",
+            *(config.name, config.sha256, config.description, str(folder.relative_to(state))),
+            *(json.dumps(resources(config)), time.time(), by),
+        )
+        note(db, by, "arm added", config.name, sha256=config.sha256)
+    return KnownArm(config.name, folder / ARM_FILE, config, "uploaded")
+
+
+@contextmanager
+def uploaded(state: Path, text: str, files: Mapping[str, str]) -> Iterator[Path]:
+    """The file of an uploaded description, beside the files that it names, for as long as the block lasts.
+
+    Args:
+        state: the state folder.
+        text: the YAML.
+        files: name to content of the files that it names.
+
+    Raises:
+        UsageError: too large, or files whose names are none.
+        ConfigError: it leads out of its folder; and whatever the block raises, without the place of the upload.
+    """
     if len(text) + sum(len(content) for content in files.values()) > MOST_BYTES:
         raise UsageError(f"a description and its files have {MOST_BYTES} bytes at most")
     if len(files) > _MOST_FILES:
@@ -119,18 +154,13 @@ def add_arm(db: Database, state: Path, text: str, files: Mapping[str, str], by: 
             raise UsageError(f"{name!r}: a file's name is a plain one, and not {ARM_FILE}")
     place = state / DESCRIPTIONS
     # Below its own name only when it has been found good.
-    staging = place / f".{time.time_ns():x}.partial"
+    staging = place / f".{time.time_ns():x}.{secrets.token_hex(4)}.partial"
     try:
         staging.mkdir(parents=True)
         for name, content in {ARM_FILE: text, **files}.items():
             (staging / name).write_text(content, encoding="utf-8", errors="strict")
         _require_confined(staging)
-        config = load_arm(staging / ARM_FILE)
-        folder = place / f"{config.name}-{config.sha256[:16]}"
-        if not folder.exists():
-            with appearing_folder(folder) as built:
-                for path in staging.iterdir():
-                    shutil.copyfile(path, built / path.name)
+        yield staging / ARM_FILE
     except ConfigError as error:
         # The place of the upload means nothing to whoever sent it.
         raise ConfigError(
@@ -145,17 +175,6 @@ def add_arm(db: Database, state: Path, text: str, files: Mapping[str, str], by: 
         raise UsageError(f"{place}: cannot be written: {error.strerror}") from None
     finally:
         shutil.rmtree(staging, ignore_errors=True)
-    with db.transaction():
-        db.write(
-            "INSERT INTO arms VALUES (?, ?, ?, 'uploaded', ?, ?, 0, ?, ?) ON CONFLICT (name) DO UPDATE SET "
-            "sha256 = excluded.sha256, description = excluded.description, source = excluded.source, "
-            "folder = excluded.folder, resources = excluded.resources, added = excluded.added, "
-            "added_by = excluded.added_by",
-            *(config.name, config.sha256, config.description, str(folder.relative_to(state))),
-            *(json.dumps(resources(config)), time.time(), by),
-        )
-        note(db, by, "arm added", config.name, sha256=config.sha256)
-    return KnownArm(config.name, folder / ARM_FILE, config, "uploaded")
 
 
 def _require_confined(folder: Path) -> None:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-from ident_service.errors import UsageError
+from ident_service.errors import UnknownId, UsageError
 from ident_service.service.registry.audit import note
 from ident_service.service.registry.database import Database, Row
 
@@ -62,11 +62,11 @@ def revoke_token(db: Database, name: str, by: str) -> None:
     """Let a token count no more.
 
     Raises:
-        UsageError: no such token that counts.
+        UnknownId: no such token that counts.
     """
     with db.transaction():
         if not db.write("UPDATE tokens SET revoked = ? WHERE name = ? AND revoked IS NULL", time.time(), name):
-            raise UsageError(f"no token {name!r} that could be revoked; `ident token list` names them")
+            raise UnknownId(f"no token {name!r} that could be revoked; `ident token list` names them")
         note(db, by, "token revoked", name)
 
 

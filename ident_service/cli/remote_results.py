@@ -1,0 +1,166 @@
+"""`--server` for what is there already: results, parameters, acceptances, tokens, done or told by a daemon.
+
+Files that a daemon makes stay there, as exports; `--out` fetches them.
+Boundary: words to requests by id, answers to words; the connection is `remote.py`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ident_service.cli.answer import DONE, VERDICT_NO, Answer
+from ident_service.cli.daemon import token_line
+from ident_service.cli.keeping import pruned_text
+from ident_service.cli.remote import Verb, asked, recording, word_of_address
+from ident_service.cli.remote_words import in_words
+from ident_service.errors import ArmError, UsageError
+
+if TYPE_CHECKING:
+    from ident_service.service.client import Client
+
+_API = "/api/v1"
+_PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,119}")  # a name that stays in the folder it is written into
+
+
+def _run(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+    return {"run": word_of_address(str(arguments.run))}
+
+
+def _export(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+    return {**_run(client, arguments), "formats": [name.strip() for name in arguments.format.split(",")]}
+
+
+def _figures(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+    return {**_run(client, arguments), "format": arguments.format}
+
+
+def _of_file(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+    """The verbs that take a parameter file here take the run that holds one there."""
+    given = {name: getattr(arguments, name, None) for name in ("feasible_set", "arm", "metric")}
+    return {"run": word_of_address(str(arguments.file)), **given}
+
+
+def _compare(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+    if len(arguments.others) != 1:
+        raise UsageError("compare --server: one run is compared with one other; ask again for the rest")
+    run, other = arguments.reference, arguments.others[0]
+    return {"run": word_of_address(str(run)), "other": word_of_address(str(other))}
+
+
+def _payload(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+    recordings = [recording(path) for path in arguments.recordings]
+    return {**_run(client, arguments), "recordings": recordings, "refit_offsets": arguments.refit_offsets}
+
+
+def _fetched(client: Client, arguments: argparse.Namespace, answer: Answer) -> Answer:
+    """Bring the files of an export here, where `--out` was given."""
+    from ident_service.results.files import appearing_folder
+
+    code, text, document = in_words(client, arguments, answer)
+    if code not in (DONE, VERDICT_NO):
+        return code, text, document
+    export = word_of_address(str(document["job"]["run"]))
+    files = client.get(f"{_API}/exports/{export}")["files"]
+    if arguments.out is None:
+        listed = "".join(f"  {name}\n" for name in files)
+        return code, f"{text}files of {export}, fetched with --out:\n{listed}", document | {"export": export}
+    if strange := [name for name in files if not _PLAIN.fullmatch(name)]:
+        raise ArmError(f"the daemon names a file {strange[0]!r}, which is no plain name; nothing was written")
+    with appearing_folder(arguments.out) as folder:
+        for name in files:
+            (folder / name).write_bytes(client.content(f"{_API}/exports/{export}/files/{name}"))
+    listed = "".join(f"  {name}\n" for name in files)
+    return code, f"{text}files: {arguments.out}\n{listed}", document | {"export": export, "folder": str(arguments.out)}
+
+
+def _corrected(client: Client, arguments: argparse.Namespace, answer: Answer) -> Answer:
+    """The one file of a correction, under the name that it was given here."""
+    code, text, document = in_words(client, arguments, answer)
+    if code != DONE:
+        return code, text, document
+    export = word_of_address(str(document["job"]["run"]))
+    _write(arguments.out, client.content(f"{_API}/exports/{export}/files/parameters.json"))
+    return code, f"{text}file: {arguments.out}\n", document | {"export": export, "file": str(arguments.out)}
+
+
+def _reported(client: Client, arguments: argparse.Namespace, answer: Answer) -> Answer:
+    code, text, document = answer
+    page = f"{_API}/runs/{word_of_address(str(arguments.run))}/report.html"
+    if code != DONE or arguments.out is None:
+        return code, f"{text}page: {page}\n" if code == DONE else text, document
+    _write(arguments.out, client.content(page))
+    return code, f"{text}file: {arguments.out}\n", document | {"file": str(arguments.out)}
+
+
+def _write(path: Path, content: bytes) -> None:
+    from ident_service.results.files import write_atomically
+
+    try:
+        write_atomically(path, content.decode("utf-8"))
+    except UnicodeDecodeError:
+        raise ArmError(f"{path}: not written: what the daemon sent for it is not text") from None
+
+
+def _accept(client: Client, arguments: argparse.Namespace) -> Answer:
+    run = word_of_address(str(arguments.run))
+    arm = word_of_address(client.get(f"{_API}/runs/{run}")["arm"])
+    act = client.post(f"{_API}/arms/{arm}/acceptances", {"run": run, "note": arguments.note})
+    return DONE, f"{act['arm']}: acceptance {act['number']} is the current one\n", act
+
+
+def _rollback(client: Client, arguments: argparse.Namespace) -> Answer:
+    body = {"note": arguments.note, "to": arguments.to}
+    act = client.post(f"{_API}/arms/{word_of_address(arguments.arm)}/rollback", body)
+    text = f"{act['arm']}: acceptance {act['number']} is the set of {act['origin']} ({act['run']})\n"
+    return DONE, text, act
+
+
+def _prune(client: Client, arguments: argparse.Namespace) -> Answer:
+    found = client.post(f"{_API}/recordings/prune", {"keep": arguments.keep, "yes": arguments.yes})
+    return DONE, pruned_text(found), found
+
+
+def _tokens(client: Client, _: argparse.Namespace) -> Answer:
+    rows = client.get(f"{_API}/tokens")
+    return DONE, "".join(map(token_line, rows)), {"tokens": rows}
+
+
+def _revoke(client: Client, arguments: argparse.Namespace) -> Answer:
+    row = client.post(f"{_API}/tokens/{word_of_address(arguments.name)}/revoke")
+    return DONE, f"{arguments.name}: revoked\n", row
+
+
+VERBS: dict[str, Verb] = {
+    "report": asked(_run, _reported),
+    "export": asked(_export, _fetched),
+    "figures": asked(_figures, _fetched),
+    "payload": asked(_payload, _fetched),
+    "compare": asked(_compare, in_words),
+    "verify": asked(_of_file, in_words),
+    "feasible": asked(_of_file, in_words),
+    "correct": asked(_of_file, _corrected),
+    "accept": _accept,
+    "rollback": _rollback,
+    "prune": _prune,
+    "token list": _tokens,
+    "token revoke": _revoke,
+}
+_FILE = frozenset({"file", "feasible_set", "arm"})
+CARRIED: dict[str, frozenset[str]] = {
+    "report": frozenset({"run", "out"}),
+    **dict.fromkeys(("export", "figures"), frozenset({"run", "format", "out"})),
+    "payload": frozenset({"run", "recordings", "refit_offsets", "out"}),
+    "compare": frozenset({"reference", "others"}),
+    "verify": frozenset({"file"}),
+    "feasible": _FILE,
+    "correct": _FILE | {"metric", "out"},
+    "accept": frozenset({"run", "note"}),
+    "rollback": frozenset({"arm", "note", "to"}),
+    "prune": frozenset({"keep", "yes"}),
+    "token list": frozenset(),
+    "token revoke": frozenset({"name"}),
+}
+"""What of each verb a daemon is told; who asks is the token's name, and not `--by`."""

@@ -1,0 +1,150 @@
+"""`--server` at an arm: looking at it, its bus and its description; and the rehearsal, whose key is held here.
+
+The key is held at this terminal and the arm is elsewhere: every look at the key that finds it held renews the lease,
+one that finds it released asks for the stop. Whatever dies between the two, the lease lapses and the arm stops.
+Boundary: words to requests by id, answers to words; the connection is `remote.py`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, tell
+from ident_service.cli.moving import RELEASED, HeldKey, require_terminal
+from ident_service.cli.remote import (
+    LIVE,
+    Verb,
+    asked,
+    confirmation,
+    motion_id,
+    renew,
+    told,
+    typed,
+    word_of_address,
+)
+from ident_service.cli.remote_words import in_words
+from ident_service.errors import MotionRefused, UsageError
+
+if TYPE_CHECKING:
+    from ident_service.service.client import Client
+
+_API = "/api/v1"
+_RENEW = 0.05  # s between looks at the key, each of which renews the lease; a rehearsal's lasts 0.25 s
+_LOOK = 0.4  # s between looks at the job
+
+
+def _arm(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+    return {"arm": arguments.arm}
+
+
+def _watch(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+    return {"arm": arguments.arm, "seconds": arguments.seconds}
+
+
+def _recover(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+    return {"arm": arguments.arm, "kind": "leave_limit" if arguments.leave_limit else None}
+
+
+def _preview(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+    return {"arm": arguments.arm, "motion": motion_id(client, arguments.arm, arguments.motion)}
+
+
+def _bus_load(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+    return {"kind": "bus_load", "arm": arguments.arm, "rate": arguments.rate}
+
+
+def _bus_scan(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+    return {"kind": "bus_scan", "arm": arguments.arm}
+
+
+def _known(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+    return {"kind": "config_check", "arm": word_of_address(arguments.file)}
+
+
+def _config_check(client: Client, arguments: argparse.Namespace) -> Answer:
+    """A file is sent and judged there; any other word is the name of an arm that the daemon knows."""
+    path = Path(arguments.file)
+    if not path.is_file():
+        return asked(_known, in_words)(client, arguments)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path}: cannot be read as text: {error}") from None
+    found = client.post(f"{_API}/descriptions/check", {"description": text})
+    return VERDICT_NO if found["stable"] is False else DONE, found["text"], found
+
+
+def _rehearse(client: Client, arguments: argparse.Namespace) -> Answer:
+    terminal = None if arguments.no_key else require_terminal(arguments)
+    name, motion = typed(arguments), motion_id(client, arguments.arm, arguments.motion)
+    job = {"kind": "rehearse", "arm": arguments.arm, "speed": arguments.speed}
+    job |= {} if motion is None else {"motion": motion}
+    stopping = StopOnSignal()
+    with stopping, nullcontext() if terminal is None else HeldKey(terminal) as key:
+        if key is not None:
+            tell(arguments, f"{arguments.arm}: hold the space bar: the arm begins to move some seconds later")
+            tell(arguments, f"release it: the arm stops ({RELEASED:g} s without the key), and the rehearsal is over")
+            if not key.wait(stopping.requested):
+                raise MotionRefused("nobody held the key; nothing has moved")
+        # Only now, so that the challenge is fresh however long nobody held the key.
+        body = {"job": job, "confirm": confirmation(client, arguments, name)}
+        made = client.post(f"{_API}/jobs", body)
+        tell(arguments, f"job {made['id']}")
+        over = stopping.requested if key is None else lambda: stopping.requested() or key.released()
+        return told(client, held(client, arguments, made, over))
+
+
+def held(
+    client: Client, arguments: argparse.Namespace, job: dict[str, Any], over: Callable[[], bool]
+) -> dict[str, Any]:
+    """Renew the lease of a rehearsal until `over` says that it is not to go on, then have it stopped.
+
+    Returns:
+        The job, when it has ended.
+    """
+    looked, phase, cancelled = time.monotonic(), "", False
+    while job["state"] in LIVE:
+        if not cancelled and over():
+            cancelled = True
+            try:
+                client.post(f"{_API}/jobs/{job['id']}/cancel")
+            except UsageError:  # it has ended meanwhile, which the next look tells
+                looked = 0.0
+        elif not cancelled:
+            renew(client, job["id"])
+        time.sleep(_RENEW)
+        if time.monotonic() - looked > _LOOK:
+            looked, job = time.monotonic(), client.get(f"{_API}/jobs/{job['id']}")
+            said = (job["progress"] or {}).get("phase", job["state"])
+            if said != phase:
+                phase = said
+                tell(arguments, phase)
+    return job
+
+
+VERBS: dict[str, Verb] = {
+    "watch": asked(_watch, in_words),
+    "recover": asked(_recover, in_words),
+    "base": asked(_arm, in_words),
+    "preview": asked(_preview, in_words),
+    "bus load": asked(_bus_load, in_words),
+    "bus scan": asked(_bus_scan, in_words),
+    "config check": _config_check,
+    "rehearse": _rehearse,
+}
+CARRIED: dict[str, frozenset[str]] = {
+    "watch": frozenset({"arm", "seconds"}),
+    "recover": frozenset({"arm", "leave_limit", "confirm"}),
+    "base": frozenset({"arm"}),
+    "preview": frozenset({"arm", "motion"}),
+    "bus load": frozenset({"arm", "rate"}),
+    "bus scan": frozenset({"arm"}),
+    "config check": frozenset({"file"}),
+    "rehearse": frozenset({"arm", "motion", "confirm", "speed", "no_key"}),
+}
+"""What of each verb a daemon is told."""

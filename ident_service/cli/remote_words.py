@@ -1,0 +1,53 @@
+"""What a job's command answered, a JSON object, as words for a person: `--server` has no other text of it.
+
+Boundary: JSON values to lines.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+from ident_service.cli.answer import Answer
+
+if TYPE_CHECKING:
+    from ident_service.service.client import Client
+
+_OURS = frozenset({"exit_code", "error"})  # which the job's own lines tell
+
+
+def in_words(_: Client, __: argparse.Namespace, answer: Answer) -> Answer:
+    """The answer with what its command said, where a person looks for it."""
+    code, text, document = answer
+    said = {key: value for key, value in document["answer"].items() if key not in _OURS}
+    return code, text + "".join(f"{line}\n" for line in lines_of(said)), document
+
+
+def lines_of(value: Any, indent: str = "") -> Iterator[str]:
+    """One line per value; what stands within something is moved in by two.
+
+    Lists of plain values, and plain values, stand on the line of their name.
+    """
+    pairs = value.items() if isinstance(value, dict) else enumerate(value, 1)
+    for name, part in pairs:
+        if isinstance(part, dict | list) and not _plain(part):
+            yield f"{indent}{name}:"
+            yield from lines_of(part, indent + "  ")
+        else:
+            yield f"{indent}{name}: {_word(part)}"
+
+
+def _plain(part: Any) -> bool:
+    values = part.values() if isinstance(part, dict) else part
+    return not part or (isinstance(part, list) and not any(isinstance(one, dict | list) for one in values))
+
+
+def _word(part: Any) -> str:
+    if isinstance(part, dict | list):
+        return ", ".join(map(_word, part)) or "none"
+    if isinstance(part, bool):
+        return "yes" if part else "no"
+    if isinstance(part, float):
+        return f"{part:.6g}"
+    return "none" if part is None else str(part)

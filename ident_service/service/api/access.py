@@ -1,0 +1,41 @@
+"""Routes about tokens: who may talk to the service, and that one may no more.
+
+A token is not made over HTTP: whoever got hold of an operator's could make others, which would outlive its being
+revoked. That is an act at the state folder (`ident token add`). Revoking over HTTP harms nobody who sits there.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Path
+from pydantic import BaseModel
+
+from ident_service.service.api.asking import Operator, Serving
+from ident_service.service.api.mistakes import failures
+from ident_service.service.registry.tokens import revoke_token, tokens
+
+router = APIRouter(prefix="/api/v1", tags=["tokens"], responses=failures(404))
+TokenName = Annotated[str, Path(pattern=r"^[a-z0-9][a-z0-9_.-]{0,39}$")]
+
+
+class TokenLine(BaseModel):
+    """A token; `revoked` is when, null while it counts. The token itself is kept nowhere."""
+
+    name: str
+    role: Literal["viewer", "operator"]
+    created: float
+    revoked: float | None
+
+
+@router.get("/tokens")
+def list_tokens(service: Serving, _: Operator) -> list[TokenLine]:
+    """All tokens that ever were, the earliest first."""
+    return [TokenLine(**row) for row in tokens(service.db)]
+
+
+@router.post("/tokens/{token}/revoke")
+def revoke(service: Serving, who: Operator, token: TokenName) -> TokenLine:
+    """Let a token, and the sessions that it began, count no more."""
+    revoke_token(service.db, token, who.name)
+    return next(TokenLine(**row) for row in tokens(service.db) if row["name"] == token)

@@ -1,0 +1,67 @@
+"""Routes about descriptions: one that is not the service's yet is judged (of others: a job `config_check`); the home.
+
+What computes with mechanisms is loaded when it is asked for: the service starts without.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Literal
+
+from fastapi import APIRouter
+from pydantic import BaseModel
+
+from ident_service.service.api.arms import Description
+from ident_service.service.api.asking import Operator, Serving, Viewer
+from ident_service.service.api.mistakes import failures
+from ident_service.service.jobs.asked import ArmName
+from ident_service.service.registry.arms import known_arm, uploaded
+
+router = APIRouter(prefix="/api/v1", tags=["arms"], responses=failures(404))
+
+
+class DescriptionAnswer(BaseModel):
+    """A description without mistakes.
+
+    `stable` is null for an arm that can be identified but not moved; `objections` say what is wrong with the gains,
+    `text` is all of it for a person.
+    """
+
+    arm: str
+    sha256: str
+    stable: bool | None
+    objections: list[str]
+    text: str
+
+
+class HomeJoint(BaseModel):
+    """One joint of the posture in which an arm is zeroed: its position [rad or m], and the unit of that."""
+
+    joint: str
+    position: float
+    unit: Literal["rad", "m"]
+
+
+@router.post("/descriptions/check")
+def check(service: Serving, _: Operator, body: Description) -> DescriptionAnswer:
+    """Judge a description and keep nothing of it; its mistakes are answered with line and column."""
+    from ident_service.service.description_check import check_description, description_text
+
+    with uploaded(service.state, body.description, body.files) as path:
+        checked = check_description(path)
+    config, gains = checked.model.config, checked.gains
+    return DescriptionAnswer(
+        arm=config.name,
+        sha256=config.sha256,
+        stable=None if gains is None else gains.stable,
+        objections=[] if gains is None else list(gains.objections()),
+        text=description_text(path.name, checked),
+    )
+
+
+@router.get("/arms/{arm}/home")
+def get_home(service: Serving, _: Viewer, arm: ArmName) -> list[HomeJoint]:
+    """The posture in which an arm must stand when a job of the kind `zero` is asked for; refused for other arms."""
+    from ident_service.service.zeroing import home_posture
+
+    return [HomeJoint(**asdict(one)) for one in home_posture(known_arm(service.db, service.state, arm).config)]

@@ -1,0 +1,99 @@
+"""A description as it is judged before anybody uses it: its mistakes, its bus budget, its gains; as text and as values.
+
+Boundary: the work is `config/load.py`, `service/bus.py` and `motion/preflight/stability.py`; here it is put together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from drivers.canopen.budget import Budget
+from ident_service.config.limits import motion_limits
+from ident_service.config.load import load_arm
+from ident_service.errors import MotionRefused
+from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.motion.preflight.stability import StabilityReport, delay_of, stability
+from ident_service.service.bus import bus_lines, require_budget
+
+
+@dataclass(frozen=True)
+class CheckedDescription:
+    """A description without mistakes.
+
+    Attributes:
+        model: of its arm.
+        budget: of its buses; None for an arm without CANopen drives.
+        gains: how stable they are; None for an arm that can be identified but not moved.
+    """
+
+    model: ArmModel
+    budget: Budget | None
+    gains: StabilityReport | None
+
+    @property
+    def good(self) -> bool:
+        """Whether nothing is objected to."""
+        return self.gains is None or self.gains.stable
+
+
+def check_description(arm: str | Path) -> CheckedDescription:
+    """Judge a description.
+
+    Args:
+        arm: its file, or its name if it is shipped.
+
+    Raises:
+        ConfigError: every mistake in it, each with line and column; a bus budget that does not fit is one.
+        ModelError: its mechanism cannot be computed with.
+    """
+    model = arm_model(load_arm(arm))
+    budget = require_budget(arm, model.config)
+    try:
+        limits = motion_limits(model.config)
+    except MotionRefused:  # an arm that is only identified needs none
+        return CheckedDescription(model, budget, None)
+    return CheckedDescription(model, budget, stability(model, limits, delay_of(model.config)))
+
+
+def description_document(checked: CheckedDescription) -> dict[str, Any]:
+    """As JSON values."""
+    config, report = checked.model.config, checked.gains
+    gains = None if report is None else {"stable": report.stable, "objections": report.objections()}
+    return {
+        "arm": config.name,
+        "sha256": config.sha256,
+        "problems": [],
+        "stability": None if report is None or gains is None else asdict(report) | gains,
+    }
+
+
+def description_text(arm: str, checked: CheckedDescription) -> str:
+    """For a person; `arm` as they named it."""
+    model = checked.model
+    head = f"{arm}: {model.config.name}, {model.chain.joints} joints, {model.layout.size} parameters: good\n"
+    head += "" if checked.budget is None else bus_lines(checked.budget)
+    if checked.gains is None:
+        return (
+            head + "gains: not judged; limits or gains are missing, so that this arm can be identified but not moved\n"
+        )
+    return head + _gains_text(checked.gains)
+
+
+def _gains_text(report: StabilityReport) -> str:
+    """Margins per joint, and what is objected to."""
+    joints = report.joints
+    width = max(5, *(len(one.joint) for one in joints))
+    cycles = "one cycle" if report.delay_cycles == 1 else f"{report.delay_cycles} cycles"
+    lines = [
+        f"gains at {1.0 / report.period:g} Hz with {cycles} of delay: "
+        + ("stable" if report.stable else "NOT STABLE ENOUGH; lower kp and kd, or raise the rate or the cut-off"),
+        f"  {'joint':<{width}} {'gain margin':>12} {'delay margin':>13}",
+        *(f"  {one.joint:<{width}} {one.gain_margin:>12.2f} {1e3 * one.delay_margin:>10.2f} ms" for one in joints),
+    ]
+    if report.coupled_radius is None:
+        lines.append("  without a prior, each joint is judged by itself")
+    else:
+        lines.append(f"  all joints together: spectral radius {report.coupled_radius:.6f}, below 1 is stable")
+    return "\n".join([*lines, *(f"  {words}" for words in report.objections()), ""])

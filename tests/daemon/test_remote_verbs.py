@@ -1,0 +1,301 @@
+"""`--server`: every verb of the command is done by a daemon, or says why not; what a daemon is not told is refused."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import pty
+import shutil
+import termios
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from daemon.conftest import quick_text
+from daemon.served import daemon_process
+from daemon.verbs_bench import ON_A_BUS, on_a_bus, unstable_text
+
+from ident_service.cli import main, parser
+from ident_service.cli.remote import LOCAL_ONLY, table
+from ident_service.cli.remote_words import lines_of
+from ident_service.cli.words import Parser
+from ident_service.errors import ArmError
+from ident_service.service.client import Client
+
+RUN = "20260101T000000Z-quick"
+REPEAT = 0.033  # s, a desktop's keyboard
+
+
+def verbs() -> dict[str, Parser]:
+    """Every verb of the command, by its words."""
+
+    def below(one: argparse.ArgumentParser) -> Iterator[tuple[str, Parser]]:
+        for action in one._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                for sub in action.choices.values():
+                    if (word := sub.get_default("word")) is not None:
+                        yield word, sub
+                    yield from below(sub)
+
+    return dict(below(parser()))
+
+
+def test_every_verb_is_done_by_a_daemon_or_says_why_not() -> None:
+    done, carried = table()
+    assert len(verbs()) > 45
+    assert set(done) | set(LOCAL_ONLY) == set(verbs())
+    assert not set(done) & set(LOCAL_ONLY)
+    assert set(LOCAL_ONLY) == {"serve", "emulate", "import", "token add"}
+    assert all(len(why) > 10 for why in LOCAL_ONLY.values())
+    assert set(carried) == set(done)
+    for word, told in carried.items():
+        known = {action.dest for action in verbs()[word]._actions}
+        assert told <= known, (word, told - known)
+        # Where it writes to here, and who says so here, is nothing that a daemon can be told in silence.
+        assert not told & {"by", "can_log", "lease_from_stdin", "keep"} or word == "prune", word
+
+
+def test_verbs_of_this_machine_say_why(state: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    server = ["--server", "http://127.0.0.1:1", "--state", str(state)]
+    for words in (["serve"], ["import", "x"], ["token", "add", "ann", "--role", "viewer"], ["emulate", "x"]):
+        assert main([*words, *server]) == 2
+        said = capsys.readouterr().err
+        assert next(why for word, why in LOCAL_ONLY.items() if " ".join(words).startswith(word)) in said
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["export", "r", "--by", "me"],
+        ["accept", "r", "--note", "n", "--by", "me"],
+        ["prune", "--keep", "1", "--by", "me"],
+        ["compare", "a", "b", "--out", "x"],
+        ["compare", "a", "b", "--keep"],
+        ["preview", "planar2", "--out", "x"],
+        ["preview", "planar2", "--model", "x"],
+        ["watch", "planar2", "--by", "me"],
+        ["rehearse", "planar2", "--out", "x"],
+        ["rehearse", "planar2", "--can-log"],
+        ["rehearse", "planar2", "--lease-from-stdin"],
+        ["recover", "planar2", "--leave-limit", "--can-log"],
+        ["home", "planar2", "--zero", "--can-log"],
+    ],
+)
+def test_what_would_be_lost_is_refused(words: list[str], state: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    # Nobody listens there: it is refused before anybody is asked.
+    try:
+        code = main([*words, "--server", "http://127.0.0.1:1", "--state", str(state)])
+    except SystemExit as wrong:  # the verb itself does not know it
+        code = int(wrong.code or 0)
+    assert code == 2
+    assert "cannot be reached" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("path", ["/etc/passwd", "../runs/x", "runs/x", ".hidden", "a b", ""])
+def test_no_run_is_a_path(path: str, state: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    server = ["--server", "http://127.0.0.1:1", "--state", str(state)]
+    more = {"accept": ["--note", "n"], "figures": ["--out", "x"]}
+    for verb in ("report", "export", "verify", "feasible", "accept", "figures"):
+        assert main([verb, path or ".", *more.get(verb, []), *server]) == 2
+        assert "named by id" in capsys.readouterr().err
+
+
+def test_answers_are_told_in_words() -> None:
+    said = {"arm": "a", "fits": True, "load": 0.25, "none": None, "names": ["x", "y"], "lines": [{"node": 1}], "no": []}
+    assert list(lines_of(said)) == [
+        "arm: a",
+        "fits: yes",
+        "load: 0.25",
+        "none: none",
+        "names: x, y",
+        "lines:",
+        "  1:",
+        "    node: 1",
+        "no: none",
+    ]
+
+
+class _Evil(Client):
+    """A daemon that names files which lead elsewhere."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+
+    def get(self, path: str) -> Any:
+        return {"files": {"../outside": 1}, "answer": {}}
+
+    def content(self, path: str) -> bytes:
+        raise AssertionError(path)
+
+
+def test_a_daemon_does_not_choose_where_files_go_here(tmp_path: Path) -> None:
+    from ident_service.cli.remote_results import _fetched
+
+    words = argparse.Namespace(out=tmp_path / "out", json=True)
+    with pytest.raises(ArmError, match="no plain name"):
+        _fetched(_Evil(), words, (0, "", {"job": {"run": "e"}, "answer": {}}))
+    assert list(tmp_path.iterdir()) == []
+
+
+@contextmanager
+def served(state: Path, commissioned: Path) -> Iterator[tuple[Client, list[str]]]:
+    """A daemon with two arms and two runs; the words that lead to it."""
+    for run in (RUN, RUN.replace("0101", "0102")):
+        shutil.copytree(commissioned, state / "runs" / run)
+    with daemon_process(state) as (_, client):
+        for body in ({"description": quick_text()}, on_a_bus()):
+            client.post("/api/v1/arms", body)
+        until = time.monotonic() + 30.0
+        while len(client.get("/api/v1/runs")) < 2:
+            assert time.monotonic() < until
+            time.sleep(0.05)
+        yield client, ["--server", client._url, "--state", str(state)]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+def test_verbs_are_done_by_a_daemon(
+    state: Path, commissioned: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = RUN.replace("0101", "0102")
+    with served(state, commissioned) as (_, server):
+
+        def done(*words: object, code: int = 0) -> dict[str, Any]:
+            capsys.readouterr()
+            found = main([*map(str, words), *server, "--json"])
+            out = capsys.readouterr()
+            assert found == code, (words, out.out, out.err)
+            return dict(json.loads(out.out))
+
+        assert done("base", "quick")["answer"]["base_parameters"]["expressions"]
+        assert done("preview", "quick")["job"]["state"] == "done"
+        assert done("watch", "quick", "--seconds", 0.2)["answer"]
+        assert done("recover", "quick")["answer"]["usable"] is True
+        assert done("bus", "load", ON_A_BUS)["answer"]["fits"] is True
+        assert done("bus", "scan", ON_A_BUS)["answer"]["complete"] is True
+        assert done("home", ON_A_BUS, "--zero", "--confirm", ON_A_BUS)["job"]["kind"] == "zero"
+        done("home", ON_A_BUS, "--zero", "--confirm", "quick", code=2)
+        assert done("config", "check", "quick")["answer"]["stability"]["stable"] is True
+        (tmp_path / "arm.yaml").write_text(unstable_text())
+        assert done("config", "check", tmp_path / "arm.yaml", code=3)["stable"] is False
+
+        assert done("verify", RUN)["answer"]["verdict"] == "feasible"
+        assert done("feasible", RUN, "--arm", "quick")["answer"]["feasible"] is True
+        singular = done("correct", RUN, "--metric", "covariance", "--out", tmp_path / "none.json", code=1)
+        assert "singular" in singular["job"]["detail"]  # the metric was told
+        assert not (tmp_path / "none.json").exists()
+        done("correct", RUN, "--feasible-set", "inertia", "--out", tmp_path / "near.json")
+        corrected = json.loads((tmp_path / "near.json").read_text())
+        assert (corrected["method"], corrected["feasible_set"]) == ("correction", "inertia")
+        assert done("compare", RUN, other)["answer"]["verdict"] == "unchanged"
+        done("compare", RUN, other, RUN, code=2)
+        assert done("payload", RUN, f"{RUN}/validation.mcap", "--out", tmp_path / "load", code=3)["export"]
+        assert (tmp_path / "load" / "payload.json").is_file()
+        done("report", RUN, "--out", tmp_path / "page.html")
+        assert (tmp_path / "page.html").read_text().lstrip().lower().startswith("<!doctype html")
+        files = done("export", RUN, "--format", "urdf,csv", "--out", tmp_path / "urdf")["answer"]["files"]
+        assert {one["file"] for one in files} == {path.name for path in (tmp_path / "urdf").iterdir()}
+        done("figures", RUN, "--out", tmp_path / "drawn")
+        assert all(path.read_bytes().startswith(b"<svg") for path in (tmp_path / "drawn").iterdir())
+        assert len(list((tmp_path / "drawn").iterdir())) > 5
+
+        assert done("accept", RUN, "--note", "good")["number"] == 1
+        assert done("accept", other, "--note", "better")["who"] == "owner"
+        assert done("rollback", "quick", "--note", "back")["origin"] == 1
+        assert done("prune", "--keep", 1)["deleted"] is False
+        assert [row["name"] for row in done("token", "list")["tokens"]] == ["owner"]
+        done("token", "revoke", "none", code=2)
+        assert main(["base", "quick", *server]) == 0
+        said = capsys.readouterr().out
+        assert "base_parameters:\n  expressions: " in said
+
+
+@pytest.mark.parametrize(("said", "why"), [(b"stop\n", "a stop was asked for"), (b"", "is gone"), (None, "")])
+def test_a_zeroing_that_nobody_asks_for_any_more_is_not_done(
+    said: bytes | None,
+    why: str,
+    state: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    body = on_a_bus()
+    (tmp_path / "arm.yaml").write_text(body["description"])
+    (tmp_path / "puck.eds").write_text(body["files"]["puck.eds"])
+    words = ["home", str(tmp_path / "arm.yaml"), "--zero", "--confirm", ON_A_BUS, "--lease-from-stdin"]
+    reading, writing = os.pipe()
+    os.write(writing, b"\n" if said is None else said)
+    with os.fdopen(reading) as stdin, os.fdopen(writing, "wb") as held:
+        monkeypatch.setattr("sys.stdin", stdin)
+        if said == b"":
+            held.close()
+        assert main([*words, "--state", str(state)]) == (0 if said is None else 3)
+    heard = capsys.readouterr()
+    assert why in heard.err
+    assert ("zeroed, until its drives lose their power" in heard.out) == (said is None)
+
+
+class Hands:
+    """The space bar of a terminal, held until it is let go."""
+
+    def __init__(self, master: int) -> None:
+        self._master, self._let_go = master, threading.Event()
+        self._thread = threading.Thread(target=self._hold, daemon=True)
+
+    def __enter__(self) -> Hands:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.let_go()
+        self._thread.join()
+
+    def let_go(self) -> None:
+        """Release the key."""
+        self._let_go.set()
+
+    def _hold(self) -> None:
+        while not self._let_go.is_set():
+            os.write(self._master, b" ")
+            time.sleep(REPEAT)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_rehearsal_elsewhere_ends_with_the_key_here(
+    state: Path, commissioned: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    master, slave = pty.openpty()
+    with served(state, commissioned) as (client, server):
+        assert main(["check", "quick", "--confirm", "quick", *server]) == 0
+        rehearse = ["rehearse", "quick", "--confirm", "quick", *server]
+        assert main([*rehearse, "--json"]) == 2  # a program holds no key
+        assert "no terminal" in capsys.readouterr().err
+        before = termios.tcgetattr(slave)
+        with os.fdopen(os.dup(slave)) as stdin, Hands(master) as hands:
+            monkeypatch.setattr("sys.stdin", stdin)
+            said: list[str] = []
+
+            def told(_: object, line: str) -> None:
+                said.append(line)
+                if line in ("approaching", "exciting"):
+                    hands.let_go()
+
+            monkeypatch.setattr("ident_service.cli.remote_watching.tell", told)
+            assert main(rehearse) == 1
+        job = client.get("/api/v1/jobs?most=1")[0]
+        assert (job["kind"], job["state"]) == ("rehearse", "cancelled"), (job, said)
+        assert "cancelled by owner" in job["detail"]
+        assert client.get(f"/api/v1/runs/{job['run']}")["ending"] == "stopped"
+        assert client.get("/api/v1/arms/quick")["faults"] == []
+        assert termios.tcgetattr(slave) == before
+        # Without a key it goes to its end, its lease renewed by the command.
+        assert main([*rehearse, "--no-key"]) == 0
+        assert client.get("/api/v1/jobs?most=1")[0]["state"] == "done"
+    os.close(master)
+    os.close(slave)
