@@ -70,6 +70,21 @@ class Finding:
     meaning: str
 
 
+@dataclass(frozen=True)
+class Compared:
+    """A comparison that was concluded from.
+
+    Attributes:
+        folder: of the run that keeps it.
+        findings: what has changed.
+        errors: torque error on the new recording with the accepted parameters and with its own [%]; None if unknown.
+    """
+
+    folder: Path
+    findings: tuple[Finding, ...]
+    errors: tuple[float, float] | None
+
+
 def steps(db: Database, row: Row) -> tuple[Step, ...]:
     """Its steps, in order.
 
@@ -87,8 +102,8 @@ def steps(db: Database, row: Row) -> tuple[Step, ...]:
     )
 
 
-def comparison(db: Database, state: Path, run: str | None, words: str) -> Path | None:
-    """The folder whose comparison is the one that these words were concluded from; None where there is none.
+def compared(db: Database, state: Path, run: str | None, words: str) -> Compared | None:
+    """The comparison that these words were concluded from; None where it is not there, or another has replaced it.
 
     Args:
         db: the registry.
@@ -96,29 +111,26 @@ def comparison(db: Database, state: Path, run: str | None, words: str) -> Path |
         run: id of the run with the parameters.
         words: what was concluded, as the registry has it.
     """
-    return None if _document(db, state, run, words) is None else runs.run_folder(db, state, str(run))
-
-
-def findings(db: Database, state: Path, run: str | None, words: str) -> tuple[Finding, ...]:
-    """What has changed; empty where nothing has, or where only the words are left to say it. Arguments as above."""
-    document = _document(db, state, run, words)
-    found = [] if document is None else document["compared"][0]["findings"]
-    return tuple(Finding(one["what"], one["joint"], one["sigma"], one["size"], one["meaning"]) for one in found)
-
-
-def _document(db: Database, state: Path, run: str | None, words: str) -> dict[str, Any] | None:
-    """`comparison.json`, if it can be believed."""
     try:
         named = {} if run is None else runs.run_files(db, state, run)
         if run is None or not {DOCUMENT, PAGE} <= set(named):
             return None
-        path = runs.run_folder(db, state, run) / DOCUMENT
-        if path.stat().st_size > _MOST_BYTES or file_sha256(path) != named[DOCUMENT]:
+        folder = runs.run_folder(db, state, run)
+        if (folder / DOCUMENT).stat().st_size > _MOST_BYTES:
             return None
-        document: dict[str, Any] = json.loads(path.read_bytes())
-        return document if verdict_of(document).words == words else None
+        if any(file_sha256(folder / name) != named[name] for name in (DOCUMENT, PAGE)):
+            return None
+        document = json.loads((folder / DOCUMENT).read_bytes())
+        return _told(folder, document["compared"][0]) if verdict_of(document).words == words else None
     except (IdentError, OSError, ValueError, LookupError, TypeError):
         return None
+
+
+def _told(folder: Path, pair: dict[str, Any]) -> Compared:
+    found = [Finding(one["what"], one["joint"], one["sigma"], one["size"], one["meaning"]) for one in pair["findings"]]
+    errors = pair["torque_error_percent"]
+    both = None if errors is None else (float(errors["reference"]["whole"]), float(errors["own"]["whole"]))
+    return Compared(folder, tuple(found), both)
 
 
 def _jobs(db: Database, row: Row) -> dict[str, str]:

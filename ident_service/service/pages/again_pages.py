@@ -14,7 +14,7 @@ from ident_service.service.api import arms, jobs, maintenance
 from ident_service.service.api.asking import Operator, Service, Serving, Viewer
 from ident_service.service.jobs.asked import ArmName, Id
 from ident_service.service.maintenance.reidentification import known_reidentification, require_comparable
-from ident_service.service.pages.again import MOVES, PAGE, TITLES, WORDS, comparison, findings, steps
+from ident_service.service.pages.again import MOVES, PAGE, TITLES, WORDS, compared, steps
 from ident_service.service.pages.asking import Form, PageRoute, seen
 from ident_service.service.pages.job_pages import log_of
 from ident_service.service.pages.render import page
@@ -76,8 +76,7 @@ def show(service: Serving, who: Viewer, name: Id, attended: bool = False) -> Res
         job=None if job is None else jobs.answer_of(service, job),
         log="" if job is None else log_of(service, job),
         note=remark[0] if remark else "",
-        findings=findings(service.db, service.state, row["run"], row["detail"]),
-        compared=comparison(service.db, service.state, row["run"], row["detail"]) is not None,
+        compared=compared(service.db, service.state, row["run"], row["detail"]),
         known={
             run for run in (row["recorded"], row["run"]) if service.db.row("SELECT 1 FROM runs WHERE id = ?", run or "")
         },
@@ -103,10 +102,10 @@ def cancel(service: Serving, who: Operator, name: Id, form: Form) -> Response:
 def show_comparison(service: Serving, _: Viewer, name: Id) -> Response:
     """Its comparison, as it was kept."""
     row = known_reidentification(service.db, name)
-    folder = comparison(service.db, service.state, row["run"], row["detail"])
-    if folder is None:
-        raise UnknownId(f"the re-identification {name} has no comparison, or another one has taken its place in the run")
-    text = (folder / PAGE).read_text(encoding="utf-8").replace(f"{service.state}/", "")
+    found = compared(service.db, service.state, row["run"], row["detail"])
+    if found is None:
+        raise UnknownId(f"the re-identification {name} has no comparison, or its run holds another one now")
+    text = (found.folder / PAGE).read_text(encoding="utf-8").replace(f"{service.state}/", "")
     return HTMLResponse(text, headers={"Content-Security-Policy": POLICY})
 
 

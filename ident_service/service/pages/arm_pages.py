@@ -15,7 +15,7 @@ from ident_service.service.jobs.asked import MOVES, ArmName
 from ident_service.service.maintenance import schedules as planned
 from ident_service.service.maintenance.alarms import alarms
 from ident_service.service.maintenance.reidentification import known_reidentification, reidentifications
-from ident_service.service.pages.again import findings
+from ident_service.service.pages.again import compared
 from ident_service.service.pages.asking import Form, PageRoute, seen
 from ident_service.service.pages.ladder import ladder
 from ident_service.service.pages.render import page
@@ -165,7 +165,7 @@ def pause(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response
 def _alarms(service: Service, arm: str | None) -> list[dict[str, Any]]:
     """Drift alarms that stand, of an arm or of all, each with what was found."""
     return [
-        {**row, "findings": findings(service.db, service.state, row["run"], row["what"])}
+        {**row, "compared": compared(service.db, service.state, row["run"], row["what"])}
         for row in alarms(service.db, arm, most=50)
     ]
 

@@ -19,7 +19,9 @@ from ident_service import __version__
 from ident_service.service.registry.tokens import Access
 
 STATIC: Final = {
-    "page.css": "text/css", "page.js": "text/javascript", "live.js": "text/javascript",
+    "page.css": "text/css",
+    "page.js": "text/javascript",
+    "live.js": "text/javascript",
     "again.js": "text/javascript",
 }
 _HEADERS: Final = {
