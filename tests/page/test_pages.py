@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import time
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from itertools import pairwise
@@ -17,6 +18,10 @@ from ident_service.config.load import load_arm
 from ident_service.service.arm_state import arm_folder, fault_file
 from ident_service.service.commission import simulate
 from ident_service.service.import_run import import_run
+from ident_service.service.maintenance.alarms import alarms
+from ident_service.service.maintenance.reidentification import enter_concluded
+from ident_service.service.maintenance.schedules import When, add_event, add_schedule, dues, events, schedules
+from ident_service.service.maintenance.verdict import Verdict
 from ident_service.service.pages.render import STATIC, mark, static
 from ident_service.service.pages.routes import PAGES
 from ident_service.service.registry import jobs as rows
@@ -54,6 +59,14 @@ def daemon(state: Path, commissioned: Path) -> Iterator[Asked]:
         rows.ended(db, "j1", "failed", EVIL)
         (state / "jobs" / "j1").mkdir(parents=True)
         (state / "jobs" / "j1" / "log").write_text(EVIL)
+        now = time.time()
+        for when in (When(cron="0 6 29 2 *"), When(hours=500.0), When(maintenance=True)):
+            add_schedule(db, ARM, when, EVIL, now)
+        add_event(db, ARM, EVIL, EVIL, EVIL, now)  # and so it is due
+        verdict = Verdict("changed", f"changed: {EVIL}")
+        again = enter_concluded(db, ARM, 1, "none", commissioned.name, verdict, now - 60.0, EVIL, now)
+        db.write("UPDATE reidentifications SET id = 'again' WHERE id = ?", again)
+        db.write("UPDATE alarms SET reidentification = 'again'")
         asked.headers.clear()
         yield asked
 
@@ -71,7 +84,8 @@ def enter(daemon: Asked, role: str) -> None:
 
 def addresses(commissioned: Path) -> list[str]:
     return ["/", f"/arms/{ARM}", "/arms/planar2", "/jobs", "/jobs/j1", "/runs", f"/runs?arm={ARM}",
-            f"/runs/{commissioned.name}", "/audit"]  # fmt: skip
+            f"/runs/{commissioned.name}", "/audit", f"/arms/{ARM}/maintenance", "/arms/planar2/maintenance",
+            "/reidentifications/again"]  # fmt: skip
 
 
 class Reader(HTMLParser):
@@ -153,7 +167,7 @@ def test_every_page_answers_whole_and_escaped(daemon: Asked, commissioned: Path,
         posting = [attrs for tag, attrs in Reader(answer.text).tags if tag == "form" and attrs.get("method") == "post"]
         if role == "viewer":  # nothing but stop and the way out
             assert {attrs["action"] for attrs in posting} == {"/stop", "/logout"}, address
-    assert shown >= 6  # description, fault, note, detail, log, audit
+    assert shown >= 12  # description, fault, note, detail, log, audit, alarm, cause, what was done, by whom
 
 
 def test_strangers_are_led_to_the_way_in(daemon: Asked, commissioned: Path) -> None:
@@ -161,7 +175,7 @@ def test_strangers_are_led_to_the_way_in(daemon: Asked, commissioned: Path) -> N
         answer = daemon.get(address)
         assert answer.status_code == 303, address
         assert answer.headers["location"].startswith("/login?next=%2F")
-    filled = {"arm": ARM, "job": "j1", "run": commissioned.name, "name": "n", "version": "v"}
+    filled = {"arm": ARM, "job": "j1", "run": commissioned.name, "name": "n", "version": "v", "number": 1}
     open_to_all = {"/login", "/logout", "/static/{version}/{name}", "/stop"}
     tried = 0
     for route in (route for router in PAGES for route in router.routes if isinstance(route, APIRoute)):
@@ -169,7 +183,7 @@ def test_strangers_are_led_to_the_way_in(daemon: Asked, commissioned: Path) -> N
             tried += 1
             answer = daemon.ask(method, route.path.format(**filled), headers=FORM)
             assert (answer.status_code, "/login" in answer.headers.get("location", "")) == (303, True), route.path
-    assert tried >= 20
+    assert tried >= 30
     for address in ("/new", f"/arms/{ARM}/move", f"/arms/{ARM}/accept", "/jobs/j1/cancel"):
         answer = daemon.post(address, content="a=b", headers=FORM)
         assert (answer.status_code, answer.headers["location"]) == (303, "/login?next=%2F"), address
@@ -184,11 +198,18 @@ def test_strangers_are_led_to_the_way_in(daemon: Asked, commissioned: Path) -> N
 def test_a_viewer_may_do_nothing_with_forms(daemon: Asked, commissioned: Path) -> None:
     enter(daemon, "viewer")
     sent = f"kind=run&run={commissioned.name}&note=n&name={ARM}&code=FOLLOWING_ERROR"
-    for name in ("confirm", "move", "jobs", "ack", "accept", "rollback", "pause"):
+    names = ("confirm", "move", "jobs", "ack", "accept", "rollback", "pause", "reidentify/confirm", "reidentify",
+             "schedules", "maintenance")  # fmt: skip
+    for name in names:
         answer = daemon.post(f"/arms/{ARM}/{name}", content=sent, headers=FORM)
         assert answer.status_code == 403, name
         assert complaints(answer.text) == []
-    assert daemon.post("/jobs/j1/cancel", content="", headers=FORM).status_code == 403
+    others = ("/jobs/j1/cancel", "/reidentifications/again/cancel", "/schedules/1/enabled", "/schedules/1/remove",
+              "/due/1/dismiss", "/alarms/1/ack")  # fmt: skip
+    for address in others:
+        assert daemon.post(address, content=sent, headers=FORM).status_code == 403, address
+    db = daemon.service.db
+    assert (len(schedules(db)), len(dues(db)), len(alarms(db)), len(events(db, ARM))) == (3, 1, 1, 1)
     assert daemon.get("/new").status_code == 403
     assert list(fault_file(daemon.service.state, ARM).latched()) == ["FOLLOWING_ERROR"]
 

@@ -12,6 +12,10 @@ from ident_service.service.api import arms, jobs
 from ident_service.service.api.asking import Operator, Service, Serving, Viewer
 from ident_service.service.arm_state import control_path, fault_file
 from ident_service.service.jobs.asked import MOVES, ArmName
+from ident_service.service.maintenance import schedules as planned
+from ident_service.service.maintenance.alarms import alarms
+from ident_service.service.maintenance.reidentification import known_reidentification, reidentifications
+from ident_service.service.pages.again import compared
 from ident_service.service.pages.asking import Form, PageRoute, seen
 from ident_service.service.pages.ladder import ladder
 from ident_service.service.pages.render import page
@@ -42,7 +46,12 @@ def list_arms(service: Serving, who: Viewer) -> Response:
         moving = in_use(control_path(service.state, row["name"]))
         lines.append({**row, "accepted": accepted.get(row["name"]), "faults": faults, "moving": moving})
     busy = rows.jobs(service.db, states=rows.LIVE, most=50)
-    return page("arms", who, arms=lines, jobs=[jobs.answer_of(service, row) for row in busy])
+    standing = _alarms(service, None)
+    due = planned.dues(service.db)
+    for line in lines:
+        line["alarms"] = sum(one["arm"] == line["name"] for one in standing)
+        line["dues"] = sum(one["arm"] == line["name"] for one in due)
+    return page("arms", who, arms=lines, alarms=standing, dues=due, jobs=[jobs.answer_of(service, row) for row in busy])
 
 
 @router.get("/new")
@@ -67,6 +76,8 @@ def show_arm(service: Serving, who: Viewer, arm: ArmName) -> Response:
     """One arm: where it stands on the ladder, what was recorded, and what was accepted."""
     answer = arms.get_arm(service, who, arm)
     config = known.known_arm(service.db, service.state, arm).config
+    due = planned.dues(service.db, answer.name)
+    scheduled = {row["id"]: row["motion"] for row in planned.schedules(service.db, answer.name)}
     sets = service.db.rows("SELECT run FROM parameter_sets WHERE arm = ?", answer.name)
     return page(
         "arm",
@@ -74,6 +85,12 @@ def show_arm(service: Serving, who: Viewer, arm: ArmName) -> Response:
         arm=answer,
         rungs=ladder(service.db, service.state, config),
         motions=known_motions.motions(service.db, answer.name),
+        alarms=_alarms(service, answer.name),
+        dues=due,
+        due_motion=next((motion for row in due if (motion := scheduled.get(row["schedule"]))), ""),
+        schedules=len(scheduled),
+        maintained=planned.events(service.db, answer.name, most=1),
+        agains=reidentifications(service.db, answer.name, most=20),
         runs=known_runs.runs(service.db, answer.name, most=20),
         identified=[row["run"] for row in sets],
         acts=list(reversed(arms.list_acceptances(service, who, arm))),
@@ -139,8 +156,18 @@ def roll_back(service: Serving, who: Operator, arm: ArmName, form: Form) -> Resp
 def pause(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
     """Let the arm stand, or go on."""
     (arms.pause if form.get("wanted") == "pause" else arms.resume)(service, who, arm)
-    job = form.get("job", "")
+    job, again = form.get("job", ""), form.get("again", "")
+    if again:
+        return seen(f"/reidentifications/{known_reidentification(service.db, again)['id']}?attended=1")
     return seen(f"/jobs/{rows.known_job(service.db, job)['id']}?attended=1" if job else f"/arms/{arm}")
+
+
+def _alarms(service: Service, arm: str | None) -> list[dict[str, Any]]:
+    """Drift alarms that stand, of an arm or of all, each with what was found."""
+    return [
+        {**row, "compared": compared(service.db, service.state, row["run"], row["what"])}
+        for row in alarms(service.db, arm, most=50)
+    ]
 
 
 def _asked(arm: str, form: dict[str, str]) -> dict[str, Any]:

@@ -59,12 +59,18 @@ class PageRoute(APIRoute):
                     return RedirectResponse(_way_in(request), 303)
                 return failure(request, error.status_code, str(error.detail))
             except (RequestValidationError, ValidationError) as error:
-                said = "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()[:5])
-                return failure(request, 422, said)
+                return failure(request, 422, words_of(error))
             except IdentError as error:
                 return failure(request, status_of(error), str(error))
 
         return handle
+
+
+def words_of(error: IdentError | RequestValidationError | ValidationError) -> str:
+    """What is wrong with what was asked, for a person."""
+    if isinstance(error, IdentError):
+        return str(error)
+    return "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()[:5])
 
 
 def failure(request: Request, status: int, words: str) -> Response:

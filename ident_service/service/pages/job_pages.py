@@ -54,7 +54,7 @@ def show_job(service: Serving, who: Viewer, job: Id, attended: bool = False) -> 
         live=live,
         lease="keep" if attends else "",
         recorded=row["kind"] in RECORDED,
-        log=_log(service, row),
+        log=log_of(service, row),
         entered=row["run"] is not None and service.db.row("SELECT 1 FROM runs WHERE id = ?", row["run"]) is not None,
         exports=_exported(service, row),
     )
@@ -96,14 +96,15 @@ def _exported(service: Service, row: Row) -> list[str]:
     )
 
 
-def _log(service: Service, row: Row) -> str:
+def log_of(service: Service, row: Row) -> str:
+    """The last of what the process of a job said."""
     log: str = jobs.without_paths(said(service.state / JOBS / row["id"], _LOG_BYTES).log, str(service.state))
     return log
 
 
 def _shown(service: Service, row: Row) -> str:
     answer = jobs.answer_of(service, row)
-    return json.dumps({"job": answer.model_dump(mode="json"), "log": _log(service, row)[-4096:]})
+    return json.dumps({"job": answer.model_dump(mode="json"), "log": log_of(service, row)[-4096:]})
 
 
 async def _events(service: Service, live: LiveRuns, row: Row) -> AsyncIterator[str]:

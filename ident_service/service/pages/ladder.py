@@ -1,7 +1,8 @@
 """The ladder of an arm: every step of its commissioning, what is done of it, and which comes next.
 
 Told from the registry and the arm's folder each time it is asked, so that it is true after any restart. Steps count
-from the last description on: another description begins the ladder anew.
+from the last description on: another description begins the ladder anew. What a re-identification did belongs to its
+own step alone. That step comes next whenever something is due or a drift alarm stands, and can be done.
 """
 
 from __future__ import annotations
@@ -19,6 +20,9 @@ from ident_service.motion.preflight.ticket import read_ticket
 from ident_service.service.acceptance import Acceptance, acceptances
 from ident_service.service.arm_state import ticket_path
 from ident_service.service.jobs.commands import EXPORTS, REPORTS
+from ident_service.service.maintenance.alarms import alarms
+from ident_service.service.maintenance.reidentification import reidentifications, require_comparable
+from ident_service.service.maintenance.schedules import dues
 from ident_service.service.registry import jobs as rows
 from ident_service.service.registry.database import Database, Row
 from ident_service.service.registry.motions import motions
@@ -48,14 +52,14 @@ class Step:
         state: `next` for exactly one step, unless a job of a step is under way, which then is `busy`; `skipped` for a
             rehearsal that a run went without.
         words: what is done of it.
-        job: id of the job that does it now.
+        link: page of what does it now.
     """
 
     key: str
     title: str
     state: StepState
     words: str
-    job: str | None = None
+    link: str | None = None
 
 
 @dataclass(frozen=True)
@@ -69,6 +73,7 @@ class Ladder:
         accepted: the current acceptance.
         exported: id of the job that exported the accepted parameters.
         reported: whether the identification has its report.
+        comparable: whether the arm can be re-identified: something is accepted that it can be compared with.
     """
 
     steps: tuple[Step, ...]
@@ -77,6 +82,7 @@ class Ladder:
     accepted: Acceptance | None
     exported: str | None
     reported: bool
+    comparable: bool
 
 
 def ladder(db: Database, state: Path, config: ArmConfig) -> Ladder:
@@ -88,7 +94,10 @@ def ladder(db: Database, state: Path, config: ArmConfig) -> Ladder:
     arm = config.name
     row = db.row("SELECT added FROM arms WHERE name = ?", arm)
     since = 0.0 if row is None else float(row["added"])
-    jobs = [one for one in rows.jobs(db, arm=arm, most=500) if one["created"] >= since]
+    again = reidentifications(db, arm, most=500)
+    made = {one[key] for one in again for key in ("recorded", "run")} - {None}
+    under_way = next((one for one in again if one["state"] == "running"), None)
+    jobs = [one for one in rows.jobs(db, arm=arm, most=500) if one["created"] >= since and one["run"] not in made]
     run = _newest(jobs, "run")
     identification = next((job for job in jobs if _identifies(job, run)), None)
     run_id, identified = _made(run), _made(identification)
@@ -100,6 +109,10 @@ def ladder(db: Database, state: Path, config: ArmConfig) -> Ladder:
     designed = len(motions(db, arm))
     checked, ticket = _ticket(ticket_path(state, arm), config)
     rehearsed = _newest(jobs, "rehearse")
+    comparable, words = _comparable(state, config) if accepted else (False, "first something has to be accepted")
+    asks = _asks(db, arm)
+    if comparable:
+        words = "; ".join(asks) or _last(again)
     done: dict[str, tuple[bool, str]] = {
         "description": (True, f"by its SHA-256 {config.sha256[:12]}"),
         "motion": (True, f"{designed} designed, and the description's own" if designed else "the description's own"),
@@ -115,10 +128,15 @@ def ladder(db: Database, state: Path, config: ArmConfig) -> Ladder:
         "report": (reported, "made" if reported else "not made yet"),
         "accept": (took, _accepted(accepted)),
         "export": (took and exported is not None, "made" if exported else "nothing exported of what is accepted"),
-        "again": (False, "after maintenance, or when the arm behaves otherwise: check, run, identify, compare"),
+        "again": (False, words),
     }
-    busy = {_step(job["kind"]): str(job["id"]) for job in reversed(jobs) if job["state"] in rows.LIVE}
-    upcoming = next(key for key, (finished, _) in done.items() if not finished)
+    live = [job for job in reversed(jobs) if job["state"] in rows.LIVE]
+    busy = {_step(job["kind"]): f"/jobs/{job['id']}" for job in live}
+    if under_way is not None:
+        own = under_way["job"]
+        busy = {_step(job["kind"]): f"/jobs/{job['id']}" for job in live if job["id"] != own}
+        busy["again"] = f"/reidentifications/{under_way['id']}"
+    upcoming = "again" if comparable and asks else next(key for key, (finished, _) in done.items() if not finished)
 
     def state_of(key: str) -> StepState:
         if key in busy:
@@ -128,7 +146,30 @@ def ladder(db: Database, state: Path, config: ArmConfig) -> Ladder:
         return "next" if key == upcoming and not busy else "open"
 
     steps = tuple(Step(key, TITLES[key], state_of(key), words, busy.get(key)) for key, (_, words) in done.items())
-    return Ladder(steps, run_id, identified, accepted, exported, reported)
+    return Ladder(steps, run_id, identified, accepted, exported, reported, comparable)
+
+
+def _comparable(state: Path, config: ArmConfig) -> tuple[bool, str]:
+    """Whether the arm can be compared with what is accepted, and if not, why."""
+    try:
+        require_comparable(state, config)
+    except IdentError as error:
+        return False, str(error).replace(f"{state}/", "")
+    return True, ""
+
+
+def _asks(db: Database, arm: str) -> list[str]:
+    """What asks for a re-identification, in words."""
+    due = [f"due: {row['cause']}" for row in dues(db, arm)]
+    return [*due, *(["a drift alarm stands"] if alarms(db, arm, most=1) else [])]
+
+
+def _last(again: list[Row]) -> str:
+    what = "after maintenance, or when the arm behaves otherwise: check, run, identify, compare with what is accepted"
+    if not again:
+        return what
+    when = datetime.fromtimestamp(again[0]["begun"], UTC).strftime("%Y-%m-%d %H:%M UTC")
+    return f"the last one, {when}: {again[0]['state']}; {what}"
 
 
 def _newest(jobs: list[Row], kind: str) -> Row | None:
@@ -158,7 +199,7 @@ def _accepted(act: Acceptance | None) -> str:
 
 
 def _step(kind: str) -> str:
-    return {"design": "motion", "home": "run", "simulate": "again"}.get(kind, kind)
+    return {"design": "motion", "home": "run", "simulate": "again", "judge": "again"}.get(kind, kind)
 
 
 def _ticket(path: Path, config: ArmConfig) -> tuple[bool, str]:

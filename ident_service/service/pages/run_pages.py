@@ -19,7 +19,7 @@ from ident_service.service.registry.audit import trail
 
 router = APIRouter(include_in_schema=False, route_class=PageRoute)
 # Of a page whose own style stands in it, and that needs nothing else.
-_POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'; sandbox"
+POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'; sandbox"
 
 
 @router.get("/runs")
@@ -49,7 +49,7 @@ def compare(service: Serving, who: Viewer, reference: Id, other: Id) -> Response
         raise UsageError("choose two different runs to compare")
     comparison, _ = compare_files([known.run_folder(service.db, service.state, one) for one in (reference, other)])
     text = comparison_html(comparison).replace(f"{service.state / known.RUNS}/", "")
-    return HTMLResponse(text, headers={"Content-Security-Policy": _POLICY})
+    return HTMLResponse(text, headers={"Content-Security-Policy": POLICY})
 
 
 @router.get("/audit")

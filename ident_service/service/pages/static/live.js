@@ -98,7 +98,8 @@ function showJob(text) {
   const { job: now, log } = JSON.parse(text);
   if (now.state !== "queued" && now.state !== "running") {
     closeStreams();
-    location.replace(`/jobs/${id}`);
+    const goesOn = new CustomEvent("job-ended", { cancelable: true });
+    if (document.dispatchEvent(goesOn)) location.replace(`/jobs/${id}`);
     return;
   }
   if (announced !== now.state) {

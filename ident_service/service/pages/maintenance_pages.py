@@ -1,0 +1,136 @@
+"""The page of an arm's maintenance: what is due, its schedules, what was done; and the answer to a drift alarm.
+
+A form with a mistake comes back as it was filled in, with the words that the API has for it.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from fastapi import APIRouter, Response
+from pydantic import ValidationError
+
+from ident_service.errors import IdentError, UsageError
+from ident_service.service.api import arms, maintenance
+from ident_service.service.api.asking import Operator, Service, Serving, Viewer
+from ident_service.service.api.maintenance import Number
+from ident_service.service.api.mistakes import status_of
+from ident_service.service.jobs.asked import ArmName
+from ident_service.service.maintenance import schedules as planned
+from ident_service.service.pages.asking import Form, PageRoute, seen, words_of
+from ident_service.service.pages.render import page
+from ident_service.service.registry import motions as known_motions
+from ident_service.service.registry.database import Row
+from ident_service.service.registry.runs import operating_seconds
+from ident_service.service.registry.tokens import Access
+
+router = APIRouter(include_in_schema=False, route_class=PageRoute)
+_HOURS: Final = "hours:"
+_HOUR = 3600.0
+
+
+@router.get("/arms/{arm}/maintenance")
+def show(service: Serving, who: Viewer, arm: ArmName) -> Response:
+    """What is due, by which schedules, and what was done."""
+    return _page(service, who, arm)
+
+
+@router.post("/arms/{arm}/schedules")
+def add_schedule(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
+    """Add a schedule."""
+    when = form.get("when", "")
+    body: dict[str, Any] = {"arm": arm, "maintenance": when == "maintenance"}
+    if when in ("cron", "hours"):
+        body[when] = form.get(when, "").strip()
+    if form.get("motion"):
+        body["motion"] = form["motion"]
+    try:
+        maintenance.add_schedule(service, who, maintenance.NewSchedule.model_validate(body))
+    except (IdentError, ValidationError) as error:
+        return _page(service, who, arm, form, error, "schedule")
+    return seen(f"/arms/{arm}/maintenance#schedules")
+
+
+@router.post("/schedules/{number}/enabled")
+def enable_schedule(service: Serving, who: Operator, number: Number, form: Form) -> Response:
+    """Let one count again from now, or no more."""
+    wanted = maintenance.Enabled(enabled=form.get("wanted") == "enable")
+    row = maintenance.enable_schedule(service, who, number, wanted)
+    return seen(f"/arms/{row.arm}/maintenance#schedules")
+
+
+@router.post("/schedules/{number}/remove")
+def remove_schedule(service: Serving, who: Operator, number: Number, form: Form) -> Response:
+    """Take one away."""
+    del form  # that it came from a page of ours is all that counts
+    arm = planned.known_schedule(service.db, number)["arm"]
+    maintenance.remove_schedule(service, who, number)
+    return seen(f"/arms/{arm}/maintenance#schedules")
+
+
+@router.post("/arms/{arm}/maintenance")
+def add_maintenance(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
+    """Maintenance was done; what is scheduled after it falls due."""
+    body = {"what": form.get("what", "").strip(), "note": form.get("note", "").strip()}
+    try:
+        maintenance.add_maintenance(service, who, arm, maintenance.Event.model_validate(body))
+    except (IdentError, ValidationError) as error:
+        return _page(service, who, arm, form, error, "event")
+    return seen(f"/arms/{arm}/maintenance#due")
+
+
+@router.post("/due/{number}/dismiss")
+def dismiss(service: Serving, who: Operator, number: Number, form: Form) -> Response:
+    """A person's word that what is due is not to be done."""
+    arm = next((row["arm"] for row in planned.dues(service.db) if row["id"] == number), None)
+    if arm is None:
+        raise UsageError(f"nothing of number {number} is due any more")
+    maintenance.dismiss_due(service, who, number, maintenance.Remark(note=form.get("note", "").strip()))
+    return seen(f"/arms/{arm}/maintenance#due")
+
+
+@router.post("/alarms/{number}/ack")
+def acknowledge(service: Serving, who: Operator, number: Number, form: Form) -> Response:
+    """A person's word that they know of a drift; the accepted set stays as it is."""
+    body = maintenance.Remark(note=form.get("note", "").strip())
+    return seen(f"/arms/{maintenance.acknowledge_alarm(service, who, number, body).arm}")
+
+
+def _page(
+    service: Service,
+    who: Access,
+    arm: str,
+    form: dict[str, str] | None = None,
+    problem: IdentError | ValidationError | None = None,
+    where: str = "",
+) -> Response:
+    """The page; after a mistake with the form as it was filled in, and the words beside it."""
+    answer = arms.get_arm(service, who, arm)
+    driven = operating_seconds(service.db, answer.name)
+    status = 200 if problem is None else 422 if isinstance(problem, ValidationError) else status_of(problem)
+    return page(
+        "maintenance",
+        who,
+        status,
+        arm=answer,
+        dues=planned.dues(service.db, answer.name),
+        schedules=[_line(row, driven) for row in planned.schedules(service.db, answer.name)],
+        events=planned.events(service.db, answer.name, most=50),
+        motions=known_motions.motions(service.db, answer.name),
+        hours=driven / _HOUR,
+        filled=form or {},
+        problem="" if problem is None else words_of(problem),
+        where=where,
+        longest={"what": planned.LONGEST_WHAT, "note": planned.LONGEST_NOTE},
+    )
+
+
+def _line(row: Row, driven: float) -> dict[str, Any]:
+    """A schedule in words: when it is due, and what comes next."""
+    if row["cron"]:
+        return {**row, "words": f"at {row['cron']}", "coming": None}
+    if not row["trigger"].startswith(_HOURS):
+        return {**row, "words": "after maintenance", "coming": "when maintenance is entered"}
+    hours = float(row["trigger"].removeprefix(_HOURS))
+    left = max(0.0, hours - (driven - row["counted"]) / _HOUR)
+    return {**row, "words": f"every {hours:g} operating hours", "coming": f"in {left:.3g} operating hours"}
