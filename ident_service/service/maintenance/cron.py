@@ -107,7 +107,7 @@ def _field(word: str, name: str, lowest: int, highest: int, names: dict[str, int
             last = _number(found["last"], names, name)
         step = int(found["step"] or 1)
         if not lowest <= first <= last <= highest or step < 1:
-            raise UsageError(f"{part!r}: a {name} of cron is from {lowest} to {highest}, in rising order")
+            raise UsageError(f"{part!r}: the {name} of cron is from {lowest} to {highest}, in rising order")
         numbers.update(range(first, last + 1, step))
     return numbers
 
