@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 from fastapi import FastAPI
@@ -32,12 +32,11 @@ ROUTERS = (about.router, arms.router, jobs.router, runs.router, maintenance.rout
 """In this order."""
 
 
-def create_app(settings: Settings, ready: Callable[[Service], None] = lambda _: None) -> FastAPI:
+def create_app(settings: Settings) -> FastAPI:
     """The service as an ASGI application; its database is opened now, its queue runs while its lifespan does.
 
     Args:
         settings: how it runs.
-        ready: called when it answers.
 
     Raises:
         UsageError: the state folder cannot be used.
@@ -59,7 +58,6 @@ def create_app(settings: Settings, ready: Callable[[Service], None] = lambda _: 
         settle(db, settings.state)
         engine.start(lambda: rebuild_runs(db, settings.state))
         keeper.start()
-        ready(service)
         try:
             yield
         finally:
