@@ -4,7 +4,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: demo test unit coverage lint types bench bench-design bench-canopen campaign test-socketcan test-foreign clean
+.PHONY: demo test unit coverage lint types bench bench-design bench-canopen bench-serve bench-viewers campaign test-socketcan test-foreign clean
 
 demo: $(READY)
 	$(BIN)/ident simulate
@@ -40,6 +40,13 @@ bench-design: $(READY)
 
 bench-canopen: $(READY)
 	$(BIN)/python -m benchmarks.canopen
+
+# The daemon's first page; and what ten viewers of the live page cost the loop.
+bench-serve: $(READY)
+	$(BIN)/python -m benchmarks.serve
+
+bench-viewers: $(READY)
+	$(BIN)/python -m benchmarks.viewers
 
 campaign: $(READY)
 	$(BIN)/pytest -m campaign --timeout 7200

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 from fastapi import FastAPI
@@ -35,12 +35,11 @@ ROUTERS = (
 """In this order."""
 
 
-def create_app(settings: Settings, ready: Callable[[Service], None] = lambda _: None) -> FastAPI:
+def create_app(settings: Settings) -> FastAPI:
     """The service as an ASGI application; its database is opened now, its queue runs while its lifespan does.
 
     Args:
         settings: how it runs.
-        ready: called when it answers.
 
     Raises:
         UsageError: the state folder cannot be used.
@@ -62,7 +61,6 @@ def create_app(settings: Settings, ready: Callable[[Service], None] = lambda _: 
         settle(db, settings.state)
         engine.start(lambda: rebuild_runs(db, settings.state))
         keeper.start()
-        ready(service)
         try:
             yield
         finally:

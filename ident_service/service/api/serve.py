@@ -44,13 +44,13 @@ def serve(settings: Settings, tell: Callable[[str], None] = lambda _: None) -> N
         host, port = listening.getsockname()[:2]
         url = f"{'https' if settings.tls else 'http'}://{f'[{host}]' if ':' in host else host}:{port}"
 
-        def ready(_: Service) -> None:
+        def ready() -> None:
             # In the file for programs that start us and let us choose the port.
             write_atomically(settings.state / URL_FILE, url + "\n")
             tell(url)
             tell_manager("READY=1")
 
-        app = create_app(settings, ready)
+        app = create_app(settings)
         config = uvicorn.Config(
             app,
             log_config=None,
@@ -64,7 +64,7 @@ def serve(settings: Settings, tell: Callable[[str], None] = lambda _: None) -> N
             ssl_certfile=settings.tls_cert,
             ssl_keyfile=settings.tls_key,
         )
-        server = _Server(config, app.state.service)
+        server = _Server(config, app.state.service, ready)
         try:
             server.run(sockets=[listening])
         finally:
@@ -100,9 +100,15 @@ def single_instance(state: Path) -> Iterator[None]:
 class _Server(uvicorn.Server):
     """uvicorn's, that stops the arms as soon as it is to end, and tells the service manager that it lives."""
 
-    def __init__(self, config: uvicorn.Config, service: Service) -> None:
+    def __init__(self, config: uvicorn.Config, service: Service, ready: Callable[[], None]) -> None:
         super().__init__(config)
-        self._service = service
+        self._service, self._ready = service, ready
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Listen, and only then say so: whoever comes at the word is not refused."""
+        await super().startup(sockets)
+        if self.started:
+            self._ready()
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """A signal: the arms first. Another interrupt means in a hurry, and they are being stopped already."""
