@@ -21,6 +21,7 @@ from ident_service.record.recording import Block
 from ident_service.record.tail import RecordingTail
 
 _LOOK = 0.3  # s between looks
+_IN_A_ROW = 2  # steps in which the target is reached: deviations are estimates, and one that dips is no knowledge
 
 
 def main() -> int:
@@ -48,6 +49,7 @@ def watch(folder: Path, target: Target, least: float) -> dict[str, Any] | None:
     places = target.places(growing.base, model.config.name)
     if (tail := _opened(folder)) is None:
         return None
+    row = 0
     while True:
         samples = tail.read()
         if samples is not None:
@@ -58,7 +60,8 @@ def watch(folder: Path, target: Target, least: float) -> dict[str, Any] | None:
             continue
         seconds = (doubt.until_ns - tail.exciting_ns) * 1e-9
         worst = worst_share(doubt, growing.base, places)
-        if seconds >= least and worst <= target.share:
+        row = row + 1 if seconds >= least and worst <= target.share else 0
+        if row >= _IN_A_ROW:
             return {"seconds": round(seconds, 3), "share": worst}
 
 

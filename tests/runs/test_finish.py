@@ -74,8 +74,8 @@ def test_a_run_ends_early_with_what_it_is_for(
     content = json.loads((tmp_path / "result" / "parameters.json").read_text())
     table = content["base_parameters"]
     found = shares(np.array(table["values"]), np.array(table["standard_deviations"]), tuple(table["units"]))
-    # The result smooths the whole recording and trims its ends; more of it went in than when the target was reached.
-    assert (found <= 1.2 * SHARE).all(), found
+    # Deviations from 40 blocks are known to 11 % themselves, and the result smooths otherwise than what is watched.
+    assert (found <= 1.35 * SHARE).all(), found
     assert content["feasibility"]["feasible"]
 
 
