@@ -251,7 +251,7 @@ def test_without_any_way_a_finish_ends_as_a_pause_does(
 
 
 def test_the_way_back_keeps_clear(make: Callable[..., Bench]) -> None:
-    """A ball beside the straight way home: with it the way is none, and the planned one is taken instead."""
+    """A ball in the middle of the straight way home: with it that way is none."""
     bodies = {
         name: [{"from": (-0.45, 0.0, 0.0), "to": (0.0, 0.0, 0.0), "radius": 0.02}] for name in ("shoulder", "elbow")
     }
