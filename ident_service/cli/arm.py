@@ -1,4 +1,4 @@
-"""Verbs at an arm: `watch`, `check`, `rehearse`, `run`; and `stop`, `pause`, `resume`, `ack` from any terminal.
+"""Verbs at an arm: `watch`, `check`, `rehearse`, `run`; from any terminal `stop`, `pause`, `resume`, `finish`, `ack`.
 
 Boundary: words to requests, results to words; the work is `service/run.py`. `stop` asks for nothing, waits for nobody.
 """
@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Any
 from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
 from ident_service.cli.lease import add_lease, asked_lease, until
 from ident_service.cli.moving import RELEASED, HeldKey, add_can_log, moved, require_terminal
-from ident_service.cli.words import Parser, Verbs, seconds, speed
+from ident_service.cli.words import Parser, Verbs, seconds, share, speed
 from ident_service.errors import DriverError, MotionRefused, UsageError
 
 if TYPE_CHECKING:
     from ident_service.config.schema import ArmConfig
+    from ident_service.estimation.target import Target
     from ident_service.excitation.excitation import Excitation
 
 _REHEARSAL = 0.2
@@ -39,6 +40,19 @@ def add(verbs: Verbs) -> None:
     sub = verbs.add("run", _run, "move the arm along a motion and record it")
     _motion(sub)
     sub.add_argument("--speed", type=speed, default=1.0, metavar="SHARE", help="of the motion's own speed")
+    sub.add_argument(
+        "--until",
+        type=share,
+        metavar="SHARE",
+        help="end early, in order, once every deviation is at most this share of its parameter (0.05)",
+    )
+    sub.add_argument(
+        "--parameter",
+        dest="chosen",
+        action="append",
+        metavar="EXPRESSION",
+        help="with --until: only this base parameter counts, as `ident base` prints it; may be repeated",
+    )
     sub = verbs.add("rehearse", _rehearse, "the run at a fifth of its speed, while the space bar is held")
     _motion(sub)
     sub.add_argument("--no-key", action="store_true", help="no key to hold; Ctrl-C and `ident stop` stop")
@@ -47,6 +61,7 @@ def add(verbs: Verbs) -> None:
         ("stop", "bring the arm to a controlled stop; needs no lease and always works"),
         ("pause", "let the arm stand"),
         ("resume", "let it go on"),
+        ("finish", "leave out the rest of the motion: the arm goes back to where it stood, and the run is done"),
     ):
         sub = verbs.add(name, _ask, text)
         sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
@@ -153,7 +168,19 @@ def _run(arguments: argparse.Namespace, seconds: float | None = None) -> Answer:
             speed=arguments.speed,
             lease=seconds,
             stop_requested=until(stopping.requested, lease),
+            until=_target(arguments),
         )
+
+
+def _target(arguments: argparse.Namespace) -> Target | None:
+    """What is to be known before the run may end early."""
+    if getattr(arguments, "until", None) is None:
+        if getattr(arguments, "chosen", None):
+            raise UsageError("--parameter is what --until SHARE is about; give both")
+        return None
+    from ident_service.estimation.target import Target
+
+    return Target(arguments.until, tuple(arguments.chosen or ()))
 
 
 def _rehearse(arguments: argparse.Namespace) -> Answer:
@@ -197,6 +224,8 @@ def _ask(arguments: argparse.Namespace) -> Answer:
             raise UsageError(f"nobody moves {name}; no motion will begin that was asked for before now ({path})")
     else:
         with ControlFile.reach(path) as controls:
+            if arguments.asks == "finish":
+                controls.ask_finish()
             controls.ask_pause(arguments.asks == "pause")
             pid = controls.pid
     document: dict[str, Any] = {"arm": name, "asked": arguments.asks, "pid": pid}

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ident_service.config.schema import ArmConfig
+    from ident_service.estimation.target import Target
     from ident_service.excitation.excitation import Excitation
     from ident_service.motion.plans import Destination
 
@@ -117,6 +118,7 @@ def moved(
     speed: float = 1.0,
     lease: float | None = None,
     stop_requested: Callable[[], bool],
+    until: Target | None = None,
 ) -> Answer:
     """Move the arm and say how it went.
 
@@ -128,6 +130,7 @@ def moved(
         speed: share of the motion's own.
         lease: how long the arm moves on when this process is gone [s]; None for the ordinary one.
         stop_requested: asked several times per lease.
+        until: what is to be known, whereupon the run is finished early.
 
     Raises:
         As `service.run.run_motion`; MotionRefused without a ticket.
@@ -164,6 +167,7 @@ def moved(
             asked_ns=arguments.asked_ns,
             tell=lambda word: tell(arguments, word),
             stop_requested=stop_requested,
+            until=until,
         )
     except IdentError as error:
         if begun and folder.exists():
@@ -218,7 +222,9 @@ def _report_text(report: dict[str, Any]) -> str:
     frames = f"can.log: {report['frames_logged']}\n" if "frames_logged" in report else ""
     warnings = ", ".join(f"{code} {count} times" for code, count in report["warnings"].items()) or "none"
     lateness, compute = report["lateness"], report["compute"]
-    ended = f"{report['state']} after {report['cycles']} cycles; warnings: {warnings}\n{report['real_time']}"
+    early = f"finished early, after {report['motion_seconds']:.1f} s of the motion\n" if "finished" in report else ""
+    early += f"not finished early: {report['not_finished']}\n" if "not_finished" in report else ""
+    ended = f"{early}{report['state']} after {report['cycles']} cycles; warnings: {warnings}\n{report['real_time']}"
     if lateness is None or compute is None:
         return f"{ended}: nothing was timed\n{frames}"
     return (

@@ -155,7 +155,16 @@ def _run(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
         "arm": arguments.arm,
         "motion": motion_id(client, arguments.arm, arguments.motion),
         "speed": arguments.speed,
+        "until": _until(arguments),
     }
+
+
+def _until(arguments: argparse.Namespace) -> dict[str, Any] | None:
+    if arguments.until is None:
+        if arguments.chosen:
+            raise UsageError("--parameter is what --until SHARE is about; give both")
+        return None
+    return {"share": arguments.until, "parameters": arguments.chosen or []}
 
 
 def _home(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -210,7 +219,7 @@ REMOTE: dict[str, Verb] = {
     "check": asked(_check),
     "run": asked(_run),
     "home": asked(_home),
-    **dict.fromkeys(("stop", "pause", "resume"), _ask),
+    **dict.fromkeys(("stop", "pause", "resume", "finish"), _ask),
     "ack": _ack,
     "jobs list": _list,
     "jobs show": _show,
@@ -236,9 +245,9 @@ _CARRIED: dict[str, frozenset[str]] = {
     "identify": frozenset({"arm", "recordings", "validate", "method", "feasible_set", "prior"}),
     "design": frozenset({"arm", "seconds", "starts", "seed", "criterion", "chosen", "motion", "after"}),
     "check": _MOTION | {"home"},
-    "run": _MOTION | {"speed"},
+    "run": _MOTION | {"speed", "until", "chosen"},
     "home": frozenset({"arm", "confirm", "zero"}),
-    **dict.fromkeys(("stop", "pause", "resume"), frozenset({"arm"})),
+    **dict.fromkeys(("stop", "pause", "resume", "finish"), frozenset({"arm"})),
     "ack": frozenset({"arm", "fault"}),
     "jobs list": frozenset({"most"}),
     **dict.fromkeys(("jobs show", "jobs watch", "jobs cancel"), frozenset({"job"})),

@@ -50,8 +50,13 @@ def block_covariance(equations: Equations, fit: LeastSquares) -> Array:
 
 def verdicts(beta: Array, deviations: Array, units: tuple[str, ...]) -> tuple[Verdict, ...]:
     """A word per parameter: its deviation against the larger of its size and the reference of its unit."""
-    result: list[Verdict] = []
-    for value, deviation, unit in zip(beta, deviations, units, strict=True):
-        share = deviation / max(abs(value), REFERENCE.get(unit, 0.0), np.finfo(float).tiny)
-        result.append("identified" if share < IDENTIFIED_BELOW else "weak" if share < WEAK_BELOW else "unidentified")
-    return tuple(result)
+    return tuple(
+        "identified" if share < IDENTIFIED_BELOW else "weak" if share < WEAK_BELOW else "unidentified"
+        for share in shares(beta, deviations, units)
+    )
+
+
+def shares(beta: Array, deviations: Array, units: tuple[str, ...]) -> Array:
+    """Each deviation as a share of the larger of the parameter's size and the reference of its unit, shape (base,)."""
+    sizes = [max(abs(beta[k]), REFERENCE.get(unit, 0.0), np.finfo(float).tiny) for k, unit in enumerate(units)]
+    return np.asarray(deviations / np.array(sizes))

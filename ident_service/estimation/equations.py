@@ -88,7 +88,7 @@ class Equations:
         """The equations of both."""
         parts = [part for part in (self.left_out, other.left_out) if part is not None]
         return Equations(
-            _bounded([*self.blocks, *other.blocks]),
+            bounded([*self.blocks, *other.blocks]),
             self.samples + other.samples,
             reduce(Information.merged, parts) if parts else None,
         )
@@ -131,7 +131,7 @@ def equations(
             current = number[begin]
         rest = information_of(rows.H_b, rows.torque, ~rows.keep, joint_supports)
         left_out = rest if left_out is None else left_out.merged(rest)
-        blocks = list(_bounded(blocks))
+        blocks = list(bounded(blocks))
     result = Equations(tuple(blocks), samples, left_out)
     still = [name for name, count in zip(model.chain.names, result.total.rows, strict=True) if count == 0]
     if still:
@@ -204,7 +204,8 @@ def _filtered_rows(recording: Recording, model: ArmModel, base: BaseParameters, 
         yield Rows(motion.time, filtered, torque[inner], motion.keep, motion.position, motion.velocity)
 
 
-def _bounded(blocks: list[Information]) -> tuple[Information, ...]:
+def bounded(blocks: list[Information]) -> tuple[Information, ...]:
+    """At most `MAX_BLOCKS`: when there are more, neighbours merge in pairs."""
     while len(blocks) > MAX_BLOCKS:
         pairs = [blocks[i].merged(blocks[i + 1]) for i in range(0, len(blocks) - 1, 2)]
         blocks = pairs + blocks[2 * len(pairs) :]

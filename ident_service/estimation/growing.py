@@ -3,7 +3,8 @@
 New samples wait until they make a window long enough for the zero-phase filter; the window's equations are merged into
 the factor (`model/information.py`) and all but its end is forgotten. Work and memory of a step are bounded, whatever
 the length of the run. Deviations are those of eq. 81, which takes residuals for white: they show how doubt shrinks; the
-result's own come from blocks (`doubt.py`) and are larger.
+result's own come from blocks (`doubt.py`) and are larger. What is decided while the arm moves is decided by the larger
+of both, for which the information of each block is kept, too.
 """
 
 from __future__ import annotations
@@ -13,18 +14,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ident_service.config.recording import RecordingFormat
 from ident_service.errors import RecordingError
-from ident_service.estimation.doubt import Verdict, verdicts
-from ident_service.estimation.equations import equation_rows
+from ident_service.estimation.doubt import Verdict, block_covariance, verdicts
+from ident_service.estimation.equations import Equations, Rows, bounded, equation_rows
 from ident_service.estimation.least_squares import ordinary_least_squares
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import base_parameters
 from ident_service.model.chain import Array
-from ident_service.model.information import empty_information, information_of, supports
+from ident_service.model.information import Information, empty_information, information_of, supports
 from ident_service.model.threads import one_blas_thread
-from ident_service.record.recording import BLOCK_SAMPLES, Block, cut, join
+from ident_service.record.recording import BLOCK_SAMPLES, Block, Stamps, cut, join
 
 _FIRST = 2.0  # s; a filter that needs more says so, and gets it
 _LONGEST = 60.0  # s
@@ -38,14 +40,19 @@ class Doubt:
     Attributes:
         seconds: of motion that went in [s].
         beta: least squares, each joint's equations divided by its residual [SI], shape (base,).
-        deviations: eq. 81 [SI], infinite where nothing is known yet, shape (base,).
+        deviations: eq. 81 [SI], or what blocks say where that is more and they are kept; infinite where nothing is
+            known yet, shape (base,).
         verdicts: a word per base parameter.
+        blocks: that were kept.
+        until_ns: stamp of the last sample that went in.
     """
 
     seconds: float
     beta: Array
     deviations: Array
     verdicts: tuple[Verdict, ...]
+    blocks: int = 0
+    until_ns: int = 0
 
 
 class GrowingInformation:
@@ -55,11 +62,12 @@ class GrowingInformation:
         base: the grouping of the parameters.
     """
 
-    def __init__(self, model: ArmModel) -> None:
+    def __init__(self, model: ArmModel, *, in_blocks: bool = False) -> None:
         """Nothing is known yet.
 
         Args:
             model: of the arm; averaging over periods and trimming, which need a whole recording, are left out.
+            in_blocks: whether the information of each block is kept, and deviations are as careful as the result's.
         """
         options = model.config.identification.model_copy(update={"period": None})
         config = model.config.model_copy(update={"identification": options, "recording": RecordingFormat()})
@@ -67,6 +75,8 @@ class GrowingInformation:
         self.base = base_parameters(model.chain, model.layout)
         self._supports = supports(model.chain, model.layout, self.base.base)
         self._information = empty_information(self._supports, self.base.size)
+        self._blocks: list[Information] | None = [] if in_blocks else None
+        self._number, self._origin_ns = -1, -1
         self._waiting: list[Block] = []
         self._need, self._done_ns, self._seconds = _FIRST, -1, 0.0
 
@@ -108,9 +118,26 @@ class GrowingInformation:
                 continue
             block = information_of(rows.H_b[:, :, new], rows.torque[new], rows.keep[new], self._supports)
             self._information = self._information.merged(block)
+            if self._blocks is not None:
+                self._keep(self._blocks, rows, time_ns, new)
             self._seconds += float(rows.time[new][-1] - rows.time[new][0])
             self._done_ns, found = int(time_ns[-1]), True
         return found
+
+    def _keep(self, blocks: list[Information], rows: Rows, time_ns: Stamps, new: NDArray[np.bool_]) -> None:
+        """The same equations by stretches of time, as `equations.py` has them of a whole recording."""
+        if self._origin_ns < 0:
+            self._origin_ns = int(time_ns[new][0])
+        numbers = (time_ns - self._origin_ns) // int(self._model.config.identification.block * 1e9)
+        for number in np.unique(numbers[new]).tolist():
+            part = new & (numbers == number)
+            block = information_of(rows.H_b[:, :, part], rows.torque[part], rows.keep[part], self._supports)
+            if number == self._number:
+                blocks[-1] = blocks[-1].merged(block)
+            else:
+                blocks.append(block)
+            self._number = number
+        self._blocks = list(bounded(blocks))
 
     @one_blas_thread()
     def doubt(self) -> Doubt | None:
@@ -122,8 +149,12 @@ class GrowingInformation:
         spread = np.sqrt(information.squared_residuals(fit.beta) / np.maximum(information.rows, 1))
         floor = 1e-9 * np.sqrt(information.squared_torques() / np.maximum(information.rows, 1)) + 1e-300
         fit = ordinary_least_squares(information, np.where(information.rows > 0, 1.0 / np.maximum(spread, floor), 1.0))
-        deviations = fit.standard_deviations
-        return Doubt(self._seconds, fit.beta, deviations, verdicts(fit.beta, deviations, self.base.units))
+        deviations, blocks = fit.standard_deviations, self._blocks or []
+        if blocks:
+            spread = np.sqrt(np.diag(block_covariance(Equations(tuple(blocks), 0), fit)))
+            deviations = np.maximum(deviations, spread)
+        words = verdicts(fit.beta, deviations, self.base.units)
+        return Doubt(self._seconds, fit.beta, deviations, words, len(blocks), self._done_ns)
 
 
 class _Window:

@@ -7,6 +7,7 @@
 | 12 | uint32 | pid of the process that moves the arm |
 | 16 | uint8 | stop: not 0 for a controlled stop; never taken back |
 | 17 | uint8 | pause: not 0 while the arm shall stand |
+| 18 | uint8 | finish: not 0 when the run shall end early, in order; never taken back |
 | 24 | int64 | when the lease was renewed last [ns of the machine's monotonic clock] |
 | 32 | int64 | how long it lasts [ns]; 0 for none |
 | 40 | int64 | when a stop was asked for last, whether or not the arm moved then [ns of the same]; 0 for never |
@@ -37,7 +38,7 @@ from typing import Self
 from ident_service.errors import DriverError, UsageError
 
 _MAGIC, _VERSION, _SIZE = b"identctl", 1, 64
-_PID, _STOP, _PAUSE, _RENEWED, _LENGTH, _STOPPED = 12, 16, 17, 24, 32, 40
+_PID, _STOP, _PAUSE, _FINISH, _RENEWED, _LENGTH, _STOPPED = 12, 16, 17, 18, 24, 32, 40
 _TRIES, _TRY_AGAIN = 20, 0.005  # s; who looks whether the file is in use holds it for a moment
 
 
@@ -164,6 +165,15 @@ class ControlFile:
     def ask_pause(self, wanted: bool) -> None:
         """Let the arm stand, or go on."""
         self._memory[_PAUSE] = int(wanted)
+
+    @property
+    def finish(self) -> bool:
+        """Whether the run is to end early, where it began."""
+        return self._memory[_FINISH] != 0
+
+    def ask_finish(self) -> None:
+        """Let the run end early, in order; cannot be taken back. A pause stays one until that is taken back."""
+        self._memory[_FINISH] = 1
 
     def renew(self) -> None:
         """Say that whoever asked for motion is still there."""

@@ -1,4 +1,4 @@
-"""What people and programs may ask of a motion while it runs: stop, pause, and that they are still there.
+"""What people and programs may ask of a motion while it runs: stop, pause, finish, and that they are still there.
 
 The loop reads this once per cycle, so it must answer at once: a word of shared memory, an attribute, never a lock.
 Stop needs no lease. Hold-to-run is nothing but a short lease.
@@ -24,14 +24,19 @@ class Controls(Protocol):
     def pause(self) -> bool:
         """Whether the arm is to stand; it goes on when this is False again."""
 
+    @property
+    def finish(self) -> bool:
+        """Whether what is left of the motion is to be left out: the arm rests, and goes back to where it stood."""
+
     def lease_ok(self, now_ns: int) -> bool:
         """Whether whoever asked for motion is still there at this time of the loop's clock [ns]."""
 
 
 class StopWhen:
-    """Controls of a run that nobody pauses: stops when a function says so."""
+    """Controls of a run that nobody pauses or finishes early: stops when a function says so."""
 
     pause = False
+    finish = False
 
     def __init__(self, asked: Callable[[], bool] = lambda: False) -> None:
         self._asked = asked
@@ -52,6 +57,7 @@ class Switches:
     Attributes:
         stop: the arm is to stop.
         pause: the arm is to stand.
+        finish: the run is to end early.
     """
 
     def __init__(self, lease_seconds: float | None = None) -> None:
@@ -62,6 +68,7 @@ class Switches:
         """
         self.stop = False
         self.pause = False
+        self.finish = False
         self._length_ns = None if lease_seconds is None else round(lease_seconds * 1e9)
         self._renewed_ns: int | None = None
 

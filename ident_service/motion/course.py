@@ -1,5 +1,8 @@
 """Which reference is followed, from state to state: approach, motion, return, pauses in any of them, the stop.
 
+A run that is finished early pauses, and goes straight back to where it stood instead of on. Where that way is not free
+it goes on: what was planned is proven, and ends in order too.
+
 Boundary: references and states. Whether the arm itself follows, and rests when its reference does, is `loop.py`'s.
 """
 
@@ -10,10 +13,13 @@ from collections.abc import Generator, Sequence
 from ident_service.config.limits import MotionLimits
 from ident_service.errors import MotionRefused
 from ident_service.motion.pause import Paused, Resumed
-from ident_service.motion.reference import Reference, Setpoint, hold
+from ident_service.motion.reference import Reference, Setpoint, hold, rest
 from ident_service.motion.states import MOVING, STOPPABLE, State, States
 from ident_service.motion.stop import stop
 from ident_service.motion.surroundings import Surroundings
+from ident_service.motion.way import RuckigReference
+
+_UNDER_WAY = (*MOVING, State.PAUSING, State.PAUSED, State.RESUMING)
 
 
 class Course:
@@ -23,6 +29,8 @@ class Course:
         reference: of the last cycle.
         first: the state of the first way.
         complete: whether the last way has been followed to its end.
+        finished_at: of a run that was finished early, how much of its excitation was made [s]; None for any other.
+        not_finished: why a run that was to be finished early goes on; empty for any other.
     """
 
     def __init__(
@@ -40,7 +48,8 @@ class Course:
 
         Args:
             states: armed when the first cycle comes.
-            legs: ways and the states in which they are followed, in order; states is armed, the first comes next.
+            legs: ways and the states in which they are followed, in order; states is armed, the first comes next. Where
+                there are several, the last one leads back to `start`.
             start: where the arm stands.
             limits: of the arm, for stops and pauses.
             resuming: of ways out of pauses.
@@ -49,6 +58,9 @@ class Course:
         """
         self.reference = start
         self.complete = False
+        self.finished_at: float | None = None
+        self.not_finished = ""
+        self._start = rest(start.position)
         self._states = states
         self._limits, self._resuming, self._surroundings = limits, resuming, surroundings
         self._held = held
@@ -56,8 +68,10 @@ class Course:
         self._begin_ns: int | None = None
         self._left = self.first  # what a pause interrupts
         self._paused: Paused | None = None
-        self._search: Generator[None, None, Resumed] | None = None
+        self._search: Generator[None, None, Resumed | RuckigReference] | None = None
         self._back: Resumed | None = None
+        self._finishing = False  # asked for, which counts once
+        self._away: RuckigReference | None = None  # the way back of a run that is finished early
 
     def at(self, stamp_ns: int) -> Setpoint:
         """The reference of the cycle with this stamp [ns]; states follow each other as their references end."""
@@ -109,7 +123,25 @@ class Course:
         """The arm rests at the end of a pause's stop: it is paused, and the way back can be looked for."""
         self._states.enter(State.PAUSED)
         if self._paused is not None:
-            self._search = self._paused.resume_in_slices(self._resuming, self._surroundings)
+            self._search = self._way_out(self._paused)
+
+    def finish(self, stamp_ns: int) -> None:
+        """Turn back early, by way of a pause; once, and only before the last way, or else without effect."""
+        if self._finishing or not self._later or self._states.state not in _UNDER_WAY:
+            return
+        self._finishing = True
+        self.pause(stamp_ns)
+        if self._states.state is State.PAUSED and self._paused is not None:
+            self._back, self._search = None, self._way_out(self._paused)
+
+    def _way_out(self, paused: Paused) -> Generator[None, None, Resumed | RuckigReference]:
+        """The search for the way out of a pause: straight back to the start once the run is to be finished early."""
+        if self._finishing and self._later and not self.not_finished:
+            try:
+                return (yield from paused.leave_in_slices(self._start, self._resuming, self._surroundings))
+            except MotionRefused as refusal:
+                self.not_finished = str(refusal)
+        return (yield from paused.resume_in_slices(self._resuming, self._surroundings))
 
     def look_for_way_back(self) -> str | None:
         """While paused, one slice of the search for the way back; why there is none, when that turns out."""
@@ -118,15 +150,23 @@ class Course:
         try:
             next(self._search)
         except StopIteration as found:
-            self._back, self._search = found.value, None
+            self._search = None
+            if isinstance(found.value, RuckigReference):
+                self._away = found.value
+            else:
+                self._back = found.value
         except MotionRefused as refusal:
             self._search = None
             return str(refusal)
         return None
 
     def go_on(self, stamp_ns: int) -> None:
-        """Leave a pause, as soon as the way back is found."""
-        if self._back is not None:
+        """Leave a pause, as soon as the way out is found."""
+        if self._away is not None and self._paused is not None:
+            self.finished_at = self._paused.time if self._left is State.EXCITING else 0.0
+            self._states.enter(State.RETURNING)
+            self._later, self._begin_ns, self._way, self._away = [], stamp_ns, self._away, None
+        elif self._back is not None:
             self._states.enter(State.RESUMING)
             self._begin_ns, self._way = stamp_ns, self._back
 

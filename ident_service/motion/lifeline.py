@@ -41,6 +41,11 @@ class Lifeline:
         return self._controls.pause
 
     @property
+    def finish(self) -> bool:
+        """Whether the run is to end early."""
+        return self._controls.finish
+
+    @property
     def cut(self) -> bool:
         """Whether the other end of the pipe is closed."""
         return bool(self._poll.poll(0))

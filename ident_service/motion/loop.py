@@ -22,7 +22,7 @@ from ident_service.motion.control import ComputedTorque
 from ident_service.motion.controls import Controls
 from ident_service.motion.course import Course
 from ident_service.motion.deadlines import Deadlines
-from ident_service.motion.faults import LOWER, LOWER_AFTER, SETTLE, Fault, Reaction
+from ident_service.motion.faults import LOWER, LOWER_AFTER, SETTLE, Fault, Reaction, Severity
 from ident_service.motion.guard import Guard
 from ident_service.motion.latch import Latch
 from ident_service.motion.reference import Setpoint, rest
@@ -204,6 +204,7 @@ class Loop:
         """Do what is asked from outside; whatever is wrong with that, too, stops the arm."""
         try:
             stop, pause, lease = self.controls.stop, self.controls.pause, self.controls.lease_ok(now_ns)
+            finish = self.controls.finish
         except Exception as error:  # noqa: BLE001 - whatever reading it died of, the arm must not fall for it
             self._react(
                 self.guard.findings.found("controls_failed", f"reading the controls failed ({error!r})"), stamp_ns
@@ -213,14 +214,24 @@ class Loop:
             self.course.stop(stamp_ns)
         elif not lease:
             self._lapse(stamp_ns)
-        elif pause:
-            self.course.pause(stamp_ns)
+        else:
+            if pause:
+                self.course.pause(stamp_ns)
+            if finish:
+                self.course.finish(stamp_ns)
         if self.states.state is State.PAUSED:
             refusal = self.course.look_for_way_back()
+            self._tell_of_no_finish(stamp_ns)
             if refusal is not None:
                 self._react(self.guard.findings.found("no_way_back", refusal), stamp_ns)
             elif not pause:
                 self.course.go_on(stamp_ns)
+
+    def _tell_of_no_finish(self, stamp_ns: int) -> None:
+        why = self.course.not_finished
+        if why and "finish" not in self._told:
+            self._told.add("finish")
+            self.tell(Severity.WARNING, stamp_ns, f"not finished early, goes on to its end: {why}")
 
     def _lapse(self, stamp_ns: int) -> None:
         """The lease is lost; a stop that is under way already does not become a fault by it."""

@@ -1,4 +1,4 @@
-"""Pause and resume: a controlled stop out of a motion, and a jerk-limited way back onto it.
+"""Pause and resume: a controlled stop out of a motion, and a jerk-limited way back onto it, or away from it for good.
 
 The way back leads from standstill to the motion's own moving state, so that position, velocity and acceleration have
 no step anywhere. Boundary: pure functions of time.
@@ -13,7 +13,7 @@ from ident_service.errors import MotionRefused
 from ident_service.motion.reference import Reference, Setpoint, rest
 from ident_service.motion.stop import stop
 from ident_service.motion.surroundings import Surroundings
-from ident_service.motion.way import RuckigReference, at_once, way_in_slices
+from ident_service.motion.way import RuckigReference, at_once, calm_way_in_slices, way_in_slices
 
 _SEARCH_STEP = 0.1  # s
 _SEARCH = 20  # steps to either side
@@ -83,6 +83,24 @@ class Paused:
             except MotionRefused as error:
                 refusal = error
         raise MotionRefused(f"no way leads from here back onto the motion: {refusal}") from refusal
+
+    def leave_in_slices(
+        self, end: Setpoint, limits: MotionLimits, surroundings: Surroundings | None = None
+    ) -> Generator[None, None, RuckigReference]:
+        """The straight, calm way to another place, from rest to rest, to be followed once the arm stands.
+
+        Args:
+            end: at rest.
+            limits: of the way, as for `resume`.
+            surroundings: what the way must keep clear of.
+
+        Raises:
+            MotionRefused: the straight way is not free; from any of the steps.
+        """
+        away = yield from calm_way_in_slices(rest(self._stop.end), end, limits)
+        if surroundings is not None:
+            yield from surroundings.require_clear(away, limits)
+        return away
 
 
 class Resumed:

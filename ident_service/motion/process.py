@@ -37,7 +37,7 @@ from ident_service.motion.lifeline import Lifeline
 from ident_service.motion.plans import Destination, Excite, GoTo, Plan
 from ident_service.motion.preflight.ticket import subject_of, ticket_from_json
 from ident_service.motion.realtime import ask
-from ident_service.motion.run import follow
+from ident_service.motion.run import RunReport, follow
 from ident_service.motion.states import State
 from ident_service.record.cycle import Cycle
 from ident_service.record.ring_sink import RingSink, SinkEnds
@@ -177,12 +177,20 @@ def _moved(request: dict[str, Any], controls: ControlFile, latch: Latch) -> dict
         "peak_following_error": np.asarray(report.peak_following_error).tolist(),
         "peak_torque": np.asarray(report.peak_torque).tolist(),
         "warnings": report.warnings,
+        **_early(report),
         "real_time": sentence,
         # In virtual time cycles wait for each other, and nothing is late.
         "lateness": None if arm.clock.lock_step else sink.lateness.document(),
         "compute": None if arm.clock.lock_step else sink.compute.document(),
         **({"frames_logged": arm.logged()} if request["log_frames"] else {}),
     }
+
+
+def _early(report: RunReport) -> dict[str, Any]:
+    """What there is to say of a run that was finished early, or was to be."""
+    if report.finished_at is not None:
+        return {"finished": "early", "motion_seconds": report.finished_at}
+    return {"not_finished": report.not_finished} if report.not_finished else {}
 
 
 if __name__ == "__main__":

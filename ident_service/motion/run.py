@@ -48,6 +48,8 @@ class RunReport:
         peak_following_error: [rad or m], shape (joints,).
         peak_torque: that left [N m or N], shape (joints,).
         warnings: how often each mild fault was seen.
+        finished_at: of a run that was finished early and is DONE, how much of its excitation was made [s]; else None.
+        not_finished: why a run that was to be finished early went on; empty for any other.
     """
 
     state: State
@@ -55,6 +57,8 @@ class RunReport:
     peak_following_error: Vector
     peak_torque: Vector
     warnings: dict[str, int]
+    finished_at: float | None = None
+    not_finished: str = ""
 
 
 def run(
@@ -75,7 +79,7 @@ def run(
         model: with the prior parameters that control needs.
         excitation: checked against the limits beforehand.
         sink: takes every sample.
-        controls: read every cycle; None for a run that nobody stops or pauses.
+        controls: read every cycle; None for a run that nobody stops, pauses or finishes early.
         speed: share of the motion's own speed at which all of it is played, approach, return and ways out of pauses
             too; a rehearsal takes 0.2. Stops are never slowed.
         latch: the arm's faults, which outlive the run; a new one when None.
@@ -169,6 +173,8 @@ class _Run:
             peaks.following_error,
             peaks.torque,
             dict(loop.guard.findings.warnings),
+            loop.course.finished_at if self.states.state is State.DONE else None,
+            loop.course.not_finished,
         )
 
     def _prepared(self) -> tuple[Loop, Vector]:

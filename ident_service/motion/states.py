@@ -19,7 +19,7 @@ class State(Enum):
     EXCITING = "exciting"
     RETURNING = "returning"  # or going home: the last way of a run, or its only one
     DONE = "done"
-    PAUSING = "pausing"  # decelerating under control, to go on later
+    PAUSING = "pausing"  # decelerating under control, to go on or back later
     PAUSED = "paused"  # held at rest
     RESUMING = "resuming"  # on the way back onto what was left
     STOPPING = "stopping"  # decelerating under control or being lowered
@@ -31,8 +31,8 @@ MOVING = (State.APPROACHING, State.EXCITING, State.RETURNING)
 STOPPABLE = (State.ARMED, *MOVING, State.PAUSING, State.PAUSED, State.RESUMING)
 
 # Stopping and faulting are lawful from every state that is energised. A way that ends where nothing supports the arm
-# ends as a stop does, held at rest, and is done after that. Out of the ends leads only the way to the next
-# run, out of a fault only when nothing is latched any more.
+# ends as a stop does, held at rest, and is done after that. Out of a pause a run that is finished early returns. Out of
+# the ends leads only the way to the next run, out of a fault only when nothing is latched any more.
 LAWFUL: dict[State, tuple[State, ...]] = {
     State.IDLE: (State.CHECKED, State.FAULTED),
     State.CHECKED: (State.ARMED, State.IDLE, State.FAULTED),
@@ -41,7 +41,7 @@ LAWFUL: dict[State, tuple[State, ...]] = {
     State.EXCITING: (State.RETURNING, State.PAUSING, State.STOPPING, State.FAULTED),
     State.RETURNING: (State.DONE, State.PAUSING, State.STOPPING, State.FAULTED),
     State.PAUSING: (State.PAUSED, State.STOPPING, State.FAULTED),
-    State.PAUSED: (State.RESUMING, State.STOPPING, State.FAULTED),
+    State.PAUSED: (State.RESUMING, State.RETURNING, State.STOPPING, State.FAULTED),
     State.RESUMING: (*MOVING, State.PAUSING, State.STOPPING, State.FAULTED),
     State.STOPPING: (State.STOPPED, State.FAULTED),
     State.DONE: (State.IDLE, State.FAULTED),

@@ -68,6 +68,15 @@ def calm_way(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigRefe
     Raises:
         MotionRefused: as `way`.
     """
+    return at_once(calm_way_in_slices(start, end, limits))
+
+
+def calm_way_in_slices(start: Setpoint, end: Setpoint, limits: MotionLimits) -> Generator[None, None, RuckigReference]:
+    """As `calm_way`, a bearable part of a control cycle at a time; the generator returns the way.
+
+    Raises:
+        MotionRefused: as `way`, from any of its steps.
+    """
     velocity = np.maximum(np.abs(start.velocity), np.abs(end.velocity))
     acceleration = np.maximum(np.abs(start.acceleration), np.abs(end.acceleration))
     calm = replace(
@@ -75,7 +84,7 @@ def calm_way(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigRefe
         velocity=np.minimum(limits.velocity, np.maximum(_CALM * limits.velocity, 1.1 * velocity)),
         acceleration=np.minimum(limits.acceleration, np.maximum(_CALM * limits.acceleration, 1.1 * acceleration)),
     )
-    return way(start, end, calm)
+    return (yield from way_in_slices(start, end, calm))
 
 
 def way(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference:

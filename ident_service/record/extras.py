@@ -91,7 +91,7 @@ def read_extras(path: Path, stream: IO[bytes], size: int, utc_offset_ns: int) ->
                     raise mcap.TornError("a message of a channel that was never announced")
                 schema = directory.schema_of(channel)
                 if channel.topic == _EVENTS and schema == LOG:
-                    events.append(_event(payload, utc_offset_ns))
+                    events.append(event(payload, utc_offset_ns))
                 elif channel.topic == _DESCRIPTION and schema == STRING:
                     description = _string(payload, 4)[0]
     except mcap.TornError:
@@ -101,7 +101,8 @@ def read_extras(path: Path, stream: IO[bytes], size: int, utc_offset_ns: int) ->
     return Extras(metadata, attachments, tuple(events), description)
 
 
-def _event(payload: bytes, utc_offset_ns: int) -> Event:
+def event(payload: bytes, utc_offset_ns: int) -> Event:
+    """A line of `/events`, `utc_offset_ns` subtracted from its stamp [ns]; raises struct.error where it is none."""
     seconds, nanoseconds, level = struct.unpack_from("<iIB", payload, 4)
     name, position = _string(payload, _LOG_TEXTS)
     message, _ = _string(payload, position)

@@ -19,12 +19,14 @@ from numpy.typing import NDArray
 
 from ident_service.errors import RecordingError
 from ident_service.record import mcap_records as mcap
+from ident_service.record.extras import event
 from ident_service.record.joint_state import Layout, PayloadError
 from ident_service.record.recording import Matrix, Stamps
 
 MOST_BYTES: Final = 1 << 20
 _HEAD: Final = struct.Struct("<BQ")
-_STATES, _COMMANDS = "/joint_states", "/joint_commands"
+_STATES, _COMMANDS, _EVENTS = "/joint_states", "/joint_commands", "/events"
+_EXCITING = "exciting"  # the word of `motion/states.py`
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,7 @@ class RecordingTail:
     Attributes:
         ended: whether the recording's data has come to its end.
         joint_names: in the order of the columns; empty before the first sample.
+        exciting_ns: when the motion itself began [ns since 1970 in UTC]; None before.
     """
 
     def __init__(self, path: Path) -> None:
@@ -63,6 +66,7 @@ class RecordingTail:
         self._directory = mcap.Directory()
         self._position = len(mcap.MAGIC)
         self.ended, self.joint_names = False, tuple[str, ...]()
+        self.exciting_ns: int | None = None
 
     def read(self, most: int = MOST_BYTES) -> Samples | None:
         """The next samples, from `most` bytes of the file or one record; None where nothing new is whole.
@@ -132,7 +136,9 @@ class RecordingTail:
                     states.append(payload)
                 elif topic == _COMMANDS:
                     commands.append(payload)
-        except (mcap.TornError, mcap.TooLargeError) as error:
+                elif topic == _EVENTS and self.exciting_ns is None and event(payload, 0).message == _EXCITING:
+                    self.exciting_ns = stamp
+        except (mcap.TornError, mcap.TooLargeError, struct.error) as error:
             raise RecordingError(self._path, str(error)) from None
 
     def _decoded(self, stamps: list[int], states: list[bytes], commands: list[bytes]) -> Samples:

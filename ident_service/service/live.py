@@ -197,6 +197,8 @@ class LiveRuns:
 
 
 def _told(doubt: Doubt, expressions: tuple[str, ...], units: tuple[str, ...]) -> dict[str, Any]:
+    from ident_service.estimation.doubt import shares
+
     return {
         "seconds": round(doubt.seconds, 2),
         "parameters": [
@@ -205,10 +207,17 @@ def _told(doubt: Doubt, expressions: tuple[str, ...], units: tuple[str, ...]) ->
                 "unit": unit,
                 "value": float(value),
                 "deviation": float(deviation) if math.isfinite(deviation) else None,
+                "share": float(share) if math.isfinite(share) else None,
                 "verdict": verdict,
             }
-            for expression, unit, value, deviation, verdict in zip(
-                expressions, units, doubt.beta, doubt.deviations, doubt.verdicts, strict=True
+            for expression, unit, value, deviation, share, verdict in zip(
+                expressions,
+                units,
+                doubt.beta,
+                doubt.deviations,
+                shares(doubt.beta, doubt.deviations, units),
+                doubt.verdicts,
+                strict=True,
             )
         ],
     }

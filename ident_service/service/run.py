@@ -11,6 +11,7 @@ import json
 import shutil
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import astuple, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,6 +19,7 @@ from typing import Any
 
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import MotionRefused, RecordingError, UsageError
+from ident_service.estimation.target import Target
 from ident_service.excitation.excitation import Excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.model.urdf import urdf_text
@@ -32,6 +34,7 @@ from ident_service.results.files import require_place, write_atomically
 from ident_service.results.run_folder import write_manifest
 from ident_service.service.arm_state import arm_folder, fault_file
 from ident_service.service.preflight import write_ticket
+from ident_service.service.reaching import Reaching, least_seconds, require_target
 from ident_service.service.watching import watched
 
 
@@ -62,6 +65,7 @@ def run_motion(
     tell: Callable[[str], None] = lambda _: None,
     stop_requested: Callable[[], bool] = lambda: False,
     asked_ns: int | None = None,
+    until: Target | None = None,
 ) -> Ran:
     """Move an arm along a motion, or to a destination, and record it.
 
@@ -79,9 +83,11 @@ def run_motion(
         stop_requested: asked several times a second.
         asked_ns: when a person asked for the motion, on the machine's monotonic clock [ns]; now when None. A stop that
             was asked for since then keeps it from beginning.
+        until: what is to be known, whereupon the run is finished early; None for one that goes on to its end.
 
     Raises:
-        UsageError: the run folder exists or cannot be made, or the state folder cannot be written; nothing has moved.
+        UsageError: the run folder exists or cannot be made, the state folder cannot be written, or the target is none;
+            nothing has moved.
         MotionRefused: nothing has moved; a fault that nobody has acknowledged is a reason too.
         ArmFault: a fault stopped the motion, the first of those that stay latched until `FaultFile.acknowledge`.
         DriverError: the arm cannot be had.
@@ -95,6 +101,8 @@ def run_motion(
     model = arm_model(config)
     subject = subject_of(model, motion if isinstance(motion, Excitation) else None, None)
     ticket.require_valid_for(ticket.with_arm(subject), datetime.now(UTC))
+    if until is not None:
+        require_target(until, model)
     require_place(folder)
     require_writable(arm_folder(state, config.name))
     clock = make_arm(config).clock
@@ -140,9 +148,13 @@ def run_motion(
         for file, content in attachments.items():
             write_atomically(folder / file, content.decode() + "\n")
         begin()
-        with recorder:
+        reaching = None
+        if until is not None and isinstance(motion, Excitation):
+            reaching = Reaching(folder, until, least_seconds(motion, speed), tell)
+        with recorder, reaching or nullcontext():
             started = True
-            ending = watched(request, astuple(recorder.ends), lease, tell, stop_requested)
+            finish = (lambda: False) if reaching is None else reaching.reached
+            ending = watched(request, astuple(recorder.ends), lease, tell, stop_requested, finish)
             ending.raise_for(faults)
     except BaseException as error:
         if started and not (isinstance(error, MotionRefused) and not faults.latched()):
@@ -151,7 +163,10 @@ def run_motion(
             shutil.rmtree(folder, ignore_errors=True)
         raise
     write_manifest(folder)
-    return Ran(folder, ending.report)
+    if reaching is None or until is None:
+        return Ran(folder, ending.report)
+    wanted = {"share": until.share, "parameters": list(until.parameters), "reached": reaching.said}
+    return Ran(folder, {**ending.report, "until": wanted})
 
 
 def _keep(folder: Path, error: BaseException) -> None:

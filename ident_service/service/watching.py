@@ -103,6 +103,7 @@ def watched(
     lease: float,
     tell: Callable[[str], None],
     stop_requested: Callable[[], bool],
+    finish_requested: Callable[[], bool] = lambda: False,
 ) -> Ending:
     """Start the motion process, keep its lease, hear what it says until it ends.
 
@@ -112,6 +113,7 @@ def watched(
         lease: how long the arm moves on when this process is gone [s].
         tell: called with each state that is entered.
         stop_requested: asked several times per lease.
+        finish_requested: likewise; it must not wait.
 
     Raises:
         KeyboardInterrupt: it came before the arm was taken, or the motion process did not end after it.
@@ -134,7 +136,7 @@ def watched(
         with suppress(BrokenPipeError):
             process.stdin.write(json.dumps({**request, "ends": ends}).encode() + b"\n")
             process.stdin.flush()
-        watch = _Watch(process, Path(request["arm_folder"]) / CONTROLS, lease, tell, stop_requested)
+        watch = _Watch(process, Path(request["arm_folder"]) / CONTROLS, lease, tell, stop_requested, finish_requested)
         try:
             try:
                 watch.hear()
@@ -165,12 +167,13 @@ class _Watch:
         lease: float,
         tell: Callable[[str], None],
         stop_requested: Callable[[], bool],
+        finish_requested: Callable[[], bool],
     ) -> None:
         self.ending = Ending({}, {})
         self._process, self._path, self._lease = process, path, lease
-        self._tell, self._stop_requested = tell, stop_requested
+        self._tell, self._stop_requested, self._finish_requested = tell, stop_requested, finish_requested
         self._controls: ControlFile | None = None
-        self._asked = False
+        self._asked = self._finishing = False
 
     def hear(self, until: float = float("inf")) -> bool:
         """Hear it, and renew its lease, until it ends or the time has come [s]; whether it ended."""
@@ -181,6 +184,9 @@ class _Watch:
                 self._controls.renew()
                 if not self._asked and self._stop_requested():
                     self.ask_stop()
+                if not self._finishing and self._finish_requested():
+                    self._finishing = True
+                    self._controls.ask_finish()
             ready, _, _ = select.select([stdout], [], [], _RENEW_SHARE * self._lease)
             if not ready:
                 continue

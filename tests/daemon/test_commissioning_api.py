@@ -42,6 +42,50 @@ def checked(daemon: Asked) -> None:
     assert daemon.follow(job["id"], lease=True)["state"] == "done"
 
 
+@pytest.fixture
+def patient(daemon: Asked) -> str:
+    """The same arm with a motion of five minutes of its own time, and a ticket for it."""
+    text = quick_text(ARM).replace("periods: 2}", "periods: 60}")
+    assert "periods: 60}" in text
+    assert daemon.post("/api/v1/arms", {"description": text}).status_code == 201
+    checked(daemon)
+    return ARM
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("asked", ["by a person", "by a person who paused", "by its target"])
+def test_a_run_ends_early(daemon: Asked, patient: str, state: Path, asked: str) -> None:
+    until = {"until": {"share": 0.3, "parameters": ["fv1", "fc1"]}} if asked == "by its target" else {}
+    job = daemon.begin({"kind": "run", "arm": ARM, **until}, confirmed=True)["id"]
+    if not until:
+        daemon.follow(job, lease=True, until=lambda seen: "exciting" in str(seen["progress"]))
+        words = ["pause", "finish"] if "paused" in asked else ["finish"]
+        for word in words:
+            answer = daemon.post(f"/api/v1/arms/{ARM}/{word}")
+            assert (answer.status_code, answer.json()) == (200, {"arm": ARM, "asked": word, "reached": True})
+        assert [line["what"] for line in trail(daemon.service.db, most=len(words))] == words[::-1]
+    ended = daemon.follow(job, lease=True)
+    assert ended["state"] == "done", ended
+    report = daemon.get(f"/api/v1/jobs/{job}/result").json()["answer"]["report"]
+    assert (report["state"], report["finished"]) == ("done", "early")
+    assert 0.0 < report["motion_seconds"] < 300.0
+    if until:
+        assert report["until"]["parameters"] == ["fv1", "fc1"]
+        assert report["until"]["reached"]["share"] <= 0.3
+        assert report["until"]["reached"]["seconds"] >= 5.0
+    assert not in_use(control_path(state, ARM))
+
+
+def test_only_operators_finish_and_nobody_is_reached_where_nothing_moves(daemon: Asked, arm: str, viewer: str) -> None:
+    answer = daemon.post(f"/api/v1/arms/{ARM}/finish")
+    assert (answer.status_code, answer.json()["reached"]) == (200, False)
+    for until in ({"share": 1.0}, {"share": 0}, {"share": 0.1, "parameters": [""]}, {"share": 0.1, "more": 1}):
+        body = {"job": {"kind": "run", "arm": ARM, "until": until}}
+        assert daemon.post("/api/v1/jobs", body).status_code == 422
+    daemon.as_token(viewer)
+    assert daemon.post(f"/api/v1/arms/{ARM}/finish").status_code == 403
+
+
 @pytest.mark.timeout(300)
 def test_from_an_upload_to_accepted_parameters_and_back(daemon: Asked, arm: str, state: Path) -> None:
     runs = [run_of(daemon), run_of(daemon)]

@@ -56,11 +56,19 @@ def test_the_command_drives_a_daemon(state: Path, tmp_path: Path, capsys: pytest
             assert stat.S_IMODE((state / name).stat().st_mode) == 0o600, name
         server = ("--server", client._url, "--state", state)
         client.post("/api/v1/arms", {"description": quick_text()})
+        (state / "quick.yaml").write_text(quick_text())
         code, document = ident(capsys, "run", "quick", *server)
         assert (code, document["error"]["kind"]) == (2, "UsageError")
         assert "--confirm quick" in document["error"]["message"]
         code, document = ident(capsys, "check", "quick", "--confirm", "quick", *server)
         assert (code, document["job"]["state"]) == (0, "done")
+        words = ("--until", "0.0001", "--parameter", "fv1", "--parameter", "fc1", "--confirm", "quick")
+        code, document = ident(capsys, "run", "quick", *words, *server)
+        assert (code, document["job"]["state"]) == (0, "done")
+        wanted = {"share": 0.0001, "parameters": ["fv1", "fc1"]}
+        assert document["job"]["request"]["until"] == wanted
+        assert document["answer"]["report"]["until"] == {**wanted, "reached": None}
+        assert ident(capsys, "run", "quick", "--parameter", "fv1", "--confirm", "quick", *server)[0] == 2
         code, document = ident(capsys, "simulate", "quick", *server)
         assert (code, document["job"]["state"], document["answer"]["feasible"]) == (0, "done", True)
         run = document["job"]["run"]
@@ -71,6 +79,13 @@ def test_the_command_drives_a_daemon(state: Path, tmp_path: Path, capsys: pytest
         assert ident(capsys, "verify", "x.json", *server)[0] == 2
         assert ident(capsys, "jobs", "list", "--state", state)[1]["jobs"][0]["kind"] == "simulate"
         with ControlFile.take(control_path(state, "quick"), None) as mover:
+            mover.ask_pause(True)
+            assert ident(capsys, "finish", "quick", *server)[1]["reached"] is True
+            assert (mover.finish, mover.pause, mover.stop) == (True, False, False)
+            mover.ask_pause(True)
+            # At a terminal of the same machine it is the same.
+            assert ident(capsys, "finish", state / "quick.yaml", "--state", state)[0] == 0
+            assert not mover.pause
             assert ident(capsys, "stop", "quick", *server)[1]["arms"] == ["quick"]
             assert mover.stop
         # The same acts at a terminal are in the same trail.

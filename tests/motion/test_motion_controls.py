@@ -13,6 +13,7 @@ def test_a_function_can_stop_a_run() -> None:
     assert not controls.stop
     assert controls.stop
     assert not controls.pause
+    assert not controls.finish
     assert controls.lease_ok(10**18)
     assert not StopWhen().stop
 

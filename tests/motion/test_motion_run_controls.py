@@ -33,6 +33,7 @@ class Hands:
     stopped: int = FOREVER
     gone: int = FOREVER
     dead: int = FOREVER
+    finished: int = FOREVER
     cycle: int = field(default=0, init=False)
 
     @property
@@ -45,6 +46,10 @@ class Hands:
         if self.cycle + LOOKED > self.dead:
             raise BrokenPipeError("nobody there")
         return self.cycle + LOOKED > self.stopped
+
+    @property
+    def finish(self) -> bool:
+        return self.cycle + LOOKED > self.finished
 
     def lease_ok(self, now_ns: int) -> bool:
         return self.cycle + LOOKED <= self.gone

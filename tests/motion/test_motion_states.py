@@ -22,6 +22,7 @@ WAYS = {
     ("returning", "done"),
     ("pausing", "paused"),
     ("paused", "resuming"),
+    ("paused", "returning"),
     ("resuming", "pausing"),
     ("stopping", "stopped"),
     ("stopped", "done"),

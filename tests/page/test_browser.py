@@ -6,6 +6,7 @@ The arm is simulated, in virtual time; service, jobs, motions and browser are re
 from __future__ import annotations
 
 import hashlib
+import json
 import time
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -33,6 +34,11 @@ def begin(page: Page, reached: Reached, step: str) -> None:
     arm_page(page, reached)
     if not page.get_by_role("button", name=step, exact=True).is_visible():
         page.locator("summary", has_text=step).first.click()
+    begin_from_here(page, step)
+
+
+def begin_from_here(page: Page, step: str) -> None:
+    """The same on the page of the arm, whose fields are filled."""
     page.get_by_role("button", name=step, exact=True).press("Enter")
     expect(page.get_by_label("Type the arm's name")).to_be_focused()
     page.keyboard.type(ARM)
@@ -168,6 +174,23 @@ def test_a_stop_in_the_middle(browser: Browser, reached: Reached, state: Path, h
     assert row["state"] == "cancelled"
     words = {"escape": "owner asked", "button": "owner asked", "without scripts": "looks asked", "leaving": "renewed"}
     assert words[how] in row["detail"]
+    assert not in_use(control_path(state, ARM))
+
+
+def test_a_run_is_finished_by_keyboard_and_its_target_is_shown(browser: Browser, reached: Reached, state: Path) -> None:
+    page = log_in(browser, reached)
+    begin(page, reached, "Check")
+    assert ended(page) == "done"
+    arm_page(page, reached)
+    page.get_by_label("End early, once every deviation").fill("0.001")
+    begin_from_here(page, "Run")
+    page.get_by_role("heading", name="The arm now").wait_for()
+    assert page.locator("#job").get_attribute("data-until") == "0.001"
+    page.get_by_role("button", name="Finish now").press("Enter")
+    assert ended(page) == "done"
+    job = rows.jobs(reached.service.db, arm=ARM, most=1)[0]
+    report = json.loads((state / "runs" / job["run"] / "ended.json").read_text())
+    assert (report["state"], report["finished"]) == ("done", "early")
     assert not in_use(control_path(state, ARM))
 
 

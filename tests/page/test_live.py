@@ -60,9 +60,13 @@ def test_a_tail_gives_each_flushed_sample_once(tmp_path: Path, most: int) -> Non
     with RecordingWriter(tmp_path / "run.mcap", NAMES, "<robot/>", 0) as writer:
         tail = RecordingTail(writer.partial)
         assert tail.read(most) is None
+        writer.event(START_NS, 20, "approaching")
         seen, counts = list[float](), []
         for k in range(1000):
             writer.sample(cycle(k))
+            if k in (500, 700):
+                writer.event(START_NS + k * STEP_NS, 20, "exciting")
+            assert tail.exciting_ns is None or k > 500
             if k % 100 == 99:
                 seen += everything(tail, most)
                 counts.append(len(seen))
@@ -73,6 +77,7 @@ def test_a_tail_gives_each_flushed_sample_once(tmp_path: Path, most: int) -> Non
     seen += everything(tail, most)
     assert seen == list(range(1000))
     assert tail.joint_names == NAMES
+    assert tail.exciting_ns == START_NS + 500 * STEP_NS
     assert tail.ended
     tail.close()
 
@@ -147,10 +152,12 @@ def test_a_run_that_cannot_be_read_says_so_once(tmp_path: Path, caplog: pytest.L
     live.close()
 
 
-def growing_run(seconds: float, noise: float) -> tuple[GrowingInformation, np.ndarray, list[np.ndarray]]:
+def growing_run(
+    seconds: float, noise: float, *, in_blocks: bool = False
+) -> tuple[GrowingInformation, np.ndarray, list[np.ndarray]]:
     """Doubt of a motion of the planar arm that comes in pieces; the true base parameters; deviations on the way."""
     model = arm_model(load_arm(shipped_arms()["planar2"]))
-    growing = GrowingInformation(model)
+    growing = GrowingInformation(model, in_blocks=in_blocks)
     rng, step = np.random.default_rng(3), 0.002
     time_s = np.arange(0.0, seconds, step)
     w = 2 * np.pi * np.array([[0.31], [0.47]])
@@ -189,6 +196,20 @@ def test_doubt_shrinks_as_the_arm_moves_and_is_honest() -> None:
         assert (later < 1.15 * earlier).all()
     assert (np.abs(doubt.beta - beta) < 6.0 * doubt.deviations + 0.02).all()
     assert set(doubt.verdicts) <= {"identified", "weak", "unidentified"}
+
+
+def test_deviations_from_blocks_are_those_that_blocks_of_the_whole_give() -> None:
+    plain, careful = growing_run(40.0, 0.2)[0].doubt(), growing_run(40.0, 0.2, in_blocks=True)[0].doubt()
+    assert plain is not None
+    assert careful is not None
+    np.testing.assert_allclose(careful.beta, plain.beta, rtol=1e-9)
+    assert plain.blocks == 0
+    assert 35 <= careful.blocks <= 41  # of a second
+    assert (careful.deviations >= plain.deviations).all()
+    # The noise is white, so that both know the same; blocks are few, and err.
+    assert (careful.deviations < 3.0 * plain.deviations).all()
+    assert (careful.deviations > plain.deviations).any()
+    assert 38_000_000_000 < careful.until_ns < 40_000_000_000
 
 
 def test_what_is_remembered_stays_bounded() -> None:

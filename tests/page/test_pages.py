@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from html.parser import HTMLParser
 from itertools import pairwise
 from pathlib import Path
+from urllib.parse import urlencode
 
 import pytest
 from daemon.conftest import URL, Asked, quick_text, serving
@@ -198,8 +199,8 @@ def test_strangers_are_led_to_the_way_in(daemon: Asked, commissioned: Path) -> N
 def test_a_viewer_may_do_nothing_with_forms(daemon: Asked, commissioned: Path) -> None:
     enter(daemon, "viewer")
     sent = f"kind=run&run={commissioned.name}&note=n&name={ARM}&code=FOLLOWING_ERROR"
-    names = ("confirm", "move", "jobs", "ack", "accept", "rollback", "pause", "reidentify/confirm", "reidentify",
-             "schedules", "maintenance")  # fmt: skip
+    motions = ("confirm", "move", "pause", "finish", "reidentify/confirm", "reidentify")
+    names = (*motions, "jobs", "ack", "accept", "rollback", "schedules", "maintenance")
     for name in names:
         answer = daemon.post(f"/arms/{ARM}/{name}", content=sent, headers=FORM)
         assert answer.status_code == 403, name
@@ -257,6 +258,39 @@ def test_a_motion_needs_the_typed_name_and_a_fresh_page(daemon: Asked) -> None:
     assert "data-lease" not in daemon.get(where.split("?")[0]).text
     enter(daemon, "viewer")
     assert "data-lease" not in daemon.get(where).text
+    daemon.post("/stop", content="", headers=FORM)
+
+
+def test_a_run_is_asked_for_with_a_target(daemon: Asked) -> None:
+    enter(daemon, "operator")
+    fault_file(daemon.service.state, ARM).acknowledge("FOLLOWING_ERROR")
+    fields = [attrs for _, attrs in Reader(daemon.get(f"/arms/{ARM}").text).tags if attrs.get("name") == "until"]
+    assert [one["type"] for one in fields] == ["number"]
+
+    def confirmed(until: str) -> tuple[str, str]:
+        answer = daemon.post(f"/arms/{ARM}/confirm", content=f"kind=run&speed=1&until={until}", headers=FORM)
+        assert (answer.status_code, complaints(answer.text)) == (200, [])
+        hidden = {attrs["name"]: attrs["value"] or "" for _, attrs in Reader(answer.text).tags if "value" in attrs}
+        sent = urlencode({**hidden, "name": ARM})
+        assert hidden["until"] == until
+        return sent, answer.text
+
+    for wrong in ("2", "0", "-1", "nan", "much"):
+        answer = daemon.post(f"/arms/{ARM}/move", content=confirmed(wrong)[0], headers=FORM)
+        assert answer.status_code in (400, 422), wrong
+        assert complaints(answer.text) == []
+    assert not rows.jobs(daemon.service.db, arm=ARM, states=rows.LIVE)
+    sent, shown = confirmed("0.05")
+    assert "0.05 of its parameter" in shown
+    answer = daemon.post(f"/arms/{ARM}/move", content=sent, headers=FORM)
+    assert answer.status_code == 303, answer.text
+    job = rows.jobs(daemon.service.db, arm=ARM, most=1)[0]
+    assert job["request"]["until"] == {"share": 0.05, "parameters": []}
+    assert "--until=0.05" in job["words"]
+    page = daemon.get(answer.headers["location"])
+    assert complaints(page.text) == []
+    assert 'data-until="0.05"' in page.text
+    assert "Ends early" not in daemon.post(f"/arms/{ARM}/confirm", content="kind=run&speed=1", headers=FORM).text
     daemon.post("/stop", content="", headers=FORM)
 
 

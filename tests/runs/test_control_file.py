@@ -24,11 +24,16 @@ class Time:
 
 def test_what_one_side_asks_the_other_reads(tmp_path: Path) -> None:
     with ControlFile.take(tmp_path / "arm" / "control", None) as loop, ControlFile.reach(loop_path(tmp_path)) as person:
-        assert (loop.stop, loop.pause) == (False, False)
+        assert (loop.stop, loop.pause, loop.finish) == (False, False, False)
         person.ask_pause(True)
         assert loop.pause
         person.ask_pause(False)
         assert not loop.pause
+        person.ask_finish()
+        assert (loop.stop, loop.pause, loop.finish) == (False, False, True)
+        person.ask_pause(True)
+        person.ask_pause(False)
+        assert (loop.pause, loop.finish) == (False, True)
         person.ask_stop()
         assert loop.stop
         assert person.pid == loop.pid

@@ -78,7 +78,9 @@ def test_a_lease_lapses_in_real_time_only(controls: ControlFile, time: Time) -> 
 def test_stop_and_pause_are_those_of_the_control_file(controls: ControlFile) -> None:
     end, other = os.pipe()
     lifeline = Lifeline(controls, end, lock_step=False)
-    assert (lifeline.stop, lifeline.pause) == (False, False)
+    assert (lifeline.stop, lifeline.pause, lifeline.finish) == (False, False, False)
+    controls.ask_finish()
+    assert (lifeline.stop, lifeline.pause, lifeline.finish) == (False, False, True)
     controls.ask_pause(True)
     controls.ask_stop()
     assert (lifeline.stop, lifeline.pause) == (True, True)

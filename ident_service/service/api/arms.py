@@ -121,6 +121,13 @@ def resume(service: Serving, who: Operator, arm: ArmName) -> AskedAnswer:
     return _pause(service, who.name, arm, wanted=False)
 
 
+@router.post("/arms/{arm}/finish")
+def finish(service: Serving, who: Operator, arm: ArmName) -> AskedAnswer:
+    """Leave out the rest of the motion: the arm goes back to where it stood, and the run is done."""
+    name = known.known_arm(service.db, service.state, arm).name
+    return AskedAnswer(arm=name, asked="finish", reached=service.engine.finish(name, who.name))
+
+
 @router.get("/arms/{arm}/acceptances")
 def list_acceptances(service: Serving, _: Viewer, arm: ArmName) -> list[AcceptanceAnswer]:
     """What was accepted, the earliest first; the last one is current."""

@@ -68,6 +68,13 @@ class Rehearse(Ask):
     speed: Speed = 0.2
 
 
+class Until(Ask):
+    """What a run is to learn, whereupon it ends early: deviations of at most this share of their parameters."""
+
+    share: Annotated[float, Field(gt=0, lt=1)]
+    parameters: Annotated[tuple[Annotated[str, Field(min_length=1, max_length=200)], ...], Field(max_length=100)] = ()
+
+
 class Run(Ask):
     """Move the arm along a motion and record it."""
 
@@ -75,6 +82,7 @@ class Run(Ask):
     arm: ArmName
     motion: Id | None = None
     speed: Speed = 1.0
+    until: Until | None = None
 
 
 class Home(Ask):

@@ -141,8 +141,15 @@ def _words(db: Database, state: Path, asked: Asked, arm: KnownArm) -> list[str]:
         motion = [] if asked.motion is None else [str(motion_path(db, state, asked.motion))]
         if isinstance(asked, Check):
             return [path, *motion, *(["--home"] if asked.home else []), "--confirm", arm.name]
-        return [path, *motion, *([] if isinstance(asked, Preview) else [f"--speed={asked.speed!r}"])]
+        speed = [] if isinstance(asked, Preview) else [f"--speed={asked.speed!r}"]
+        return [path, *motion, *speed, *(_until(asked) if isinstance(asked, Run) else [])]
     raise AssertionError(asked)
+
+
+def _until(asked: Run) -> list[str]:
+    if asked.until is None:
+        return []
+    return [f"--until={asked.until.share!r}", *(f"--parameter={one}" for one in asked.until.parameters)]
 
 
 def _design(db: Database, state: Path, asked: Design) -> list[str]:

@@ -15,20 +15,18 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ident_service.errors import IdentError, MotionRefused, UsageError
-from ident_service.motion.control_file import ControlFile, mover
-from ident_service.service.arm_state import control_path
 from ident_service.service.jobs.asked import Asked
 from ident_service.service.jobs.child import RENEW, STOP, Child, OwnChild, UnitChild
 from ident_service.service.jobs.commands import JOBS, Command, command
 from ident_service.service.jobs.keeping import keep
 from ident_service.service.jobs.outcome import outcome, said
 from ident_service.service.jobs.progress import Progress, progress
+from ident_service.service.jobs.reach import finish_arm, moving_arms, pause_arm, stop_arms
 from ident_service.service.jobs.recovery import explain_interrupted, mark_interrupted
 from ident_service.service.registry import jobs as rows
 from ident_service.service.registry.audit import note
@@ -192,7 +190,7 @@ class Engine:
 
         Waits for nobody: the control file is memory, and the word to our own children a line in a pipe.
         """
-        reached, ended = self._reach(arm, ControlFile.stop_all), []
+        reached, ended = stop_arms(self.state, arm), []
         with self._lock:
             self._stops[arm] += 1
             for live in list(self._live.values()):
@@ -207,15 +205,15 @@ class Engine:
 
     def pause(self, arm: str, by: str, *, wanted: bool) -> bool:
         """Let an arm stand, or go on; whether anybody moves it."""
+        reached = pause_arm(self.state, arm, wanted=wanted)
+        note(self.db, by, "pause" if wanted else "resume", arm, reached=[arm] if reached else [])
+        return reached
 
-        def ask(path: Path) -> int:
-            with ControlFile.reach(path) as controls:
-                controls.ask_pause(wanted)
-                return controls.pid
-
-        reached = self._reach(arm, ask)
-        note(self.db, by, "pause" if wanted else "resume", arm, reached=reached)
-        return bool(reached)
+    def finish(self, arm: str, by: str) -> bool:
+        """Let a run end early, in order, out of a pause too; whether anybody moves the arm."""
+        reached = finish_arm(self.state, arm)
+        note(self.db, by, "finish", arm, reached=[arm] if reached else [])
+        return reached
 
     def progress(self, row: Row) -> Progress | None:
         """How far a job that runs is; None for one that does not."""
@@ -226,7 +224,7 @@ class Engine:
 
     def moving(self) -> list[str]:
         """Names of the arms that anybody moves."""
-        return self._reach(None, mover)
+        return moving_arms(self.state)
 
     def begin_closing(self) -> None:
         """Stop all arms and begin nothing more; returns at once."""
@@ -369,17 +367,6 @@ class Engine:
 
     def _lapsed(self, live: _Live) -> bool:
         return self._now() - live.renewed > self._factor * live.order.lease
-
-    def _reach(self, arm: str | None, act: Callable[[Path], int | None]) -> list[str]:
-        """Do something with the control file of an arm, or of all that ever moved; the names of those that move."""
-        place = self.state / "arms"
-        there = [path.name for path in place.iterdir()] if place.is_dir() else []
-        reached = []
-        for name in there if arm is None else [arm] if arm in there else []:
-            with suppress(UsageError):
-                if act(control_path(self.state, name)) is not None:
-                    reached.append(name)
-        return sorted(reached)
 
     def _requeue(self) -> None:
         """What still waits to compute, in its old place."""

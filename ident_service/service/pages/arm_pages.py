@@ -26,7 +26,7 @@ from ident_service.service.registry import runs as known_runs
 from ident_service.service.registry.tokens import Access
 
 router = APIRouter(include_in_schema=False, route_class=PageRoute)
-_NUMBERS: Final = {"speed": float, "seconds": float, "seed": int, "starts": int}
+_NUMBERS: Final = {"speed": float, "seconds": float, "seed": int, "starts": int, "until": float}
 _KINDS: Final = frozenset({"design", "identify", "simulate", "report", "export"})
 
 
@@ -162,6 +162,14 @@ def pause(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response
     return seen(f"/jobs/{rows.known_job(service.db, job)['id']}?attended=1" if job else f"/arms/{arm}")
 
 
+@router.post("/arms/{arm}/finish")
+def finish(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
+    """Let a run end early, in order."""
+    arms.finish(service, who, arm)
+    job = form.get("job", "")
+    return seen(f"/jobs/{rows.known_job(service.db, job)['id']}?attended=1" if job else f"/arms/{arm}")
+
+
 def _alarms(service: Service, arm: str | None) -> list[dict[str, Any]]:
     """Drift alarms that stand, of an arm or of all, each with what was found."""
     return [
@@ -181,6 +189,8 @@ def _asked(arm: str, form: dict[str, str]) -> dict[str, Any]:
     asked["kind"] = kind
     if kind in ("report", "export"):
         return {**asked, **({"formats": _formats(form)} if kind == "export" else {})}
+    if "until" in asked:
+        asked["until"] = {"share": asked["until"]}
     if kind == "identify":
         asked["recordings"] = [{"run": asked.pop("recording", "")}]
         if "validation" in asked:
@@ -192,7 +202,7 @@ _FIELDS: Final[dict[str, tuple[str, ...]]] = {
     "design": ("seconds", "seed", "criterion"),
     "check": ("motion",),
     "rehearse": ("motion", "speed"),
-    "run": ("motion", "speed"),
+    "run": ("motion", "speed", "until"),
     "identify": ("recording", "validation", "method"),
     "simulate": ("motion",),
     "report": ("run",),
@@ -208,7 +218,7 @@ def _confirmation(service: Service, who: Access, arm: str, form: dict[str, str],
     if form.get("kind") not in MOVES:
         raise UsageError("choose a motion on the page of the arm")
     given = arms.challenge(service, who, arm)
-    fields = {"kind": form["kind"], "motion": form.get("motion", ""), "speed": form.get("speed", "")}
+    fields = {"kind": form["kind"], **{key: form.get(key, "") for key in ("motion", "speed", "until")}}
     motion = known_motions.known_motion(service.db, fields["motion"]) if fields["motion"] else None
     status = 409 if problem else 200
     # A rehearsal begins with the hand on its button: its lease would lapse before a page could be loaded.

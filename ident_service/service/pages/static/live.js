@@ -314,8 +314,10 @@ function showDoubt(text) {
   });
   byId("doubt").hidden = false;
   const known = told.parameters.filter((one) => one.verdict === "identified").length;
+  const until = Number(job.dataset.until || 0);
+  const at = until ? told.parameters.filter((one) => one.share !== null && one.share <= until).length : known;
   byId("doubt-summary").textContent =
-    `Base parameters: ${known} of ${told.parameters.length} are known to better than 10 % after ${Math.round(told.seconds)} s`;
+    `Base parameters: ${at} of ${told.parameters.length} are known to ${until ? `the target of ${+(100 * until).toPrecision(3)}` : "better than 10"} % after ${Math.round(told.seconds)} s`;
   byId("parameters").replaceChildren(
     ...told.parameters.map((one) => {
       const row = document.createElement("tr");
@@ -326,7 +328,9 @@ function showDoubt(text) {
           textContent: value === null ? "unknown" : value.toPrecision(3),
         });
       const word = (value) => Object.assign(document.createElement("td"), { textContent: value });
-      row.append(head, number(one.value), number(one.deviation), word(one.unit), word(one.verdict));
+      const share = word(one.share === null ? "unknown" : `${(100 * one.share).toPrecision(2)} %${until ? ` (target ${+(100 * until).toPrecision(3)} %)` : ""}`);
+      share.className = "number";
+      row.append(head, number(one.value), number(one.deviation), word(one.unit), share, word(one.verdict));
       return row;
     }),
   );

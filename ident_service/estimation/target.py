@@ -1,0 +1,58 @@
+"""When what a run is for has been learned: the target of `ident run --until`.
+
+A parameter is reached when its deviation is at most the target's share of the larger of its size and the reference of
+its unit, as in its verdict (`doubt.py`): a parameter that is as good as zero need not be known to a share of itself.
+The deviation is the larger of eq. 81 and of what blocks say, as few blocks can err to either side, and nothing counts
+before there are some, nor before the motion has lasted for its first period: before, its design has not been made.
+Every base parameter counts where none is chosen. Not only the essential ones: early on, what is not known yet cannot
+be told from what is not there. Decision 0041.
+
+Boundary: pure computation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident_service.errors import UsageError
+from ident_service.estimation.doubt import shares
+from ident_service.estimation.growing import Doubt
+from ident_service.model.base import BaseParameters
+
+LEAST_BLOCKS = 10
+
+
+@dataclass(frozen=True)
+class Target:
+    """What is to be known, and how well.
+
+    Attributes:
+        share: largest deviation as a share of the parameter, between 0 and 1.
+        parameters: expressions as `ident base` prints them; all base parameters if empty.
+    """
+
+    share: float
+    parameters: tuple[str, ...] = ()
+
+    def places(self, base: BaseParameters, arm: str) -> NDArray[np.intp]:
+        """Which base parameters are chosen.
+
+        Raises:
+            UsageError: one is none of the arm's.
+        """
+        known = {expression.replace(" ", ""): place for place, expression in enumerate(base.expressions)}
+        if unknown := [name for name in self.parameters if name.replace(" ", "") not in known]:
+            raise UsageError(f"{', '.join(unknown)}: not among the base parameters of {arm}; `ident base` prints them")
+        chosen = [known[name.replace(" ", "")] for name in self.parameters] or list(range(base.size))
+        return np.array(chosen, dtype=np.intp)
+
+
+def worst_share(doubt: Doubt, base: BaseParameters, places: NDArray[np.intp]) -> float:
+    """The largest share of the chosen ones; infinite before there are enough blocks to say."""
+    if doubt.blocks < LEAST_BLOCKS:
+        return np.inf
+    worst = float(shares(doubt.beta, doubt.deviations, base.units)[places].max())
+    return worst if np.isfinite(worst) else np.inf

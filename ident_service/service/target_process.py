@@ -1,0 +1,86 @@
+"""Follows a run's recording in a process of its own, at the lowest priority, until its target is reached.
+
+It gets one JSON object on its standard input and says one line of JSON, once. It reads what the recorder has flushed
+and touches nothing else: whoever started it keeps the lease and asks for the finish. It ends with its standard input.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import sys
+from pathlib import Path
+from typing import Any
+
+from ident_service.config.load import arm_from_json
+from ident_service.estimation.growing import GrowingInformation
+from ident_service.estimation.target import Target, worst_share
+from ident_service.model.arm_model import arm_model
+from ident_service.record.recording import Block
+from ident_service.record.tail import RecordingTail
+
+_LOOK = 0.3  # s between looks
+_IN_A_ROW = 2  # steps in which the target is reached: deviations are estimates, and one that dips is no knowledge
+
+
+def main() -> int:
+    """Watch; 0 when the target was reached or the recording ended."""
+    os.nice(19)
+    request = json.loads(sys.stdin.readline())
+    if said := watch(Path(request["folder"]), Target(request["share"], tuple(request["parameters"])), request["least"]):
+        print(json.dumps(said), flush=True)
+    return 0
+
+
+def watch(folder: Path, target: Target, least: float) -> dict[str, Any] | None:
+    """Wait until the target is reached: seconds of the motion and the largest share then; None where it was not.
+
+    Args:
+        folder: of the run.
+        target: to be reached.
+        least: seconds of the motion itself, before which nothing counts.
+
+    Raises:
+        IdentError: the recording or the description cannot be read.
+    """
+    model = arm_model(arm_from_json(folder / "arm.json"))
+    growing = GrowingInformation(model, in_blocks=True)
+    places = target.places(growing.base, model.config.name)
+    if (tail := _opened(folder)) is None:
+        return None
+    row = 0
+    while True:
+        samples = tail.read()
+        if samples is not None:
+            growing.add(Block(samples.stamp_ns, samples.position, samples.torque))
+        elif tail.ended or _left_alone():
+            return None
+        if not growing.step() or tail.exciting_ns is None or (doubt := growing.doubt()) is None:
+            continue
+        seconds = (doubt.until_ns - tail.exciting_ns) * 1e-9
+        worst = worst_share(doubt, growing.base, places)
+        row = row + 1 if seconds >= least and worst <= target.share else 0
+        if row >= _IN_A_ROW:
+            return {"seconds": round(seconds, 3), "share": worst}
+
+
+def _opened(folder: Path) -> RecordingTail | None:
+    """The recording, as soon as there is one; None where nobody waits for it any more."""
+    while True:
+        for name in ("run.mcap.partial", "run.mcap"):
+            try:
+                return RecordingTail(folder / name)
+            except FileNotFoundError:
+                continue
+        if _left_alone():
+            return None
+
+
+def _left_alone() -> bool:
+    """Wait a little; whether whoever asked is gone, or has ended the question."""
+    return bool(select.select([sys.stdin.fileno()], [], [], _LOOK)[0])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

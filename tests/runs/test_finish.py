@@ -1,0 +1,164 @@
+"""Runs that end early: `ident run --until`, whatever becomes of the process that looks, and what is learned by then."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ident_service.cli import main
+from ident_service.config.load import load_arm, shipped_arms
+from ident_service.errors import UsageError
+from ident_service.estimation.doubt import REFERENCE, shares
+from ident_service.estimation.growing import Doubt
+from ident_service.estimation.target import LEAST_BLOCKS, Target, worst_share
+from ident_service.excitation.plan import excitation
+from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.model.base import base_parameters
+from ident_service.record.mcap_file import McapRecording
+from ident_service.record.open import open_recording
+from ident_service.service.reaching import Reaching, least_seconds, require_target
+
+PERIOD = 10.0  # s, of the shipped planar arm's motion
+SHARE = 0.06
+
+
+@pytest.fixture
+def long_arm(tmp_path: Path) -> Path:
+    """The planar arm in virtual time with a motion far longer than it needs, and than this machine takes to look."""
+    path = tmp_path / "long.yaml"
+    motion = "{kind: seeded, seed: 1, base_frequency: 0.1, harmonics: 5, periods: 60}"
+    path.write_text(
+        f"extends: {shipped_arms()['planar2']}\nmotions: {{identification: {motion}, validation: {motion}}}\n"
+    )
+    return path
+
+
+@pytest.fixture(scope="module")
+def model() -> ArmModel:
+    return arm_model(load_arm(shipped_arms()["planar2"]))
+
+
+def ran(arm: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
+    """The answer of a checked run."""
+    state = ["--state", str(tmp_path / "state")]
+    assert main(["check", str(arm), "--confirm", "planar2", *state]) == 0
+    capsys.readouterr()
+    assert main(["run", str(arm), "--out", str(tmp_path / "run"), "--json", *words, *state]) == 0
+    return dict(json.loads(capsys.readouterr().out))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_run_ends_early_with_what_it_is_for(
+    long_arm: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = ran(long_arm, tmp_path, capsys, "--until", str(SHARE))["report"]
+    assert (report["state"], report["finished"]) == ("done", "early")
+    reached = report["until"]["reached"]
+    assert 0.0 < reached["share"] <= SHARE
+    assert PERIOD <= reached["seconds"] <= report["motion_seconds"] < 60.0 * PERIOD
+    ended = json.loads((tmp_path / "run" / "ended.json").read_text())
+    assert (ended["state"], ended["finished"]) == ("done", "early")
+    recording = open_recording(tmp_path / "run" / "run.mcap")
+    assert isinstance(recording, McapRecording)
+    assert recording.metadata["complete"] == "true"
+    words = ["identify", str(tmp_path / "run" / "run.mcap"), "--arm", str(long_arm), "--out", str(tmp_path / "result")]
+    assert main(words) == 0
+    content = json.loads((tmp_path / "result" / "parameters.json").read_text())
+    table = content["base_parameters"]
+    found = shares(np.array(table["values"]), np.array(table["standard_deviations"]), tuple(table["units"]))
+    # Deviations from 40 blocks are known to 11 % themselves, and the result smooths otherwise than what is watched.
+    assert (found <= 1.35 * SHARE).all(), found
+    assert content["feasibility"]["feasible"]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_target_that_is_not_reached_lets_the_run_go_on_to_its_end(
+    virtual_arm: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = ran(virtual_arm, tmp_path, capsys, "--until", "0.0001", "--parameter", "fv1")["report"]
+    assert (report["state"], report.get("finished")) == ("done", None)
+    assert report["until"] == {"share": 0.0001, "parameters": ["fv1"], "reached": None}
+    assert report["cycles"] > 10_000  # ten seconds of motion at 1 kHz
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--until", "0.1", "--parameter", "nonsense"], "nonsense: not among the base parameters"),
+        (["--until", "0"], "a target of 0 of a parameter"),
+        (["--parameter", "fv1"], "--parameter is what --until SHARE is about"),
+    ],
+)
+def test_a_target_that_is_none_is_refused_before_anything_moves(
+    virtual_arm: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
+) -> None:
+    state = ["--state", str(tmp_path / "state")]
+    assert main(["check", str(virtual_arm), "--confirm", "planar2", *state]) == 0
+    assert main(["run", str(virtual_arm), "--out", str(tmp_path / "run"), *words, *state]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_finish_is_refused_where_nobody_moves(virtual_arm: Path, tmp_path: Path, capsys: Any) -> None:
+    assert main(["finish", str(virtual_arm), "--state", str(tmp_path / "state")]) == 2
+    assert "nobody moves the arm" in capsys.readouterr().err
+
+
+def doubt(model: ArmModel, values: float, deviation: float, blocks: int = LEAST_BLOCKS) -> Doubt:
+    size = base_parameters(model.chain, model.layout).size
+    return Doubt(20.0, np.full(size, values), np.full(size, deviation), (), blocks)
+
+
+def test_the_rule(model: ArmModel) -> None:
+    base = base_parameters(model.chain, model.layout)
+    everything = Target(0.1).places(base, "planar2")
+    assert everything.tolist() == list(range(base.size))
+    assert worst_share(doubt(model, 2.0, 0.1), base, everything) == pytest.approx(0.05)
+    # As good as zero: a share of the reference, the smallest of which counts.
+    least = min(REFERENCE[unit] for unit in base.units)
+    assert worst_share(doubt(model, 0.0, 1e-3), base, everything) == pytest.approx(1e-3 / least)
+    assert worst_share(doubt(model, 2.0, 0.1, LEAST_BLOCKS - 1), base, everything) == np.inf
+    for unknown in (np.inf, np.nan):
+        assert worst_share(doubt(model, 2.0, unknown), base, everything) == np.inf
+    mixed = doubt(model, 2.0, 0.1)
+    mixed.deviations[:3] = 1.0, 0.02, np.inf
+    (second,) = chosen = Target(0.1, (base.expressions[1].replace(" ", ""),)).places(base, "planar2")
+    assert second == 1
+    assert worst_share(mixed, base, chosen) == pytest.approx(0.01)
+    assert worst_share(mixed, base, everything) == np.inf
+    for share in (0.0, 1.0, -1.0, float("nan")):
+        with pytest.raises(UsageError, match="above 0 and below 1"):
+            require_target(Target(share), model)
+
+
+def test_nothing_counts_before_the_first_period(model: ArmModel) -> None:
+    motion = excitation(model, "identification")
+    assert least_seconds(motion, 1.0) == pytest.approx(PERIOD)
+    assert least_seconds(motion, 0.5) == pytest.approx(2.0 * PERIOD)
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+def test_one_that_looks_may_die_or_hang(tmp_path: Path, how: signal.Signals) -> None:
+    told: list[str] = []
+    with Reaching(tmp_path, Target(0.1), 0.0, told.append) as reaching:
+        assert not reaching.reached()
+        os.kill(reaching._process.pid, how)
+        if how is signal.SIGKILL:
+            end = time.monotonic() + 60.0
+            while not told:
+                assert not reaching.reached()
+                assert time.monotonic() < end
+                time.sleep(0.01)
+        assert not reaching.reached()
+    assert reaching._process.returncode is not None
+    died = ["nobody looks any more whether the target is reached; the motion goes on to its end"]
+    assert told == (died if how is signal.SIGKILL else [])
