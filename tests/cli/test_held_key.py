@@ -5,21 +5,19 @@ from __future__ import annotations
 import os
 import pty
 import termios
-import threading
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pytest
+from cli.hands import REPEAT, Hands
 
 from ident_service.cli import main
 from ident_service.cli.moving import RELEASED, REPEATS, HeldKey
 from ident_service.config.load import shipped_arms
 from ident_service.motion.controls import HOLD_TO_RUN_SECONDS
 
-REPEAT = 0.033  # s, a desktop's
 SLOWEST = 0.092  # s, the Linux console's
 
 
@@ -185,30 +183,6 @@ def test_without_a_terminal_a_rehearsal_needs_a_word(
 ) -> None:
     assert main(["rehearse", str(arm(tmp_path)), "--state", str(tmp_path), *words]) == 2
     assert "--no-key" in capsys.readouterr().err
-
-
-class Hands:
-    """Somebody at the keyboard in real time: holds the space bar until told to let go."""
-
-    def __init__(self, master: int) -> None:
-        self._master, self._let_go = master, threading.Event()
-        self._thread = threading.Thread(target=self._hold, daemon=True)
-
-    def __enter__(self) -> Hands:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.let_go()
-        self._thread.join()
-
-    def let_go(self) -> None:
-        self._let_go.set()
-
-    def _hold(self) -> None:
-        while not self._let_go.is_set():
-            os.write(self._master, b" ")
-            time.sleep(REPEAT)
 
 
 @pytest.mark.slow

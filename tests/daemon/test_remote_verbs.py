@@ -8,7 +8,6 @@ import os
 import pty
 import shutil
 import termios
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cli.hands import Hands
 from daemon.conftest import quick_text
 from daemon.served import daemon_process
 from daemon.verbs_bench import ON_A_BUS, on_a_bus, unstable_text
@@ -28,7 +28,6 @@ from ident_service.errors import ArmError
 from ident_service.service.client import Client
 
 RUN = "20260101T000000Z-quick"
-REPEAT = 0.033  # s, a desktop's keyboard
 
 
 def verbs() -> dict[str, Parser]:
@@ -238,31 +237,6 @@ def test_a_zeroing_that_nobody_asks_for_any_more_is_not_done(
     heard = capsys.readouterr()
     assert why in heard.err
     assert ("zeroed, until its drives lose their power" in heard.out) == (said is None)
-
-
-class Hands:
-    """The space bar of a terminal, held until it is let go."""
-
-    def __init__(self, master: int) -> None:
-        self._master, self._let_go = master, threading.Event()
-        self._thread = threading.Thread(target=self._hold, daemon=True)
-
-    def __enter__(self) -> Hands:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.let_go()
-        self._thread.join()
-
-    def let_go(self) -> None:
-        """Release the key."""
-        self._let_go.set()
-
-    def _hold(self) -> None:
-        while not self._let_go.is_set():
-            os.write(self._master, b" ")
-            time.sleep(REPEAT)
 
 
 @pytest.mark.slow
