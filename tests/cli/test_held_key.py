@@ -191,6 +191,7 @@ def test_a_rehearsal_ends_with_the_key(
 ) -> None:
     path, state = arm(tmp_path), ["--state", str(tmp_path / "state")]
     assert main(["check", str(path), "--confirm", "planar2", *state]) == 0
+    monkeypatch.setattr("ident_service.cli.moving.RELEASED", 2.0)  # a busy machine is no hand that lets go
     before = termios.tcgetattr(keyboard.slave)
     with os.fdopen(os.dup(keyboard.slave)) as stdin, Hands(keyboard.master) as hands:
         monkeypatch.setattr("sys.stdin", stdin)
