@@ -11,7 +11,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
+from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, interrupting, state_folder, tell
 from ident_service.cli.lease import add_lease, asked_lease, until
 from ident_service.cli.moving import RELEASED, HeldKey, add_can_log, moved, require_terminal
 from ident_service.cli.words import Parser, Verbs, seconds, share, speed
@@ -136,9 +136,9 @@ def _check(arguments: argparse.Namespace) -> Answer:
     arm, model = make_arm(config), arm_model(config)
     lease, stopping = asked_lease(arguments, config), StopOnSignal()
     # Whoever looks for the one who moves the arm finds this process, and its stop ends the preflight. A person's Ctrl-C
-    # ends it at once, a question too; a program's polite signal waits for the next cycle.
+    # or a polite kill ends it at once, a question too, with torque off; a program's signal waits for the next cycle.
     with (
-        nullcontext() if lease is None else stopping,
+        interrupting() if lease is None else stopping,
         ControlFile.take(control_path(state, config.name), None, asked_ns=arguments.asked_ns) as controls,
     ):
         stoppable = StoppableArm(arm, until(lambda: controls.stop or stopping.requested(), lease))

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from ident_service.cli.answer import StopOnSignal, print_answer, tell
+from ident_service.cli.answer import StopOnSignal, interrupting, print_answer, tell
 
 TALK = """
 import sys
@@ -104,3 +104,19 @@ def test_an_answer_that_cannot_be_written_is_no_success_and_no_traceback() -> No
         )
     assert ended.returncode == 1
     assert ended.stderr == "ident: done, but the answer cannot be written: No space left on device\n"
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_polite_kill_is_an_interrupt_that_arms_are_let_go_by(number: signal.Signals) -> None:
+    before, let_go = signal.getsignal(number), []
+
+    def preflight() -> None:
+        try:
+            signal.raise_signal(number)
+        finally:
+            let_go.append("torque off")
+
+    with interrupting(), pytest.raises(KeyboardInterrupt):
+        preflight()
+    assert let_go == ["torque off"]
+    assert signal.getsignal(number) is before
