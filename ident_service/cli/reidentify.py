@@ -79,6 +79,7 @@ def _step(arguments: argparse.Namespace, *words: str) -> Answer:
 
     always = ["--state", str(state_folder(arguments)), *(["--json"] if arguments.json else [])]
     parsed = parser().parse_args([*words, *always])
+    parsed.asked_ns = arguments.asked_ns  # a stop that comes between two of them, too, is of this
     tell(arguments, f"-- {words[0]}")
     answer: Answer = parsed.verb(parsed)
     return answer

@@ -193,4 +193,5 @@ def test_nothing_is_wider_than_the_window(browser: Browser, reached: Reached, wi
         expect(page.get_by_role("button", name="Stop all arms")).to_be_in_viewport(ratio=1.0)
     page.goto(f"{reached.url}/arms/{ARM}")
     page.get_by_role("button", name="Re-identify", exact=True).click()
+    expect(page.get_by_label("Type the arm's name")).to_be_visible()
     assert page.evaluate("document.documentElement.scrollWidth") <= width

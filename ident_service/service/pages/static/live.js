@@ -82,6 +82,7 @@ function holdToMove(button) {
   button.addEventListener("keyup", release);
   addEventListener("blur", release);
   document.addEventListener("visibilitychange", () => document.hidden && release());
+  button.disabled = false; // before, a press would not have been heard
 }
 
 if (job.dataset.lease === "keep") {
