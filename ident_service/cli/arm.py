@@ -6,6 +6,7 @@ Boundary: words to requests, results to words; the work is `service/run.py`. `st
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from contextlib import nullcontext
 from pathlib import Path
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from ident_service.excitation.excitation import Excitation
 
 _REHEARSAL = 0.2
+_PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")  # a name that stays below its folder
 _HELP_ARM = "description file, or the name of a shipped one"
 
 
@@ -233,17 +235,27 @@ def _ask(arguments: argparse.Namespace) -> Answer:
 
 
 def _ack(arguments: argparse.Namespace) -> Answer:
-    from ident_service.config.load import load_arm
     from ident_service.service.arm_state import fault_file
 
-    name = load_arm(arguments.arm).name
+    name = _name(arguments)
     cause = fault_file(state_folder(arguments), name).acknowledge(arguments.fault)
     return DONE, f"{name}: acknowledged {arguments.fault} ({cause})\n", {"arm": name, "acknowledged": arguments.fault}
 
 
 def _control(arguments: argparse.Namespace) -> tuple[str, Path]:
-    from ident_service.config.load import load_arm
     from ident_service.service.arm_state import control_path
 
-    name = load_arm(arguments.arm).name
+    name = _name(arguments)
     return name, control_path(state_folder(arguments), name)
+
+
+def _name(arguments: argparse.Namespace) -> str:
+    """Of an arm: the word itself where the state folder remembers such an arm, whose description may be a daemon's."""
+    from ident_service.config.load import load_arm
+    from ident_service.service.arm_state import arm_folder
+
+    word = str(arguments.arm)
+    state = state_folder(arguments)
+    if _PLAIN.fullmatch(word) and not Path(word).is_file() and arm_folder(state, word).is_dir():
+        return word
+    return load_arm(word).name

@@ -14,7 +14,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.answer import DONE, FAILED, FAULTED, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
+from ident_service.cli.answer import DONE, FAILED, FAULTED, USAGE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
 from ident_service.cli.words import Verbs, count
 from ident_service.errors import IdentError, UsageError
 
@@ -182,8 +182,9 @@ def _home(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
 def _ask(client: Client, arguments: argparse.Namespace) -> Answer:
     answer = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/{arguments.word}")
     reached = bool(answer.get("reached", answer.get("arms")) or answer.get("jobs"))
-    words = f"{arguments.word} asked" if reached else "nobody moves the arm"
-    return DONE, f"{arguments.arm}: {words}\n", answer
+    if not reached:  # the exit code is that of the same words at the machine itself
+        return USAGE, f"{arguments.arm}: nobody moves an arm of this name there\n", answer
+    return DONE, f"{arguments.arm}: {arguments.word} asked\n", answer
 
 
 def _ack(client: Client, arguments: argparse.Namespace) -> Answer:

@@ -44,7 +44,8 @@ def expendable(db: Database, state: Path, newest: int) -> list[Expendable]:
     busy = {row["run"] for row in db.rows("SELECT run FROM jobs WHERE state IN ('queued', 'running')")}
     rows = db.rows(
         "SELECT recordings.run, name, bytes, rank FROM recordings JOIN (SELECT id, ROW_NUMBER() OVER "
-        "(PARTITION BY arm ORDER BY created DESC, id DESC) AS rank FROM runs) ON id = recordings.run "
+        "(PARTITION BY arm ORDER BY created DESC, id DESC) AS rank FROM runs "
+        "WHERE id IN (SELECT run FROM recordings WHERE deleted IS NULL)) ON id = recordings.run "
         "WHERE deleted IS NULL AND rank > ? ORDER BY rank DESC, recordings.run, name",
         newest,
     )

@@ -27,6 +27,18 @@ def test_an_arm_that_moves_is_neither_checked_nor_watched(ident: Ident, state: P
 
 
 @pytest.mark.slow
+def test_an_arm_whose_description_is_a_daemons_is_stopped_by_its_name(ident: Ident, state: Path) -> None:
+    assert ident("stop", "uploaded").code == 2
+    assert not (state / "arms" / "uploaded").exists()
+    with ControlFile.take(control_path(state, "uploaded"), None) as mover:
+        for word in ("pause", "finish", "stop"):
+            assert ident(word, "uploaded").code == 0
+        assert (mover.stop, mover.finish) == (True, True)
+    fault_file(state, "uploaded").latch("lease_lost", "nobody was there")
+    assert ident("ack", "uploaded", "lease_lost").code == 0
+    assert ident("stop", "../uploaded").code == 2
+
+
 def test_a_check_comes_after_the_faults(ident: Ident, state: Path) -> None:
     fault_file(state, "planar2").latch("lease_lost", "nobody was there")
     ended = ident("check", "planar2", "--confirm", "planar2")

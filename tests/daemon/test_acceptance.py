@@ -163,6 +163,11 @@ def test_only_recordings_that_nobody_accepted_are_let_go(db: Database, state: Pa
         db.write("UPDATE runs SET created = ? WHERE id = ?", float(day), named.name)
         folder = named
     accept(db, state, state / "runs" / "20260101T000000Z-quick", "kept for ever", "me")
+    # A run that holds no recording, an identification say, takes nobody's place.
+    bare = folder.with_name("20260109T000000Z-quick")
+    shutil.copytree(folder, bare, ignore=shutil.ignore_patterns("*.mcap"))
+    write_manifest(bare)
+    import_run(db, state, bare, "me")
     gone = expendable(db, state, 2)
     assert {one.run[:8] for one in gone} == {"20260102", "20260103"}
     assert {one.name for one in gone} == {"identification.mcap", "validation.mcap"}

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import logging
 import signal
+import sqlite3
 import threading
 import time
 from collections import Counter
@@ -35,6 +36,7 @@ from ident_service.service.registry.motions import new_id
 
 _TICK = 0.05  # s between looks at what runs and what waits
 _POLITE = 15.0  # s for a computation that was asked to end
+_AGAIN = 1.0  # s between tries to enter what the registry has no room for
 LOG = logging.getLogger("ident.jobs")
 
 
@@ -82,6 +84,7 @@ class Engine:
         self.db, self.state = db, state
         self._computing, self._door, self._factor, self._now = computing, motion_door, lease_factor, now
         self._live: dict[str, _Live] = {}
+        self._unwritten: set[str] = set()  # jobs whose end waits for room in the registry
         self._stops = Counter[str | None]()
         self._lock = threading.RLock()
         self._wake, self._closing = threading.Event(), threading.Event()
@@ -107,8 +110,8 @@ class Engine:
 
     @property
     def healthy(self) -> bool:
-        """Whether the queue is being looked after."""
-        return self._thread.is_alive() and self._now() - self.beat < 30.0
+        """Whether the queue is being looked after, and the registry can be written."""
+        return self._thread.is_alive() and self._now() - self.beat < 30.0 and not self._unwritten
 
     def create(
         self,
@@ -343,7 +346,17 @@ class Engine:
         except Exception as error:  # whatever stands in its way, the job has ended
             LOG.exception("what a job made could not be entered")
             detail = "; ".join(filter(None, (detail, f"its folder could not be entered: {error}")))
-        self._finish(live, ended.state, detail, ended.exit_code)
+        while True:
+            try:
+                self._finish(live, ended.state, detail, ended.exit_code)
+            except sqlite3.Error:  # a full disk, say; until there is room, nobody may take this service for a sound one
+                LOG.exception("the end of a job cannot be entered yet", extra={"job": live.job})
+                self._unwritten.add(live.job)
+                if self._closing.wait(_AGAIN):
+                    return  # the next start finds out what became of it
+            else:
+                self._unwritten.discard(live.job)
+                return
 
     def _finish(self, live: _Live, state: str, detail: str, code: int | None) -> None:
         with self._lock:
