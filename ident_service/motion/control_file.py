@@ -64,7 +64,7 @@ class ControlFile:
             path: of the file; made where it is missing.
             lease_seconds: how long the arm may move after `renew` [s]; None for a run that needs no lease.
             now_ns: the lease's clock.
-            asked_ns: when the motion was asked for, on that clock [ns]; now when None.
+            asked_ns: when the motion was asked for, on that clock [ns]; when None, no earlier stop counts.
 
         Raises:
             DriverError: another process moves the arm.
@@ -82,12 +82,12 @@ class ControlFile:
         os.ftruncate(fd, _SIZE)
         memory = mmap.mmap(fd, _SIZE)
         length = 0 if lease_seconds is None else round(lease_seconds * 1e9)
-        now = now_ns()
-        memory[:_STOPPED] = _MAGIC + struct.pack("<IIBB6xqq", _VERSION, os.getpid(), 0, 0, now, length)
+        memory[:_STOPPED] = _MAGIC + struct.pack("<IIBB6xqq", _VERSION, os.getpid(), 0, 0, now_ns(), length)
         taken = cls(fd, memory, now_ns)
         # Read last: a stop either finds these controls in place, or has left its time behind before.
         stopped = struct.unpack_from("<q", memory, _STOPPED)[0]
-        if asked_ns is not None and asked_ns <= stopped <= now:  # a later one is from before the machine was started
+        # One that seems yet to come is from before the machine was started.
+        if asked_ns is not None and asked_ns <= stopped <= now_ns():
             taken.ask_stop()
         return taken
 

@@ -128,3 +128,19 @@ def test_a_stop_that_cannot_be_written_says_so(tmp_path: Path) -> None:
     (tmp_path / "arm").write_text("", encoding="utf-8")
     with pytest.raises(UsageError, match="cannot be written"):
         ControlFile.stop_all(loop_path(tmp_path))
+
+
+def test_a_stop_that_comes_while_the_controls_are_taken_is_not_lost(tmp_path: Path) -> None:
+    time, asked_ns, looks = Time(), 5_000_000_000, [0]
+    ControlFile.take(loop_path(tmp_path), None, time).close()
+
+    def now() -> int:
+        looks[0] += 1
+        read = time.now
+        time.now += 1
+        if looks[0] == 1:  # the clock has been read, and the controls are not written yet
+            ControlFile.stop_all(loop_path(tmp_path), time)
+        return read
+
+    with ControlFile.take(loop_path(tmp_path), None, now, asked_ns) as loop:
+        assert loop.stop
