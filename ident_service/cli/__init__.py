@@ -39,6 +39,7 @@ from ident_service.cli.answer import (
     USAGE,
     VERDICT_NO,
     Answer,
+    hear_interrupts,
     print_answer,
     print_error,
     print_to_person,
@@ -74,6 +75,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         SystemExit: with 0 after help or version, with 2 after words that no verb understands.
     """
     words = sys.argv[1:] if argv is None else argv
+    hear_interrupts()
     try:
         arguments = parser().parse_args(words)
         arguments.asked_ns = time.monotonic_ns()

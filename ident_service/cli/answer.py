@@ -12,6 +12,7 @@ import json
 import os
 import signal
 import sys
+import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -90,10 +91,24 @@ def state_folder(arguments: argparse.Namespace) -> Path:
     return (Path(base) if base else Path.home() / ".local" / "state") / "ident"
 
 
+def hear_interrupts() -> None:
+    """Hear Ctrl-C although the shell that started this process told it not to.
+
+    A shell without job control, that of a script for example, starts `command &` with SIGINT ignored (POSIX.1-2017,
+    Shell Command Language, 2.11), and what is started inherits it. Where hangups are ignored too, `nohup` was asked for
+    and both stay ignored; `StopOnSignal` and `interrupting` hear Ctrl-C there all the same, because they guard an arm.
+    """
+    # Handlers can be set in the main thread only, and only there does an interpreter raise KeyboardInterrupt.
+    if threading.current_thread() is not threading.main_thread():
+        return
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 @contextmanager
 def interrupting() -> Iterator[None]:
     """A polite kill, or a terminal that closes, is an interrupt like Ctrl-C: who has an arm lets go of it first."""
-    numbers = [signal.SIGTERM]
+    numbers = [signal.SIGINT, signal.SIGTERM]
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
         numbers.append(signal.SIGHUP)
     before = {number: signal.signal(number, signal.default_int_handler) for number in numbers}
@@ -107,8 +122,8 @@ def interrupting() -> Iterator[None]:
 class StopOnSignal:
     """Ctrl-C, a polite kill or a terminal that closes asks for a controlled stop.
 
-    A second Ctrl-C or kill is an interrupt as usual. A second hangup is not: shells send it besides the kernel. Where
-    hangups are ignored (`nohup`), they stay so.
+    A second Ctrl-C interrupts and a second kill does what it did before. A second hangup does nothing: shells send it
+    besides the kernel. Where hangups are ignored (`nohup`), they stay so; Ctrl-C is heard everywhere.
     """
 
     def __init__(self) -> None:
@@ -131,4 +146,5 @@ class StopOnSignal:
     def _ask(self, number: int, _: object) -> None:
         self._asked = True
         if number != signal.SIGHUP:
-            signal.signal(number, self._before[signal.Signals(number)])
+            before = self._before[signal.Signals(number)]
+            signal.signal(number, signal.default_int_handler if before is signal.SIG_IGN else before)

@@ -25,12 +25,7 @@ sys.exit(3)
 """
 
 
-@pytest.fixture(autouse=True)
-def hangups_are_heard() -> Iterator[None]:
-    """Whoever runs the tests may have told them to ignore hangups, as `nohup` does."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
-    yield
-    signal.signal(signal.SIGHUP, before)
+pytestmark = pytest.mark.usefixtures("hangups_are_heard")
 
 
 def test_a_reader_that_has_gone_changes_nothing() -> None:
@@ -87,7 +82,7 @@ def test_hangups_that_are_ignored_stay_so() -> None:
 
 
 @pytest.fixture
-def nohup() -> Iterator[None]:
+def nohup(hangups_are_heard: None) -> Iterator[None]:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     yield
     signal.signal(signal.SIGHUP, before)
@@ -120,3 +115,42 @@ def test_a_polite_kill_is_an_interrupt_that_arms_are_let_go_by(number: signal.Si
         preflight()
     assert let_go == ["torque off"]
     assert signal.getsignal(number) is before
+
+
+INTERRUPTED = """
+import signal
+from ident_service import cli
+def verb(arguments):
+    signal.raise_signal(signal.SIGINT)
+    return 0, "did not hear it\\n", {}
+cli.remote.remotely = verb
+raise SystemExit(cli.main(["config", "check", "planar2", "--server", "http://localhost"]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("ignored", "heard"), [("INT", True), ("INT HUP", False)], ids=["in the background of a script", "nohup"]
+)
+def test_a_command_in_the_background_hears_ctrl_c_unless_it_was_to_survive_the_terminal(
+    ignored: str, heard: bool
+) -> None:
+    start = ["/bin/sh", "-c", f"trap '' {ignored}; exec \"$@\"", "sh", sys.executable, "-c", INTERRUPTED]
+    done = subprocess.run(start, capture_output=True, text=True, check=False)
+    wanted = (1, "", "ident: interrupted\n") if heard else (0, "did not hear it\n", "")
+    assert (done.returncode, done.stdout, done.stderr) == wanted
+
+
+def test_who_guards_an_arm_hears_ctrl_c_under_nohup_too(nohup: None) -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        stopping = StopOnSignal()
+        with stopping:
+            signal.raise_signal(signal.SIGINT)
+            assert stopping.requested()
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+        with interrupting(), pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -145,6 +145,13 @@ def quick_text(name: str = "quick") -> str:
     return text
 
 
+def patient_text(name: str = "quick") -> str:
+    """The same arm with motions of five minutes of its own time, which outlast what a test does meanwhile."""
+    text = quick_text(name).replace("periods: 2}", "periods: 60}")
+    assert "periods: 60}" in text
+    return text
+
+
 @pytest.fixture(scope="session")
 def commissioned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a whole job on the small arm `quick`; not to be changed."""

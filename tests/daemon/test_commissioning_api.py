@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from daemon.conftest import Asked, quick_text, serving
+from daemon.conftest import Asked, patient_text, quick_text, serving
 
 from ident_service.motion.control_file import in_use
 from ident_service.service.arm_state import control_path
@@ -45,9 +45,7 @@ def checked(daemon: Asked) -> None:
 @pytest.fixture
 def patient(daemon: Asked) -> str:
     """The same arm with a motion of five minutes of its own time, and a ticket for it."""
-    text = quick_text(ARM).replace("periods: 2}", "periods: 60}")
-    assert "periods: 60}" in text
-    assert daemon.post("/api/v1/arms", {"description": text}).status_code == 201
+    assert daemon.post("/api/v1/arms", {"description": patient_text(ARM)}).status_code == 201
     checked(daemon)
     return ARM
 

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from daemon.conftest import quick_text, serving
+from daemon.conftest import patient_text, quick_text, serving
 from daemon.served import daemon_process
 
 from ident_service.errors import MotionRefused
@@ -51,6 +51,12 @@ def checked(client: Client) -> None:
     seen = client.get(f"/api/v1/jobs/{job}")
     assert ended, seen
     assert seen["state"] == "done", seen
+
+
+def excited(client: Client, job: str) -> None:
+    """Renew a run's lease until its motion has begun."""
+    while "exciting" not in str(client.get(f"/api/v1/jobs/{job}")["progress"]):
+        assert carried(client, job, 0.2)
 
 
 def _renewed(client: Client, job: str) -> None:
@@ -132,11 +138,10 @@ def test_thirty_kills(state: Path) -> None:
 @pytest.mark.timeout(300)
 def test_a_daemon_that_is_asked_to_end_stops_its_arm_first(state: Path) -> None:
     with daemon_process(state) as (process, client):
-        client.post("/api/v1/arms", {"description": quick_text(ARM)})
+        client.post("/api/v1/arms", {"description": patient_text(ARM)})
         checked(client)
         job = begin(client, "run")
-        while not in_use(control_path(state, ARM)):
-            assert carried(client, job, 0.2)
+        excited(client, job)
         process.send_signal(signal.SIGTERM)
         assert process.wait(60) == 0
     assert not in_use(control_path(state, ARM))

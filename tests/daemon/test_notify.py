@@ -8,14 +8,16 @@ import json
 import signal
 import socket
 import struct
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-from daemon.conftest import quick_text
+from daemon.conftest import patient_text, quick_text
 from daemon.served import daemon_process, started
-from daemon.test_daemon_killed import ARM, begin, carried, checked
+from daemon.test_daemon_killed import ARM, begin, checked, excited
 
 from ident_service.motion.control_file import in_use
 from ident_service.service.arm_state import control_path
@@ -95,11 +97,10 @@ def test_who_is_told_that_it_is_ready_has_the_first_page_at_once(state: Path, tm
 
 def test_the_daemon_alone_speaks_and_an_arm_rests_before_it_ends(state: Path, tmp_path: Path, manager: Manager) -> None:
     with daemon_process(state, NOTIFY_SOCKET=str(tmp_path / "notify"), WATCHDOG_USEC="200000") as (process, client):
-        client.post("/api/v1/arms", {"description": quick_text(ARM)})
+        client.post("/api/v1/arms", {"description": patient_text(ARM)})
         checked(client)
         job = begin(client, "run")
-        while not in_use(control_path(state, ARM)):
-            assert carried(client, job, 0.2)
+        excited(client, job)
         before = manager.heard()
         process.send_signal(signal.SIGTERM)
         told = manager.until("STOPPING=1")
@@ -113,3 +114,30 @@ def test_the_daemon_alone_speaks_and_an_arm_rests_before_it_ends(state: Path, tm
     assert set(words[:-1]) == {"WATCHDOG=1"}
     assert words.count("WATCHDOG=1") > 5
     assert {pid for _, pid in before + told} == {process.pid}
+
+
+def fill(path: Path) -> int:
+    """Send to the manager until nothing more fits into its queue; how many lines that were."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as link:
+        count = 0
+        with suppress(BlockingIOError):
+            while count < 100_000:
+                link.sendto(b"STATUS=somebody else", str(path))
+                count += 1
+    return count
+
+
+def test_a_manager_that_never_reads_holds_nobody_up(state: Path, tmp_path: Path, manager: Manager) -> None:
+    others = fill(tmp_path / "notify")
+    assert 0 < others < 100_000
+    with daemon_process(state, NOTIFY_SOCKET=str(tmp_path / "notify"), WATCHDOG_USEC="20000") as (process, client):
+        client.post("/api/v1/arms", {"description": quick_text(ARM)})
+        until = time.monotonic() + 0.5  # tens of watchdog periods with a full queue
+        while time.monotonic() < until:
+            client.post("/api/v1/stop", {})
+        # As soon as it reads, it hears that we are ready, however late.
+        assert {word for word, _ in manager.heard()} == {"STATUS=somebody else"}
+        assert manager.hear() == ("READY=1", process.pid)
+        fill(tmp_path / "notify")
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 0

@@ -7,16 +7,26 @@ from __future__ import annotations
 
 import os
 import socket
-from contextlib import suppress
 
 
-def tell_manager(line: str) -> None:
-    """Say one thing, `READY=1` for example; a manager that cannot be reached changes nothing."""
+def tell_manager(line: str) -> bool:
+    """Send one line, `READY=1` for example, without ever waiting for the manager to read.
+
+    Returns:
+        False where the manager's queue is full and the line was dropped; it may be sent again. True otherwise, also
+        where there is no manager.
+    """
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address.startswith(("/", "@")):
-        return
-    with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as link:
-        link.sendto(line.encode(), f"\0{address[1:]}" if address.startswith("@") else address)
+        return True
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK) as link:
+            link.sendto(line.encode(), f"\0{address[1:]}" if address.startswith("@") else address)
+    except BlockingIOError:
+        return False
+    except OSError:
+        pass  # a manager that cannot be reached changes nothing
+    return True
 
 
 def watchdog_seconds() -> float | None:

@@ -27,6 +27,7 @@ from ident_service.service.api.settings import Settings
 LOCK: Final = "serve.lock"
 URL_FILE: Final = "serve.url"
 _LAST_ANSWERS = 5  # s for requests that are being answered when the service ends
+_READY_AGAIN = 0.1  # s until a manager whose queue was full is told again that we are ready
 _LOG = logging.getLogger("ident.serve")
 
 
@@ -48,7 +49,6 @@ def serve(settings: Settings, tell: Callable[[str], None] = lambda _: None) -> N
             # In the file for programs that start us and let us choose the port.
             write_atomically(settings.state / URL_FILE, url + "\n")
             tell(url)
-            tell_manager("READY=1")
 
         app = create_app(settings)
         config = uvicorn.Config(
@@ -121,19 +121,21 @@ class _Server(uvicorn.Server):
         self.should_exit = True
 
     async def main_loop(self) -> None:
-        """Serve, and keep the watchdog quiet as long as the queue is looked after."""
-        length = watchdog_seconds()
-        task = None if length is None else asyncio.create_task(self._live(length))
+        """Serve; tell the manager that we are ready, then keep its watchdog quiet while the queue is looked after."""
+        task = asyncio.create_task(self._tell_manager())
         try:
             await super().main_loop()
         finally:
-            if task is not None:
-                task.cancel()
-                with suppress(asyncio.CancelledError):
-                    await task
+            task.cancel()
+            with suppress(asyncio.CancelledError):
+                await task
 
-    async def _live(self, seconds: float) -> None:
-        while True:
+    async def _tell_manager(self) -> None:
+        # Without READY=1 the manager would take us for failed; any other line may be lost.
+        while not tell_manager("READY=1"):
+            await asyncio.sleep(_READY_AGAIN)
+        seconds = watchdog_seconds()
+        while seconds is not None:
             if self._service.engine.healthy:
                 tell_manager("WATCHDOG=1")
             else:
