@@ -166,6 +166,8 @@ def identify(
     test = feasibility_test(found.fit.beta, base, conditions)
     corrected = feasibility_correction(found.fit.beta, base, conditions)
     held = {name: constrained_least_squares(found.fit, base, conditions, prior) for name, conditions in sets.items()}
+    if prior is None:
+        held[kind] = held[kind].centred(base, conditions)
 
     everything, total = prepared.equations.everything, prepared.equations.total
     label = method.upper()

@@ -83,7 +83,7 @@ def correct_file(
     file, conditions = _read(path, kind, arm)
     result = feasibility_correction(
         file.values, file.base, conditions, _covariance(path, file) if metric == "covariance" else None
-    )
+    ).centred(file.base, conditions)
     content = deepcopy(file.content)
     for stale in ("fit", "information", "validation"):
         content.pop(stale, None)

@@ -59,7 +59,8 @@ def test_no_weight_is_no_prior_and_a_small_one_is_nearly_none(kind: Kind) -> Non
     np.testing.assert_array_equal(constrained_least_squares(case.fit, case.base, conditions, prior).beta, without.beta)
     light = constrained_least_squares(case.fit, case.base, conditions, replace(prior, weight=1e-9))
     assert light.objective == pytest.approx(without.objective, rel=1e-3)
-    assert light.objective >= without.objective * (1 - 1e-7)
+    # The bound on masses, which scales with the largest number of the problem, is not the same for both.
+    assert light.objective >= without.objective - 1e-4 * np.linalg.norm(case.fit.rho1)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ident_service.errors import SolverError
+from ident_service.estimation.feasible.central import central
 from ident_service.estimation.feasible.conic import ConicProblem, Solution
 from ident_service.estimation.feasible.consistency import ConditionsError, contradiction
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
-from ident_service.estimation.feasible.posing import EPSILON, Lift, constrain, minimise, pressing, project
+from ident_service.estimation.feasible.posing import (
+    EPSILON,
+    OF_ESTIMATES,
+    Lift,
+    constrain,
+    minimise,
+    pressing,
+    project,
+)
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 
-_SHARPNESS = 1e-2  # a gap of 1e-9 in the solver is at most one of 1e-7 in the distance
+_AT_TARGET = 1e-8  # of the target's size: a distance that is none
+_SHARPNESS = 8.0  # per unit of distance over the largest column: a gap of 1e-9 is one of about 1e-10 there
 
 
 @dataclass(frozen=True)
@@ -23,7 +33,7 @@ class FeasibleEstimate:
 
     Attributes:
         beta: base parameters, shape (base,).
-        delta: link parameters with K delta = beta, shape (parameters,).
+        delta: some link parameters with K delta = beta, shape (parameters,); which ones is the solver's rounding.
         objective: a distance in the space of beta, or a residual norm, without what a prior adds.
         margin: smallest eigenvalue of all blocks at delta.
         tight: names of the blocks that keep the objective from being smaller, the most decisive first.
@@ -40,6 +50,11 @@ class FeasibleEstimate:
     iterations: int
     solver_seconds: float
     prior_distance: float = 0.0
+
+    def centred(self, base: BaseParameters, conditions: FeasibleSet) -> FeasibleEstimate:
+        """Return the same base parameters with the most central link parameters, see `central.py`."""
+        delta = central(self.delta, base, conditions)
+        return replace(self, delta=delta, margin=conditions.margin(delta)[0])
 
 
 def hold(problem: ConicProblem, conditions: FeasibleSet, to_delta: Array, inset: float = EPSILON) -> None:
@@ -60,7 +75,7 @@ def solve_inside(
     size: float,
     quadratic: Array | None = None,
 ) -> tuple[Array, Solution]:
-    """Solve a problem whose answer must lie inside the set.
+    """Solve a problem whose answer must lie inside the set, with links of bounded mass.
 
     Args:
         problem: constraints gathered, those of the set included.
@@ -92,6 +107,7 @@ def solve_inside(
             size=size,
             quadratic=quadratic,
             accept=inside,
+            reaches=OF_ESTIMATES,
         )
     except SolverError as error:
         if blocks := contradiction(conditions):
@@ -131,16 +147,19 @@ def nearest(
     problem.second_order(distance, np.concatenate([[0.0], -target / scale]))
     to_delta = np.column_stack([lift.of_beta * columns, lift.of_dependent, np.zeros(len(base.names))])
     hold(problem, conditions, to_delta)
-    objective = np.append(np.zeros(variables - 1), max(1.0, _SHARPNESS * scale))
+    objective = np.append(np.zeros(variables - 1), _SHARPNESS)
     size = float(np.max(np.abs(beta), initial=0.0))
     delta, solution = solve_inside(problem, objective, name, to_delta, conditions, size)
     found = columns * solution.x[:n] if not conditions.equalities else base.K @ delta
+    distance_found = float(np.linalg.norm(metric @ found - target))
+    # At the target itself nothing is in the way; the multipliers there are the solver's rounding.
+    at_target = distance_found <= _AT_TARGET * float(np.linalg.norm(target))
     return FeasibleEstimate(
         beta=found,
         delta=delta,
-        objective=float(np.linalg.norm(metric @ found - target)),
+        objective=distance_found,
         margin=conditions.margin(delta)[0],
-        tight=pressing(conditions, solution.duals[1:]),
+        tight=() if at_target else pressing(conditions, solution.duals[1:]),
         iterations=solution.iterations,
         solver_seconds=solution.seconds,
     )

@@ -1,8 +1,9 @@
 """What all feasibility problems share: delta from (beta, delta_d), blocks into cones, optima that lie too far out.
 
-Where nothing bounds the mass of a link that hardly shows in beta, an optimum may lie far out, or only be approached as
-masses grow beyond all limits. A problem that cannot be solved for that reason is posed again with every link's
-tr(P) = m + tr(Sigma) bounded by a reach that no robot has; the answer then is the best one within that reach.
+Where nothing bounds the mass of a link that hardly shows in beta, an optimum may only be approached as masses grow
+beyond all limits, and where a solver stops on that way depends on rounding, so on the processor. Every estimate is
+therefore sought with each link's tr(P) = m + tr(Sigma) bounded by a reach that no robot has. A feasibility test asks
+whether any body exists; it is bounded only where it cannot be solved otherwise.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ from ident_service.model.chain import Array
 
 EPSILON = 1e-6  # eq. 21, the paper's margin
 MULTIPLIER = 1e-6  # smaller ones are the interior-point method's own distance from the boundary
-_REACHES = (1e4, 1e3, 1e2)  # kg and kg m^2, times the largest base parameter if that is above 1
+# Bounds of tr(P) to try, in turn: kg and kg m^2, times the largest base parameter or bound if that is above 1.
+OF_TESTS = (np.inf, 1e4, 1e3, 1e2)
+OF_ESTIMATES = (1e2, 1e1, 1e3)
 
 
 class Lift:
@@ -57,8 +60,9 @@ def minimise(
     size: float = 1.0,
     quadratic: Array | None = None,
     accept: Callable[[Array], bool] = lambda _: True,
+    reaches: Sequence[float] = OF_TESTS,
 ) -> Solution:
-    """Solve, within a reach where it cannot be solved without one.
+    """Solve within the first reach that allows it.
 
     Args:
         problem: constraints gathered.
@@ -69,30 +73,32 @@ def minimise(
         size: of the largest base parameter, which a reach must not cut off.
         quadratic: diagonal of the Hessian, shape (variables,).
         accept: whether an optimum is accurate enough to be used.
+        reaches: bounds of tr(P) to try, in turn.
 
     Raises:
-        SolverError: no optimum, with or without a reach, or none that is acceptable.
+        SolverError: no optimum within any reach, or none that is acceptable.
     """
     T, d = to_delta
-    status = "outside the set"
-    try:
-        solution = problem.minimise(objective, name, quadratic)
-        if accept(solution.x):
-            return solution
-    except SolverError as error:
-        if error.status.endswith("Infeasible"):
-            raise
-        status = error.status
-    largest, trace = max(1.0, size), _traces(conditions)
-    for reach in _REACHES:
-        bounded = problem.copy()
-        bounded.nonnegative(-trace @ T / reach, largest - trace @ d / reach)
+    trace = _traces(conditions)
+    numbers = (np.abs(block.f).max(initial=0.0) for block in conditions.blocks)
+    largest = max(1.0, size, *map(float, numbers))
+    status = ""
+    for reach in reaches:
+        bounded = problem
+        if np.isfinite(reach):
+            bounded = problem.copy()
+            bounded.nonnegative(-trace @ T / reach, largest - trace @ d / reach)
         try:
             solution = bounded.minimise(objective, name, quadratic)
-        except SolverError:
+        except SolverError as error:
+            # Without a reach, that is about the problem itself.
+            if error.status.endswith("Infeasible") and bounded is problem:
+                raise
+            status = status or error.status
             continue
         if accept(solution.x):
             return solution
+        status = status or "outside the set"
     raise SolverError(name, status)
 
 

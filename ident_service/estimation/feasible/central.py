@@ -1,0 +1,126 @@
+"""Choose link parameters among all that have the same base parameters: those at the centre of the feasible set.
+
+Motion shows base parameters only. Which of the many bodies behind them an interior-point method ends with depends on
+its path, so on rounding and on the processor. The answer here does not: it minimises
+
+    f(delta) = sum_blocks -logdet(D_b(delta) - t 1) + sum_links tr(S_b^-1 D_b(delta))
+    over all delta with K delta = beta and E delta + e = 0
+
+with S_b the reference scales of `blocks.py`, and t nine tenths of the paper's margin (eq. 21), so that where data press
+against the set only the last tenth is given up. The first sum is the barrier whose minimiser is the analytic
+centre (Boyd and Vandenberghe, *Convex Optimization*, 8.5.3); with the second, f is per link the entropic divergence from
+the reference body of 1 kg and 0.1 m (Lee, Wensing and Park 2020), so that nothing is drawn to infinity where nothing
+bounds a mass. f is strictly convex and self-concordant; Newton's method finds its minimiser to the last digits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+from numpy.typing import NDArray
+
+from ident_service.estimation.feasible.blocks import Block, symmetric
+from ident_service.estimation.feasible.feasible_set import FeasibleSet
+from ident_service.estimation.feasible.posing import EPSILON, Lift
+from ident_service.model.base import BaseParameters
+from ident_service.model.chain import Array
+
+_ITERATIONS = 200
+_CONVERGED = 1e-10  # Newton's decrement: the distance from the minimiser in the metric of f
+_QUADRATIC = 1e-2  # decrement from which Newton's method at least halves it with every step, unless rounding forbids
+_STEP = 0.99  # of the way to the boundary, at most
+_LONGEST = 10.0  # Newton's steps at a time
+_KEPT = 0.9  # share of the margin, at most the paper's, that is left where data press against the set
+
+
+@dataclass(frozen=True)
+class _Matrix:
+    """One symmetric matrix of the set over its reference scale, as an affine function of the free directions.
+
+    Attributes:
+        value: shape (size, size).
+        directions: which change it, shape (changing,).
+        slopes: its derivatives along them, shape (changing, size, size).
+        bounded: whether its trace is part of f, as that of a link's inertia is.
+    """
+
+    value: Array
+    directions: NDArray[np.intp]
+    slopes: Array
+    bounded: bool
+
+
+def central(delta: Array, base: BaseParameters, conditions: FeasibleSet) -> Array:
+    """Move link parameters to the centre of those with the same base parameters.
+
+    Args:
+        delta: inside the feasible set (margin above 0), SI units, shape (parameters,).
+        base: grouping of the parameters.
+        conditions: the feasible set.
+
+    Returns:
+        Link parameters with the same base parameters to rounding, inside the set, shape (parameters,).
+    """
+    free = Lift(base).of_dependent
+    E, _ = conditions.equality_rows()
+    if len(E):
+        free = free @ scipy.linalg.null_space(E @ free)
+    inset = _KEPT * min(EPSILON, conditions.margin(delta)[0])
+    matrices = [matrix for block in conditions.blocks for matrix in _matrices(block, delta, free, inset)]
+    y, before = np.zeros(free.shape[1]), np.inf
+    for _ in range(_ITERATIONS if matrices else 0):
+        # With D = L L^T and M_k = L^-1 dD/dy_k L^-T, f has the gradient -J^T r and the Hessian J^T J, where J has the
+        # columns vec(M_k) and r is vec(1 - L^T L): Newton's step is a least-squares problem, without the square of its
+        # condition number.
+        rows, wanted, moves = [], [], []
+        for matrix in matrices:
+            L = np.linalg.cholesky(matrix.value + np.tensordot(y[matrix.directions], matrix.slopes, 1))
+            inverse = np.linalg.inv(L)
+            move = inverse @ matrix.slopes @ inverse.T
+            J = np.zeros((L.size, len(y)))
+            J[:, matrix.directions] = move.reshape(len(move), -1).T
+            rows.append(J)
+            wanted.append((np.eye(len(L)) - (L.T @ L if matrix.bounded else 0.0)).ravel())
+            moves.append(move)
+        J, r = np.vstack(rows), np.concatenate(wanted)
+        unit = 1.0 / np.linalg.norm(J, axis=0)
+        step = unit * scipy.linalg.lstsq(J * unit, r, lapack_driver="gelsy")[0]
+        decrement = float(np.linalg.norm(J @ step))
+        if decrement < _CONVERGED or (decrement < _QUADRATIC and decrement > 0.5 * before):
+            break
+        before = decrement
+        along = [np.tensordot(step[matrix.directions], move, 1) for matrix, move in zip(matrices, moves, strict=True)]
+        y += _length(np.concatenate([np.linalg.eigvalsh(change) for change in along]), decrement) * step
+    found = np.asarray(delta + free @ y)
+    return found if conditions.margin(found)[0] > 0.0 else delta
+
+
+def _length(changes: Array, decrement: float) -> float:
+    """Minimise f along Newton's step, where f(s) = -sum log(1 + s mu) + s (sum mu - decrement^2) and mu are `changes`."""
+
+    def slope(s: float) -> float:
+        return float(np.sum(changes * (1.0 - 1.0 / (1.0 + s * changes)))) - decrement**2
+
+    longest = min(_STEP / max(-float(changes.min()), np.finfo(float).tiny), _LONGEST)
+    return longest if slope(longest) < 0.0 else float(scipy.optimize.brentq(slope, 0.0, longest, xtol=1e-12))
+
+
+def _matrices(block: Block, delta: Array, free: Array, inset: float) -> list[_Matrix]:
+    """The block's matrix, or its numbers as matrices of one row, those that no direction changes left out."""
+    values, slopes = block.F @ delta + block.f - inset * block.identity(), block.F @ free
+    directions = np.flatnonzero(np.any(slopes != 0.0, axis=0))
+    if block.size:
+        root = np.sqrt(block.references())
+        value, *found = (
+            symmetric(entries, block.size) / np.outer(root, root) for entries in (values, *slopes.T[directions])
+        )
+        return [_Matrix(value, directions, np.array(found), bounded=True)] if found else []
+    scaled = [(value / unit, row / unit) for value, row, unit in zip(values, slopes, block.references(), strict=True)]
+    return [
+        _Matrix(np.full((1, 1), value), np.flatnonzero(row), row[row != 0.0][:, None, None], bounded=False)
+        for value, row in scaled
+        if np.any(row != 0.0)
+    ]
