@@ -10,6 +10,7 @@ READY  := $(VENV)/.ready
 	test-latest lock clean
 
 demo: $(READY)
+	@echo "commissioning a simulated arm: about a minute on an idle machine"
 	$(BIN)/ident simulate
 
 # What a machine lacks (README: system packages) is skipped with its reason; with CI=true it fails.
