@@ -1,15 +1,19 @@
-# Everything a newcomer types. The environment is made once and again whenever pyproject.toml changes.
+# Everything a newcomer types. The environment is made once, and again whenever pyproject.toml, the lock or the version
+# of PYTHON changes.
 PYTHON ?= python3
 VENV   ?= .venv
+LOCK   ?= constraints.txt
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: demo test unit coverage lint types bench bench-design bench-canopen bench-serve bench-viewers campaign test-socketcan test-foreign clean
+.PHONY: demo test unit coverage lint types bench bench-design bench-canopen bench-serve bench-viewers campaign test-socketcan test-foreign \
+	test-latest lock clean
 
 demo: $(READY)
+	@echo "commissioning a simulated arm: about a minute on an idle machine"
 	$(BIN)/ident simulate
 
-# The page's tests drive the system's Chromium (Debian: `apt install chromium`; or CHROMIUM=path), and skip without one.
+# What a machine lacks (README: system packages) is skipped with its reason; with CI=true it fails.
 test: lint types coverage
 	$(BIN)/pytest -n 2 -m "not campaign and not realtime"
 	$(BIN)/pytest -m "realtime and not campaign"
@@ -60,12 +64,31 @@ test-foreign: $(READY)
 	cd tests/foreign_stack && npm ci --ignore-scripts --no-audit --no-fund
 	$(BIN)/pytest tests/pucks/test_pucks_foreign_stack.py
 
-# pip 25.1 is the first to read dependency groups.
-$(READY): pyproject.toml
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --upgrade "pip>=25.1"
-	$(BIN)/python -m pip install --quiet --editable . --group dev
-	touch $@
+# The newest of everything that pyproject.toml allows, in an environment of its own, made anew.
+LATEST := .venv-latest
+test-latest:
+	rm -rf $(LATEST)
+	$(MAKE) test VENV=$(LATEST) LOCK=
+
+# One lock for all Python versions and machines, with the newest of everything.
+lock: $(READY)
+	$(PIP) --group lock
+	$(BIN)/uv pip compile --quiet --upgrade --universal --python-version 3.11 --all-extras \
+		--group dev --group build --group lock --annotation-style line --custom-compile-command "make lock" \
+		--output-file constraints.txt pyproject.toml
+
+# pip 25.3 is the first that holds build requirements to a lock.
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+$(READY): pyproject.toml $(LOCK)
+	@echo "making $(VENV) with $$($(PYTHON) -V): one to three minutes"
+	$(PYTHON) -m venv --clear $(VENV)
+	$(PIP) --upgrade $(addprefix --constraint ,$(LOCK)) "pip>=25.3"
+	$(PIP) $(addprefix --constraint ,$(LOCK)) $(addprefix --build-constraint ,$(LOCK)) --editable . --group dev
+	$(PYTHON) -V >$@
+
+ifneq ($(shell $(PYTHON) -V 2>&1),$(shell cat $(READY) 2>/dev/null))
+.PHONY: $(READY)
+endif
 
 clean:
-	rm -rf $(VENV) .coverage .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist
+	rm -rf $(VENV) $(LATEST) .coverage .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist

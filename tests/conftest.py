@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
+from typing import TypeVar
 
 import pytest
 from hypothesis import settings
@@ -14,11 +15,19 @@ from threadpoolctl import threadpool_limits
 from ident_service.config.load import load_arm
 from ident_service.model.arm_model import ArmModel, arm_model
 
+_Report = TypeVar("_Report", pytest.TestReport, pytest.CollectReport)
 _CI = os.environ.get("CI") == "true"
 # Small matrices on several BLAS threads are slow, and very slow on a busy machine; child processes inherit this.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 threadpool_limits(limits=1, user_api="blas")
 _SHARED = Path(__file__).resolve().parents[2] / "shared"
+# The only reasons to skip with CI=true: what no package gives a machine, and what CI runs by a command of its own.
+_ALLOWED = (
+    "this machine grants no real time",
+    "only root can become somebody else",
+    "`make test-socketcan` runs it",
+    "`make test-foreign` runs it",
+)
 
 settings.register_profile("default", deadline=None, derandomize=_CI, print_blob=True)
 settings.load_profile("default")
@@ -40,14 +49,30 @@ def hangups_are_heard() -> Iterator[None]:
     signal.signal(signal.SIGHUP, before)
 
 
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    return _unless_missing((yield))
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    return _unless_missing((yield))
+
+
+def _unless_missing(report: _Report) -> _Report:
+    """Turn a skip into a failure with CI=true, where nothing may be missing."""
+    if _CI and report.skipped and not hasattr(report, "wasxfail"):
+        reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)
+        if not any(allowed in reason for allowed in _ALLOWED):
+            report.outcome, report.longrepr = "failed", f"{reason}\n(with CI=true nothing may be missing)"
+    return report
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """The folder of published data that stands beside the checkout."""
     if not _SHARED.is_dir():
-        reason = f"needs the published data in {_SHARED.name}/ beside the checkout"
-        if _CI:
-            pytest.fail(reason)
-        pytest.skip(reason)
+        pytest.skip(f"needs the published data in {_SHARED.name}/ beside the checkout")
     return _SHARED
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import socket
 import threading
 import time
@@ -15,6 +13,7 @@ from pathlib import Path
 import pytest
 import uvicorn
 from daemon.conftest import LEASES
+from helpers.browser import chromium_program
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from ident_service.service.api.app import create_app
@@ -69,17 +68,10 @@ def reached(state: Path) -> Iterator[Reached]:
         yield found
 
 
-def chromium() -> str | None:
-    """The system's browser, None without one."""
-    return os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
-
-
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
     """Headless Chromium."""
-    path = chromium()
-    if path is None:
-        pytest.skip("no Chromium on this machine: install the system's package chromium, or set CHROMIUM to its path")
+    path = chromium_program()
     with sync_playwright() as playwright:
         found = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
         yield found

@@ -27,9 +27,9 @@ NODE = shutil.which("node")
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(NODE is None, reason="node is not installed"),
     pytest.mark.skipif(
-        not (STACK / "node_modules" / "canopen").is_dir(), reason="no npm package canopen; `make test-foreign` gets it"
+        NODE is None or not (STACK / "node_modules" / "canopen").is_dir(),
+        reason="needs node and its package canopen: `make test-foreign` runs it",
     ),
 ]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 import time
@@ -12,10 +11,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
-
-PROGRAM = next(
-    (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None
-)
 
 # Both ends are copied first: either may itself be 3 or 4.
 _START = """
@@ -100,14 +95,13 @@ class Tab:
 
 
 @contextmanager
-def chromium(home: Path) -> Iterator[Tab]:
+def chromium(program: str, home: Path) -> Iterator[Tab]:
     """A browser with one tab, its files in `home`, ended with the block."""
-    assert PROGRAM is not None
     request_out, request_in = os.pipe()
     answer_out, answer_in = os.pipe()
     flags = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--remote-debugging-pipe"]
     process = subprocess.Popen(
-        [sys.executable, "-c", _START, str(request_out), str(answer_in), PROGRAM, *flags, f"--user-data-dir={home}"],
+        [sys.executable, "-c", _START, str(request_out), str(answer_in), program, *flags, f"--user-data-dir={home}"],
         pass_fds=(request_out, answer_in),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

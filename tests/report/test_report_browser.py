@@ -5,18 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
-from report.chromium import PROGRAM, Tab, chromium
+from helpers.browser import chromium_program
+from report.chromium import Tab, chromium
 from report.conftest import Made
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(PROGRAM is None, reason="needs chromium on the path"),
-]
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
 def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
-    with chromium(tmp_path_factory.mktemp("chromium")) as found:
+    with chromium(chromium_program(), tmp_path_factory.mktemp("chromium")) as found:
         yield found
 
 

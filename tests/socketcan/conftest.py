@@ -15,7 +15,7 @@ _NAMES = (f"vtest{number}" for number in range(10**6))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    missing = pytest.mark.skip(reason=f"needs root in a network with CAN, named by {VARIABLE}: `make test-socketcan`")
+    missing = pytest.mark.skip(reason=f"needs a network with CAN, named by {VARIABLE}: `make test-socketcan` runs it")
     for item in items:
         if Path(__file__).parent in item.path.parents:
             item.add_marker(pytest.mark.socketcan)

@@ -8,9 +8,9 @@ its path, so on rounding and on the processor. The answer here does not: it mini
 
 with S_b the reference scales of `blocks.py`, and t nine tenths of the paper's margin (eq. 21), so that where data press
 against the set only the last tenth is given up. The first sum is the barrier whose minimiser is the analytic
-centre (Boyd and Vandenberghe, *Convex Optimization*, 8.5.3); with the second, f is per link the entropic divergence from
-the reference body of 1 kg and 0.1 m (Lee, Wensing and Park 2020), so that nothing is drawn to infinity where nothing
-bounds a mass. f is strictly convex and self-concordant; Newton's method finds its minimiser to the last digits.
+centre (Boyd and Vandenberghe, *Convex Optimization*, 8.5.3); with the second, f is per link the entropic divergence
+from the reference body of 1 kg and 0.1 m (Lee, Wensing and Park 2020), so that nothing is drawn to infinity where
+nothing bounds a mass. f is strictly convex and self-concordant; Newton's method finds its minimiser to the last digits.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def central(delta: Array, base: BaseParameters, conditions: FeasibleSet) -> Arra
 
 
 def _length(changes: Array, decrement: float) -> float:
-    """Minimise f along Newton's step, where f(s) = -sum log(1 + s mu) + s (sum mu - decrement^2) and mu are `changes`."""
+    """Minimise f along Newton's step, where it is -sum log(1 + s mu) + s (sum mu - decrement^2), mu the `changes`."""
 
     def slope(s: float) -> float:
         return float(np.sum(changes * (1.0 - 1.0 / (1.0 + s * changes)))) - decrement**2

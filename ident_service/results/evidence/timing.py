@@ -84,7 +84,7 @@ def _of_cycles(
         gaps=gaps,
         gap_count=gap_count,
         lost=int(lost[-1]) - int(lost[0]),
-        invalid=tuple(int(count) for count in sum((~part.valid).sum(axis=0) for part in parts)),
+        invalid=tuple(int(count) for count in np.sum([(~part.valid).sum(axis=0) for part in parts], axis=0)),
         oldest=tuple(int(age) for age in np.max([part.age.max(axis=0) for part in parts], axis=0)),
     )
 
