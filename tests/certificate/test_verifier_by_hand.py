@@ -275,8 +275,9 @@ def test_conditions_are_bounded_in_size_and_number() -> None:
     fails(document, "unit: a size between 0 and 20 was expected")
     certificate["blocks"] = [matrix(2) | {"size": 1}]
     fails(document, "unit: 3 entries do not make a block of size 1")
-    certificate["blocks"] = [matrix(1) | {"size": 0.5}]
-    fails(document, "unit: a size between 0 and 20 was expected")
+    for size in (0.5, -1):
+        certificate["blocks"] = [matrix(1) | {"size": size}]
+        fails(document, "unit: a size between 0 and 20 was expected")
     certificate["blocks"] = [number(f"b{k}", {}, "1") for k in range(MAX_BLOCKS)]
     assert verified(document).verdict == "feasible"
     certificate["blocks"].append(number("last", {}, "1"))
@@ -376,3 +377,24 @@ def test_a_matrix_whose_numbers_grow_is_given_up(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(exact, "_MAX_BITS", 3)
     with pytest.raises(ParameterError, match="more digits than a proof may have"):
         is_positive_definite(matrix)
+
+
+@pytest.mark.parametrize("bad", [7, None, ["m1"], True])
+def test_what_must_be_a_text_is_one(bad: object) -> None:
+    document = feasible()
+    document["base_parameters"]["expressions"][0] = bad
+    fails(document, "base_parameters.expressions: a text was expected")
+    document = feasible()
+    document["feasibility"]["certificate"]["blocks"][0]["name"] = bad
+    fails(document, "certificate.blocks.name: a text was expected")
+    document = feasible()
+    document["link_parameters"]["names"][0] = bad
+    fails(document, "link_parameters.names: a text was expected")
+
+
+def test_what_is_told_of_a_file_is_one_line_of_bounded_length() -> None:
+    document = feasible()
+    document["feasibility"]["certificate"] = {"kind": "undecided", "reason": "why\n" + 1000 * "x"}
+    result = verified(document)
+    assert result.verdict == "undecided"
+    assert result.message == "no proof either way: why?" + 475 * "x"

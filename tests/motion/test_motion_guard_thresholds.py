@@ -157,6 +157,10 @@ def test_torques_of_all_joints_are_led_where_they_jump_together(wanted: tuple[fl
     leaves, fault = guarded.torque(np.array(wanted))
     is_fault(fault, "torque_rate")
     np.testing.assert_allclose(leaves, np.sign(wanted) * guarded.rate)
+    assert fault is not None
+    changes = ", ".join(f"{1000.0 * change:g}" for change in wanted if change)
+    allowed = ", ".join("1000" for change in wanted if change)
+    assert f": the torque was to change by {changes} N m/s, {allowed} allowed: " in fault.message
 
 
 def test_a_torque_that_changes_as_fast_as_it_may_is_not_led() -> None:
@@ -190,3 +194,23 @@ def test_the_observer_of_owed_ways_is_told_which_way_each_position_went() -> Non
     for position, valid in ((HOME, (True, True)), (HOME + step, (True, True)), (HOME, (True, False))):
         bench.see(position, valid=valid, answer=STILL)
     assert heard.directions == [[0.0, 0.0], [1.0, -1.0], [-1.0, 0.0]]
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+def test_jumps_in_a_row_are_counted_from_the_first_after_another_axis_was_lost(joint: int) -> None:
+    bench, jump = Bench(), HOME + 0.5 * unit(joint)
+    is_fault(bench.see(HOME, valid=(joint == 0, joint == 1))[1], "lost_feedback", 1 - joint)
+    is_fault(bench.see(jump, HOME)[1], "encoder_jump", joint)
+    is_fault(bench.see(jump, HOME)[1], "encoder_jumps", joint)
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+def test_a_push_is_counted_from_its_own_begin(joint: int) -> None:
+    bench, push = Bench(), 1.01 * checks.FROZEN_EFFORT * LIMITS.torque
+    faults = []
+    for cycle in range(5 + checks.FROZEN_CYCLES):
+        position = HOME + 1e-5 * cycle * unit(1 - joint)
+        correction = push * unit(1 - joint) if cycle < 5 else push
+        faults.append(bench.see(position, correction=correction)[1])
+    assert faults[:-1] == [None] * (4 + checks.FROZEN_CYCLES)
+    is_fault(faults[-1], "frozen_encoder", joint)
