@@ -214,3 +214,9 @@ def test_a_push_is_counted_from_its_own_begin(joint: int) -> None:
         faults.append(bench.see(position, correction=correction)[1])
     assert faults[:-1] == [None] * (4 + checks.FROZEN_CYCLES)
     is_fault(faults[-1], "frozen_encoder", joint)
+
+
+def test_twice_the_following_error_allowed_is_not_lost_yet() -> None:
+    middle = np.zeros(2)
+    fault = Bench(middle).see(middle, checks.FOLLOWING_LOST * LIMITS.following_error * unit(0))[1]
+    is_fault(fault, "following_error", 0)
