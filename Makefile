@@ -4,7 +4,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: demo test unit coverage lint types bench bench-design bench-canopen bench-serve bench-viewers campaign test-socketcan test-foreign clean
+.PHONY: demo test unit coverage lint types bench bench-design bench-canopen bench-serve bench-viewers campaign mutants test-socketcan test-foreign clean
 
 demo: $(READY)
 	$(BIN)/ident simulate
@@ -51,6 +51,10 @@ bench-viewers: $(READY)
 campaign: $(READY)
 	$(BIN)/pytest -m campaign --timeout 7200
 
+# Slips in the code that guards people, one at a time in a copy of the checkout: each must fail one of its quick tests.
+mutants: $(VENV)/.mutants
+	$(BIN)/python tests/mutants/run.py
+
 # Over the kernel's CAN sockets: here where this kernel has them, else in a guest.
 test-socketcan: $(READY)
 	tests/socketcan/guest/run $(BIN)/python
@@ -65,6 +69,10 @@ $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade "pip>=25.1"
 	$(BIN)/python -m pip install --quiet --editable . --group dev
+	touch $@
+
+$(VENV)/.mutants: $(READY)
+	$(BIN)/python -m pip install --quiet --group mutants
 	touch $@
 
 clean:
