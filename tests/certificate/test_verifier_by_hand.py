@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from ident_service.errors import ParameterError
+from ident_service.errors import ParameterError, UsageError
 from ident_service.estimation.proof import certificate_reader, exact
 from ident_service.estimation.proof.certificate_exact import Verification, verify
 from ident_service.estimation.proof.certificate_reader import MAX_BLOCKS, MAX_LINKS, MAX_SIZE
@@ -398,3 +398,10 @@ def test_what_is_told_of_a_file_is_one_line_of_bounded_length() -> None:
     result = verified(document)
     assert result.verdict == "undecided"
     assert result.message == "no proof either way: why?" + 475 * "x"
+
+
+def test_a_file_that_is_not_there_is_named_once(tmp_path: Path) -> None:
+    path = tmp_path / "none.json"
+    with pytest.raises(UsageError) as caught:
+        service.verify_file(path)
+    assert str(caught.value) == f"{path}: No such file or directory"
