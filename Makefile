@@ -6,8 +6,8 @@ LOCK   ?= constraints.txt
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: demo test unit coverage lint types bench bench-design bench-canopen bench-serve bench-viewers campaign test-socketcan test-foreign \
-	test-latest lock clean
+.PHONY: demo test unit coverage lint types bench bench-design bench-canopen bench-serve bench-viewers campaign mutants \
+	test-socketcan test-foreign test-latest lock clean
 
 demo: $(READY)
 	@echo "commissioning a simulated arm: about a minute on an idle machine"
@@ -15,19 +15,21 @@ demo: $(READY)
 
 # What a machine lacks (README: system packages) is skipped with its reason; with CI=true it fails.
 test: lint types coverage
-	$(BIN)/pytest -n 2 -m "not campaign and not realtime"
+	$(TESTS) -m "not campaign and not realtime" $(GUARD_TESTS:%=--ignore=%)
 	$(BIN)/pytest -m "realtime and not campaign"
 
+# Three workers for two cores: tests that talk to processes of their own also wait.
+TESTS := $(BIN)/pytest -n 3 --dist worksteal
+
 unit: $(READY)
-	$(BIN)/pytest -n 2 -m "not campaign and not slow"
+	$(TESTS) -m "not campaign and not slow and not realtime"
 
 # Every branch of what stops an arm, by its own tests: less than all of them fails.
 GUARDED := checks faults guard latch owed states stop told
+GUARD_TESTS := $(addprefix tests/motion/test_motion_, guard.py guard_table.py owed.py states.py stop.py told.py)
 coverage: $(READY)
-	$(BIN)/pytest -m "not campaign and not slow" --cov-branch --cov-report=term-missing --cov-fail-under=100 \
-		$(GUARDED:%=--cov=ident_service.motion.%) tests/motion/test_motion_guard.py \
-		tests/motion/test_motion_guard_table.py tests/motion/test_motion_owed.py tests/motion/test_motion_states.py \
-		tests/motion/test_motion_stop.py tests/motion/test_motion_told.py
+	$(TESTS) -m "not campaign" --cov-branch --cov-report=term-missing --cov-fail-under=100 \
+		$(GUARDED:%=--cov=ident_service.motion.%) $(GUARD_TESTS)
 
 lint: $(READY)
 	$(BIN)/ruff check .
@@ -52,8 +54,13 @@ bench-serve: $(READY)
 bench-viewers: $(READY)
 	$(BIN)/python -m benchmarks.viewers
 
-campaign: $(READY)
+# What takes too long for every change, once a night. The guest with the kernel's CAN emulates a processor for four minutes.
+campaign: test-socketcan
 	$(BIN)/pytest -m campaign --timeout 7200
+
+# Slips in the code that guards people, one at a time in a copy of the checkout: each must fail one of its quick tests.
+mutants: $(VENV)/.mutants
+	$(BIN)/python tests/mutants/run.py
 
 # Over the kernel's CAN sockets: here where this kernel has them, else in a guest.
 test-socketcan: $(READY)
@@ -89,6 +96,10 @@ $(READY): pyproject.toml $(LOCK)
 ifneq ($(shell $(PYTHON) -V 2>&1),$(shell cat $(READY) 2>/dev/null))
 .PHONY: $(READY)
 endif
+
+$(VENV)/.mutants: $(READY)
+	$(BIN)/python -m pip install --quiet --group mutants
+	touch $@
 
 clean:
 	rm -rf $(VENV) $(LATEST) .coverage .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist

@@ -1,0 +1,407 @@
+"""Proofs small enough to be written by hand: each condition of the verifier holds by itself, and so does each bound.
+
+One body of 1 kg whose mass distribution is a ball's, in the plane `lz = Lxz = 0`.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import re
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ident_service.errors import ParameterError, UsageError
+from ident_service.estimation.proof import certificate_reader, exact
+from ident_service.estimation.proof.certificate_exact import Verification, verify
+from ident_service.estimation.proof.certificate_reader import MAX_BLOCKS, MAX_LINKS, MAX_SIZE
+from ident_service.estimation.proof.exact import is_positive_definite, is_positive_semidefinite, rational, symmetric
+from ident_service.service import verify as service
+
+Document = dict[str, Any]
+BODY = {"Lxx1": 0.5, "Lxy1": 0.0, "Lxz1": 0.0, "Lyy1": 0.5, "Lyz1": 0.0, "Lzz1": 0.5}
+BODY |= {"lx1": 0.0, "ly1": 0.0, "lz1": 0.0, "m1": 1.0}
+SET = "link 1: a mass distribution exists"
+
+
+def number(name: str, coefficients: dict[str, str], constant: str = "0") -> Document:
+    """A condition that is one number."""
+    return {"name": name, "size": 0, "entries": [{"coefficients": coefficients, "constant": constant}]}
+
+
+PLANE = number("plane", {"lz1": "1"})
+PLANE["entries"].append({"coefficients": {"Lxz1": "1"}, "constant": "0"})
+LIGHT = number("light", {"m1": "-1"}, "3")
+
+
+def feasible() -> Document:
+    certificate = {"kind": "witness", "set": "pseudo_inertia", "links": [1], "blocks": [LIGHT], "equalities": [PLANE]}
+    certificate["delta"] = {name: repr(value) for name, value in BODY.items()}
+    return copy.deepcopy(
+        {
+            "format": "ident-parameters",
+            "version": 1,
+            "base_parameters": {"expressions": ["m1", "lz1", "Lzz1 - Lxx1"], "values": [1.0, 0.0, 0.0]},
+            "feasibility": {"feasible": True, "certificate": certificate},
+            "link_parameters": {"names": list(BODY), "values": list(BODY.values())},
+        }
+    )
+
+
+def infeasible(
+    expressions: list[str], values: list[float], base: list[str], multipliers: Document, *blocks: Document
+) -> Document:
+    certificate = {"kind": "dual", "set": "pseudo_inertia", "links": [1], "blocks": list(blocks), "equalities": []}
+    certificate |= {"base": base, "multipliers": multipliers}
+    return {
+        "format": "ident-parameters",
+        "version": 1,
+        "base_parameters": {"expressions": expressions, "values": values},
+        "feasibility": {"feasible": False, "certificate": certificate},
+    }
+
+
+def verified(document: Document) -> Verification:
+    return verify(json.dumps(document))
+
+
+def fails(document: Document, message: str) -> None:
+    result = verified(document)
+    assert (result.verdict, result.message) == ("failed", message)
+
+
+def test_a_witness_is_told_with_all_that_it_meets() -> None:
+    result = verified(feasible())
+    assert result.verdict == "feasible", result.message
+    assert result.message == "proven: a body with these base parameters exists in the set pseudo_inertia"
+    assert result.checked == (
+        SET,
+        "light (3 - m1 > 0)",
+        "plane (lz1 = 0, Lxz1 = 0)",
+        "link_parameters: as printed they meet all of these conditions and belong to the base parameters",
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("m1", "1.1", "base parameter 1 is not what its expression gives for the witness"),
+        ("Lzz1", "0.51", "base parameter 3 is not what its expression gives for the witness"),
+        ("Lxz1", "1e-30", "not zero at the witness: plane"),
+        ("Lxz1", "-1e-30", "not zero at the witness: plane"),
+        ("lx1", "0.6", f"not positive at the witness: {SET}"),
+    ],
+)
+def test_a_witness_meets_every_equation_and_condition(name: str, value: str, message: str) -> None:
+    document = feasible()
+    document["feasibility"]["certificate"]["delta"][name] = value
+    fails(document, message)
+
+
+def test_a_witness_meets_what_is_listed_beside_the_set() -> None:
+    document = feasible()
+    document["feasibility"]["certificate"]["blocks"][0]["entries"][0]["constant"] = "1"
+    fails(document, "not positive at the witness: light")
+
+
+@pytest.mark.parametrize("name", ["lx1", "m1"])
+def test_a_witness_has_neither_more_nor_fewer_values(name: str) -> None:
+    document = feasible()
+    value = document["feasibility"]["certificate"]["delta"].pop(name)
+    fails(document, f"certificate.delta: no value for {name}")
+    document["feasibility"]["certificate"]["delta"] |= {name: value, "zzz1": "1"}
+    fails(document, "certificate.delta: 'zzz1' is in no expression and in no condition")
+
+
+@pytest.mark.parametrize(
+    ("name", "within", "beyond", "message"),
+    [
+        # A millionth of the sizes of all terms together: of 1 kg that was printed and 1 kg that it should be.
+        ("m1", 1.0 + 1.9e-6, 1.0 + 2.1e-6, "base parameter 1 is another one"),
+        ("m1", 1.0 - 1.9e-6, 1.0 - 2.1e-6, "base parameter 1 is another one"),
+        ("Lxz1", 0.9e-6, 1.1e-6, "not zero as printed: plane"),
+        ("Lxz1", -0.9e-6, -1.1e-6, "not zero as printed: plane"),
+        ("Lzz1", 0.5 + 0.9e-6, 0.5 + 1.1e-6, "base parameter 3 is another one"),
+        ("lx1", 0.4999, 0.5001, f"not positive as printed: {SET}"),
+    ],
+)
+def test_printed_link_parameters_belong_to_the_proof_but_for_rounding(
+    name: str, within: float, beyond: float, message: str
+) -> None:
+    document = feasible()
+    table = document["link_parameters"]
+    table["values"][table["names"].index(name)] = within
+    assert verified(document).verdict == "feasible"
+    table["values"][table["names"].index(name)] = beyond
+    fails(document, f"link_parameters: {message}")
+
+
+def test_a_table_of_link_parameters_is_whole() -> None:
+    document = feasible()
+    document["link_parameters"]["names"][0] = "Lxy1"
+    fails(document, "link_parameters: names and values do not match")
+    document["link_parameters"]["names"][0] = "other1"
+    fails(document, "link_parameters: no value for Lxx1")
+    document["link_parameters"]["values"].append(1.0)
+    fails(document, "link_parameters: names and values do not match")
+
+
+def test_a_negative_mass_is_disproven_by_the_mass_alone() -> None:
+    document = infeasible(["m1"], [-1.0], ["1"], {SET: ["0"] * 9 + ["1"]})
+    result = verified(document)
+    assert result.verdict == "infeasible", result.message
+    message = f"proven: no body in the set pseudo_inertia has these base parameters; most of all {SET}"
+    assert (result.message, result.checked) == (message, (f"100 %: {SET}",))
+    document["base_parameters"]["values"] = [0.0]
+    assert "has these base parameters, unless one on the set's boundary; most" in verified(document).message
+    document["base_parameters"]["values"] = [1e-30]
+    fails(document, "the dual matrices prove nothing: their value is positive")
+
+
+def test_a_centre_of_mass_too_far_out_is_disproven_by_what_stands_beside_the_diagonal() -> None:
+    # Z = v v^T with v = (2, 0, 0, -1): 4 (Lyy + Lzz - Lxx)/2 - 4 lx + m, each beside the diagonal counted twice.
+    rows = ["4", "0", "0", "0", "0", "0", "-2", "0", "0", "1"]
+    document = infeasible(["Lyy1 + Lzz1 - Lxx1", "lx1", "m1"], [1.0, 2.0, 1.0], ["2", "-4", "1"], {SET: rows})
+    assert verified(document).verdict == "infeasible"
+    assert "boundary" not in verified(document).message
+    document["feasibility"]["certificate"]["base"] = ["2", "-2", "1"]
+    fails(document, "the dual matrices do not cancel lx1")
+    document["feasibility"]["certificate"]["multipliers"][SET] = ["4", "0", "0", "0", "0", "0", "-2", "0", "0", "0.9"]
+    fails(document, f"the multiplier is not positive semidefinite: {SET}")
+
+
+def test_shares_are_those_of_the_weights() -> None:
+    lighter, assumed = number("lighter", {"m1": "-1"}, "4"), number("assumed: mass", {"m1": "-1"}, "3")
+    document = infeasible(["m1"], [5.0], ["-4"], {"lighter": ["1"], "assumed: mass": ["3"]}, lighter, assumed)
+    result = verified(document)
+    assert result.checked == ("75 %: assumed: mass (3 - m1 > 0)", "25 %: lighter (4 - m1 > 0)")
+    assert result.message == (
+        "proven: no body in the set pseudo_inertia that also meets 2 listed conditions (1 of them assumed) "
+        "has these base parameters; most of all assumed: mass"
+    )
+    document["base_parameters"]["values"] = [3.25]
+    assert "unless one on the set's boundary" in verified(document).message
+    document["base_parameters"]["values"] = [3.2]
+    fails(document, "the dual matrices prove nothing: their value is positive")
+    document["feasibility"]["certificate"]["multipliers"] = {"lighter": ["-1"], "assumed: mass": ["5"]}
+    fails(document, "the multiplier is not positive semidefinite: lighter")
+
+
+def test_equalities_alone_can_contradict_and_may_have_any_sign() -> None:
+    for value, factor in ((0.1, "-1"), (-0.1, "1")):
+        document = infeasible(["m1", "lz1"], [1.0, value], ["0", factor], {"plane": [factor, "0"]})
+        document["feasibility"]["certificate"]["equalities"] = [PLANE]
+        result = verified(document)
+        assert result.verdict == "infeasible", result.message
+        assert result.checked == ("plane (lz1 = 0, Lxz1 = 0)",)
+        assert result.message == (
+            "proven: no body in the set pseudo_inertia that also meets 1 listed conditions has these base parameters"
+        )
+        document["base_parameters"]["values"] = [1.0, 0.0]
+        fails(document, "the dual matrices prove nothing: all are zero")
+
+
+def test_multipliers_fit_what_they_multiply() -> None:
+    document = infeasible(["m1"], [-1.0], ["1"], {SET: ["0"] * 9 + ["1"]})
+    certificate = document["feasibility"]["certificate"]
+    certificate["multipliers"][SET].append("0")
+    fails(document, f"{SET}: 11 multipliers for 10 entries")
+    certificate["multipliers"] = {"else": ["1"]}
+    fails(document, "certificate.multipliers: no condition is called 'else'")
+    certificate["base"] = ["1", "0"]
+    fails(document, "certificate.base: 2 multipliers for 1 base parameters")
+
+
+@pytest.mark.parametrize(("margin", "verdict"), [("1e-9", "feasible"), ("0", "failed"), ("-1e-9", "failed")])
+def test_a_margin_has_the_sign_of_the_proof(margin: str, verdict: str) -> None:
+    document = feasible()
+    document["feasibility"]["margin"] = margin
+    assert verified(document).verdict == verdict
+
+
+@pytest.mark.parametrize(("margin", "verdict"), [("1e-9", "failed"), ("0", "infeasible"), ("-1e-9", "infeasible")])
+def test_a_margin_has_the_sign_of_the_disproof(margin: str, verdict: str) -> None:
+    document = infeasible(["m1"], [-1.0], ["1"], {SET: ["0"] * 9 + ["1"]})
+    document["feasibility"]["margin"] = margin
+    assert verified(document).verdict == verdict
+
+
+@pytest.mark.parametrize("key", ["format", "version"])
+def test_only_our_format_is_read(key: str) -> None:
+    document = feasible()
+    document[key] = "2"
+    fails(document, "not a parameter file: format is not ident-parameters, version 1")
+
+
+def test_a_claim_is_true_or_false() -> None:
+    document = feasible()
+    for claim in ("yes", 1, None):
+        document["feasibility"]["feasible"] = claim
+        fails(
+            document,
+            f"the file says feasible: {str(claim).lower()}, but its certificate is a witness, a proof of feasibility",
+        )
+
+
+@pytest.mark.parametrize("link", [1, 7, MAX_LINKS])
+def test_links_have_numbers_up_to_the_most(link: int) -> None:
+    content = re.sub(r"\b([A-Za-z]+|link )1\b", rf"\g<1>{link}", json.dumps(feasible()))
+    result = verify(content.replace('"links": [1]', f'"links": [{link}]'))
+    assert (result.verdict, result.checked[0]) == ("feasible", f"link {link}: a mass distribution exists")
+
+
+@pytest.mark.parametrize("link", [0, -1, MAX_LINKS + 1, 1.5])
+def test_other_numbers_of_links_are_refused(link: float) -> None:
+    document = feasible()
+    document["feasibility"]["certificate"]["links"] = [1, link]
+    fails(document, "certificate.links: numbers from 1 to 200 were expected")
+
+
+def matrix(size: int) -> Document:
+    """The unit matrix as a condition."""
+    entries = [{"coefficients": {}, "constant": str(int(i == j))} for j in range(size) for i in range(j + 1)]
+    return {"name": "unit", "size": size, "entries": entries}
+
+
+def test_conditions_are_bounded_in_size_and_number() -> None:
+    document = feasible()
+    certificate = document["feasibility"]["certificate"]
+    certificate["blocks"] = [matrix(MAX_SIZE)]
+    assert verified(document).verdict == "feasible"
+    certificate["blocks"] = [matrix(MAX_SIZE + 1)]
+    fails(document, "unit: a size between 0 and 20 was expected")
+    certificate["blocks"] = [matrix(2) | {"size": 1}]
+    fails(document, "unit: 3 entries do not make a block of size 1")
+    for size in (0.5, -1):
+        certificate["blocks"] = [matrix(1) | {"size": size}]
+        fails(document, "unit: a size between 0 and 20 was expected")
+    certificate["blocks"] = [number(f"b{k}", {}, "1") for k in range(MAX_BLOCKS)]
+    assert verified(document).verdict == "feasible"
+    certificate["blocks"].append(number("last", {}, "1"))
+    fails(document, "certificate.blocks: more than 5000")
+
+
+def test_names_of_conditions_are_printable_short_and_told_apart() -> None:
+    document = feasible()
+    certificate = document["feasibility"]["certificate"]
+    certificate["blocks"] = [number("n" * 200, {}, "1")]
+    assert verified(document).verdict == "feasible"
+    for bad in ("n" * 201, "a\nb"):
+        certificate["blocks"] = [number(bad, {}, "1")]
+        fails(document, "certificate.blocks: a name that cannot be printed")
+    for same in (SET, "plane"):
+        certificate["blocks"] = [number(same, {}, "1")]
+        fails(document, "the certificate has two conditions of one name")
+    certificate["blocks"], certificate["equalities"] = [], [matrix(1)]
+    fails(document, "certificate.equalities: one that is a matrix")
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("m2", "the certificate says nothing about link 2"),
+        ("m", "'m' is not a link parameter's name"),
+        ("m10000", "the certificate says nothing about link"),
+        ("_" * 41 + "1", "is not a link parameter's name"),
+    ],
+)
+def test_parameters_belong_to_a_link(name: str, message: str) -> None:
+    document = feasible()
+    document["base_parameters"]["expressions"][0] = f"m1 + {name}"
+    result = verified(document)
+    assert result.verdict == "failed"
+    assert message in result.message
+
+
+def test_every_expression_has_its_value() -> None:
+    document = feasible()
+    document["base_parameters"]["values"].append(1.0)
+    fails(document, "base_parameters: 3 expressions but 4 values")
+    document["base_parameters"] = {"expressions": [], "values": []}
+    fails(document, "base_parameters: 0 expressions but 0 values")
+
+
+@pytest.mark.parametrize(("claimed", "fits"), [("pseudo_inertia", True), ("none", True), ("inertia", False)])
+def test_the_file_and_its_certificate_are_about_one_set(claimed: str, fits: bool) -> None:
+    document = feasible()
+    document["feasible_set"] = claimed
+    assert verified(document).verdict == ("feasible" if fits else "failed")
+
+
+def test_the_bounds_of_what_is_read_are_the_ones_decided_on() -> None:
+    # Every other test takes them from the code.
+    assert (certificate_reader.MAX_CHARACTERS, MAX_LINKS, MAX_BLOCKS, MAX_SIZE) == (67_108_864, 200, 5000, 20)
+    assert (exact.MAX_CHARACTERS, exact._MAX_BITS) == (2000, 100_000)
+
+
+def test_a_file_is_read_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    content, path = json.dumps(feasible()), tmp_path / "parameters.json"
+    for module in (certificate_reader, service):
+        monkeypatch.setattr(module, "MAX_CHARACTERS", len(content))
+    path.write_text(content, encoding="utf-8")
+    assert service.verify_file(path).verdict == "feasible"
+    # Without the character that is too many it would be a good file.
+    path.write_text(content + " ", encoding="utf-8")
+    assert service.verify_file(path) == Verification("failed", f"more than {len(content)} characters")
+
+
+def test_numbers_are_bounded_in_length() -> None:
+    assert rational("0" * 1999 + "7") == 7
+    with pytest.raises(ParameterError, match="a number of 2001 characters; at most 2000 are read"):
+        rational("0" * 2000 + "7")
+
+
+@pytest.mark.parametrize(
+    ("corner", "definite", "semidefinite"),
+    [(11, True, True), (Fraction(10_000_001, 1_000_000), True, True), (10, False, True), (9, False, False)],
+)
+def test_definiteness_is_decided_by_the_last_pivot_after_all_eliminations(
+    corner: Fraction, definite: bool, semidefinite: bool
+) -> None:
+    matrix = symmetric([Fraction(n) for n in (1, 2, 5, 3, 7, corner)], 3)
+    assert matrix == [[1, 2, 3], [2, 5, 7], [3, 7, corner]]
+    assert (is_positive_definite(matrix), is_positive_semidefinite(matrix)) == (definite, semidefinite)
+    # The same in the other order, where the decision falls in the middle.
+    turned = [row[::-1] for row in matrix[::-1]]
+    assert (is_positive_definite(turned), is_positive_semidefinite(turned)) == (definite, semidefinite)
+
+
+def test_a_matrix_whose_numbers_grow_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    third = Fraction(1, 3)
+    matrix = symmetric([Fraction(1), third, Fraction(1)], 2)
+    monkeypatch.setattr(exact, "_MAX_BITS", 4)  # 1 - 1/9 has a denominator of four bits
+    assert is_positive_definite(matrix)
+    monkeypatch.setattr(exact, "_MAX_BITS", 3)
+    with pytest.raises(ParameterError, match="more digits than a proof may have"):
+        is_positive_definite(matrix)
+
+
+@pytest.mark.parametrize("bad", [7, None, ["m1"], True])
+def test_what_must_be_a_text_is_one(bad: object) -> None:
+    document = feasible()
+    document["base_parameters"]["expressions"][0] = bad
+    fails(document, "base_parameters.expressions: a text was expected")
+    document = feasible()
+    document["feasibility"]["certificate"]["blocks"][0]["name"] = bad
+    fails(document, "certificate.blocks.name: a text was expected")
+    document = feasible()
+    document["link_parameters"]["names"][0] = bad
+    fails(document, "link_parameters.names: a text was expected")
+
+
+def test_what_is_told_of_a_file_is_one_line_of_bounded_length() -> None:
+    document = feasible()
+    document["feasibility"]["certificate"] = {"kind": "undecided", "reason": "why\n" + 1000 * "x"}
+    result = verified(document)
+    assert result.verdict == "undecided"
+    assert result.message == "no proof either way: why?" + 475 * "x"
+
+
+def test_a_file_that_is_not_there_is_named_once(tmp_path: Path) -> None:
+    path = tmp_path / "none.json"
+    with pytest.raises(UsageError) as caught:
+        service.verify_file(path)
+    assert str(caught.value) == f"{path}: No such file or directory"
