@@ -323,6 +323,7 @@ def test_shapes_and_names_are_checked_at_the_door() -> None:
         feasibility_correction(np.ones(1), base, other)
 
 
+@pytest.mark.slow
 @settings(max_examples=12)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 4))
 def test_known_parameters_come_back_from_noiseless_recordings(seed: int, joints: int) -> None:

@@ -147,6 +147,7 @@ def test_cancelling_ends_the_work_of_other_processes_too() -> None:
     assert 0 < found.finished <= first + 4
 
 
+@pytest.mark.slow
 def test_a_budget_of_time_is_kept(ticking: None) -> None:
     found = starts(None, seconds=1.0)
     assert 0.6 < found.seconds < 1.05

@@ -41,9 +41,7 @@ def regressors(blocks: int, samples: int, speed: float) -> tuple[np.ndarray, ...
     """Of random states block by block, the same ones for every arm: what is drawn anew is the noise."""
     rng = np.random.default_rng(14)
     states = (rng.uniform(-2.0, 2.0, size=(3, samples, JOINTS)) for _ in range(blocks))
-    return tuple(
-        joint_regressor(ARM.chain, ARM.layout, q, speed * dq, speed * ddq, BASE.base) for q, dq, ddq in states
-    )
+    return tuple(joint_regressor(ARM.chain, ARM.layout, q, speed * dq, speed * ddq, BASE.base) for q, dq, ddq in states)
 
 
 def blocks_of(
