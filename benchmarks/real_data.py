@@ -17,6 +17,7 @@ from ident_service.config.schema import Method, PriorPull
 from ident_service.errors import ParameterError
 from ident_service.estimation.identify import Candidate, Estimate, identify
 from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.record.kept import KeptRecording
 from ident_service.record.open import open_recording
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -66,13 +67,15 @@ def case_estimate(case: Case, method: Method, prior: str = "none", model: ArmMod
     model = replace(model, config=model.config.model_copy(update={"identification": options}))
     config = model.config
 
-    def opened(name: str) -> object:
-        return open_recording(
-            DATA / case.folder / name, model.chain.names, fmt=config.recording, transmission=config.transmission
+    def opened(name: str) -> KeptRecording:
+        path = DATA / case.folder / name
+        # A search for the friction's shape reads it more than a hundred times.
+        return KeptRecording(
+            open_recording(path, model.chain.names, fmt=config.recording, transmission=config.transmission)
         )
 
     validation = [] if case.judged is None else [opened(case.judged)]
-    return identify(model, [opened(case.fitted)], validation, method=method)  # type: ignore[list-item]
+    return identify(model, [opened(case.fitted)], validation, method=method)
 
 
 def violations(estimate: Estimate) -> int:

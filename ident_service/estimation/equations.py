@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import reduce
+from functools import cached_property, reduce
 
 import numpy as np
 import scipy.signal
@@ -69,12 +69,12 @@ class Equations:
     samples: int
     left_out: Information | None = None
 
-    @property
+    @cached_property
     def total(self) -> Information:
         """All blocks together: what an estimate is fitted to."""
         return reduce(Information.merged, self.blocks)
 
-    @property
+    @cached_property
     def everything(self) -> Information:
         """All rows, also those that no estimate is fitted to: what an estimate is judged on."""
         return self.total if self.left_out is None else self.total.merged(self.left_out)

@@ -6,20 +6,28 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from helpers.changed_arms import changed, identified_folder
+from helpers.changed_arms import COARSE, changed, identified_folder
 
 from ident_service.cli import main
 
 Ident = Callable[..., tuple[int, str, str]]
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark tests that need the arms commissioned here as slow: whichever comes first waits for them."""
+    for item in items:
+        if "commissioned" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.slow)
+
+
 @pytest.fixture(scope="session")
 def commissioned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folders `accepted` and `again` of the same small arm, and `dry` with 30 % more friction in its elbow."""
     folder = tmp_path_factory.mktemp("commissioned")
-    identified_folder(changed("planar2", seed=1), folder / "accepted")
-    identified_folder(changed("planar2", seed=2), folder / "again")
-    identified_folder(changed("planar2", seed=3, factors={"fv2": 1.3, "fc2": 1.3}), folder / "dry")
+    identified_folder(changed("planar2", rate=COARSE, seed=1), folder / "accepted")
+    identified_folder(changed("planar2", rate=COARSE, seed=2), folder / "again")
+    identified_folder(changed("planar2", rate=COARSE, seed=3, factors={"fv2": 1.3, "fc2": 1.3}), folder / "dry")
     return folder
 
 

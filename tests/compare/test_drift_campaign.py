@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from helpers.changed_arms import changed, recorded_arm
+from helpers.changed_arms import COARSE, changed, recorded_arm
 
 from ident_service.config.schema import ArmConfig
 from ident_service.estimation.identify import identify
@@ -44,12 +44,13 @@ def drier_elbow(pair: Pair) -> bool:
 
 
 @pytest.mark.slow
-def test_a_few_unchanged_and_drier_arms(tmp_path: Path) -> None:
-    for kind, factors in (("same", {}), ("drier", DRIER)):
-        (tmp_path / kind).mkdir()
-        found = pairs(tmp_path / kind, 3, 100, factors)
-        assert [pair.verdict for pair in found] == ["changed" if factors else "unchanged"] * 3
-        assert all(drier_elbow(pair) for pair in found) == bool(factors)
+def test_an_unchanged_and_a_drier_arm_after_another_motion(commissioned: Path, tmp_path: Path) -> None:
+    accepted = read_side(commissioned / "accepted")
+    same = side(tmp_path, "same", changed("planar2", rate=COARSE, seed=101, motion=1000))
+    drier = side(tmp_path, "drier", changed("planar2", rate=COARSE, seed=102, motion=1001, factors=DRIER))
+    unchanged, changed_one = compare([accepted, same, drier]).pairs
+    assert (unchanged.verdict, changed_one.verdict) == ("unchanged", "changed")
+    assert drier_elbow(changed_one)
 
 
 @pytest.mark.campaign

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from ident_service.model.arm_model import arm_model
 from ident_service.model.rigid_body import read_urdf
 from ident_service.record.csv_file import CsvRecording
 from ident_service.record.grid import grid
+from ident_service.record.kept import KeptRecording
 from ident_service.record.open import open_recording
 from ident_service.record.quality import Quality, quality
 from ident_service.record.recording import Recording
@@ -30,11 +32,13 @@ RECORDINGS = [
 URDF = {"kuka_lwr4": "kuka_lwr4/kuka_lwr4.urdf", "ur10": "ur10_unisa/ur10.urdf", "tx40": "tx40/tx40.urdf"}
 
 
+@lru_cache
 def opened(shared: Path, arm: str, name: str) -> Recording:
+    """A published recording, its samples kept once they have been read."""
     config = load_arm(arm)
     names = arm_model(config).chain.names
     path = shared / "data" / name
-    return open_recording(path, names, fmt=config.recording, transmission=config.transmission)
+    return KeptRecording(open_recording(path, names, fmt=config.recording, transmission=config.transmission))
 
 
 def judged(shared: Path, arm: str, name: str) -> Quality:

@@ -6,6 +6,7 @@ from functools import reduce
 
 import numpy as np
 import pytest
+import scipy.signal
 from estimation.synthetic import one_joint_information, random_information, serial_chain
 from helpers.random_arms import model_around, random_delta
 
@@ -44,10 +45,7 @@ def test_it_is_calibrated_where_neighbours_are_alike() -> None:
     errors, claimed, white = (np.zeros((repetitions, parameters)) for _ in range(3))
     for repetition in range(repetitions):
         # First-order autoregression with a memory of ten samples, a quarter of a block.
-        shocks = rng.normal(size=samples)
-        noise = np.zeros(samples)
-        for k in range(1, samples):
-            noise[k] = 0.9 * noise[k - 1] + shocks[k]
+        noise = scipy.signal.lfilter([1.0], [1.0, -0.9], rng.normal(size=samples))
         pairs = zip(np.split(W, blocks), np.split(noise, blocks), strict=True)
         parts = [one_joint_information(*pair) for pair in pairs]
         gathered = Equations(tuple(parts), samples)

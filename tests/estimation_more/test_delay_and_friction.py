@@ -177,6 +177,7 @@ def test_presliding_and_stribeck_velocity_are_found() -> None:
     assert np.all(worse > 1.2 * left(fitted))
 
 
+@pytest.mark.slow
 def test_a_given_number_is_kept() -> None:
     given = FrictionShape(presliding="fit", stribeck_velocity=tuple(STRIBECK))
     model, base, delta = rubbing(given)
@@ -186,6 +187,7 @@ def test_a_given_number_is_kept() -> None:
     np.testing.assert_allclose(np.log(np.array(shape.presliding) / PRESLIDING), 0.0, atol=np.log(1.3))
 
 
+@pytest.mark.slow
 def test_a_drive_without_presliding_is_given_little_or_none() -> None:
     model, base, delta = rubbing(FrictionShape(presliding="fit"), TERMS[:4])
     fitted = fit_friction([rubbed(model, delta, np.array([0.0, 0.03]))], model, base)
@@ -206,6 +208,7 @@ def test_nothing_to_fit_leaves_the_numbers(terms: tuple[str, ...]) -> None:
     assert fitted.config.identification.friction.presliding == (0.01, 0.01)
 
 
+@pytest.mark.slow
 def test_the_rate_and_other_options_come_back_untouched() -> None:
     model, base, delta = rubbing(FrictionShape(presliding="fit"), TERMS[:4])
     before = model.config.identification

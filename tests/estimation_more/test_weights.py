@@ -193,6 +193,7 @@ def estimates() -> dict[str, np.ndarray]:
     return found
 
 
+@pytest.mark.slow
 def test_every_method_finds_the_parameters(estimates: dict[str, np.ndarray]) -> None:
     _, base, delta = three_links()
     _, _, information = rows(5, (0.0, 0.0, 0.0))

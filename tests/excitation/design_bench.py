@@ -31,7 +31,6 @@ from ident_service.model.layout import Layout
 Array = np.ndarray
 QUICK = {"base_frequency": 0.2, "harmonics": 2, "periods": 1, "ramp": 1.0}
 ONE_START = Budget(seconds=None, starts=1, workers=1)
-TWO_STARTS = Budget(seconds=None, starts=2, workers=1)
 TERMS = ("drive_inertia", "viscous", "coulomb", "offset", "stribeck", "quadratic", "viscous_asymmetry")
 
 

@@ -136,10 +136,7 @@ def random_path(seed: int, model: ArmModel) -> Path:
     return FourierPath(FourierSeries(frequency, a * scale, b * scale, postures[0]), 1, ramp)
 
 
-@pytest.mark.slow
-@settings(max_examples=40)
-@given(seed=st.integers(0, 2**32 - 1), share=st.sampled_from([None, 0.5, 0.99]))
-def test_nothing_closer_is_found_between_the_samples(seed: int, share: float | None) -> None:
+def assert_nothing_closer(seed: int, share: float | None) -> None:
     model, collision = free_arm(seed)
     path = random_path(seed, model)
     time = np.arange(0.0, path.duration, 2e-5)
@@ -153,6 +150,20 @@ def test_nothing_closer_is_found_between_the_samples(seed: int, share: float | N
     assert clear.sampled >= closest - 1e-5 * float((np.array(collision.reach) @ speed).max()) - 1e-6
     if share is not None and closest > 0.0:
         assert clear.proven == (clear.lower_bound >= clear.required)
+
+
+@pytest.mark.slow
+@settings(max_examples=6)
+@given(seed=st.integers(0, 2**32 - 1), share=st.sampled_from([None, 0.5, 0.99]))
+def test_nothing_closer_is_found_between_the_samples(seed: int, share: float | None) -> None:
+    assert_nothing_closer(seed, share)
+
+
+@pytest.mark.campaign
+@settings(max_examples=200)
+@given(seed=st.integers(0, 2**32 - 1), share=st.sampled_from([None, 0.5, 0.99]))
+def test_nothing_closer_is_found_between_the_samples_of_many_motions(seed: int, share: float | None) -> None:
+    assert_nothing_closer(seed, share)
 
 
 class Crossing:
@@ -202,10 +213,7 @@ def test_a_crossing_where_two_cells_meet_is_not_missed(edge: int) -> None:
     assert -1e-2 < clear.lower_bound <= 0.0
 
 
-@pytest.mark.slow
-@settings(max_examples=30)
-@given(seed=st.integers(0, 2**32 - 1))
-def test_a_bound_of_the_speed_is_enough(seed: int) -> None:
+def assert_a_bound_is_enough(seed: int) -> None:
     model, collision = free_arm(seed)
     one, other = random_postures(np.random.default_rng(seed), model, 2)
 
@@ -218,3 +226,17 @@ def test_a_bound_of_the_speed_is_enough(seed: int) -> None:
     assert clear.lower_bound <= closest
     assert clear.sampled >= closest - 1e-5
     assert clear.proven
+
+
+@pytest.mark.slow
+@settings(max_examples=6)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_bound_of_the_speed_is_enough(seed: int) -> None:
+    assert_a_bound_is_enough(seed)
+
+
+@pytest.mark.campaign
+@settings(max_examples=150)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_bound_of_the_speed_is_enough_for_many_motions(seed: int) -> None:
+    assert_a_bound_is_enough(seed)

@@ -10,7 +10,7 @@ from design_bench import quick, small
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident_service.excitation.climb import Interrupted, Stopped, climbed, keeps, kept, random_variables
+from ident_service.excitation.climb import Candidate, Interrupted, Stopped, climbed, keeps, kept, random_variables
 from ident_service.excitation.design import family, settled
 from ident_service.excitation.postures import safe_posture
 from ident_service.excitation.problem import Problem
@@ -93,9 +93,14 @@ def test_an_interrupted_climb_hands_over_what_it_has(calls: int) -> None:
     assert keeps(PROBLEM, caught.value.candidate.coefficients)
 
 
+@pytest.fixture(scope="module")
+def good() -> Candidate:
+    """What one start has climbed to."""
+    return climbed(PROBLEM, random_variables(PROBLEM, np.random.default_rng(2), SAFE), SAFE, 3, lambda: None)
+
+
 @pytest.mark.parametrize("calls", [0, 1, 30, 65, 80, 120])
-def test_a_polish_makes_nothing_worse_however_early_it_ends(calls: int) -> None:
-    good = climbed(PROBLEM, random_variables(PROBLEM, np.random.default_rng(2), SAFE), SAFE, 3, lambda: None)
+def test_a_polish_makes_nothing_worse_however_early_it_ends(good: Candidate, calls: int) -> None:
     try:
         polished = climbed(PROBLEM, PROBLEM.variables(good.coefficients), SAFE, 3, after(calls), polish=True)
     except Stopped as stopped:

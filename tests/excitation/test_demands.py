@@ -72,6 +72,7 @@ def assert_bounds(series: FourierSeries, points: int) -> None:
         assert (getattr(asked, name) <= peak * (1.0 + 2e-4)).all(), name
 
 
+@pytest.mark.slow
 @settings(max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 3), harmonics=st.integers(1, 3))
 def test_peaks_bound_a_thousand_times_finer_sampling(seed: int, joints: int, harmonics: int) -> None:
@@ -175,6 +176,7 @@ def test_seeded_motions_are_the_same_for_the_same_seed() -> None:
     assert not np.allclose(first.a, other.a)
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(
     seed=st.integers(0, 2**31),

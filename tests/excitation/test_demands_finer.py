@@ -105,6 +105,7 @@ def test_a_thousand_times_finer_nothing_exceeds_the_bounds(seed: int, joints: in
     assert_bounds(demands(path, model), sampled(path, model, 1000))
 
 
+@pytest.mark.slow
 @settings(max_examples=4)
 @given(seed=SEEDS)
 def test_nor_in_the_ramps(seed: int) -> None:
@@ -121,6 +122,7 @@ def test_nor_on_ways_between_postures(seed: int) -> None:
     assert_bounds(demands(path, model), sampled(path, model, 1000))
 
 
+@pytest.mark.slow
 @settings(max_examples=8)
 @given(seed=SEEDS, share=st.floats(0.3, 1.5))
 def test_a_motion_without_violations_keeps_random_limits_a_thousand_times_finer(seed: int, share: float) -> None:
@@ -147,6 +149,7 @@ def test_a_motion_without_violations_keeps_random_limits_a_thousand_times_finer(
         assert any(text.startswith("supply: ") for text in violations)
 
 
+@pytest.mark.slow
 @settings(max_examples=15)
 @given(seed=SEEDS, joints=st.integers(1, 3))
 def test_torque_and_power_lie_inside_their_enclosures_stretch_by_stretch(seed: int, joints: int) -> None:

@@ -79,6 +79,7 @@ def mutilated(content: Any, place: tuple[Any, ...], value: Any) -> Any:
     return content
 
 
+@pytest.mark.slow
 @settings(max_examples=400)
 @given(seed=st.integers(0, 2), data=st.data())
 def test_a_mutilated_file_is_read_or_refused_with_a_reason(seed: int, data: st.DataObject) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from design_bench import ONE_START, moves, quick, small, unproven
 
 from ident_service.config.limits import motion_limits
@@ -35,6 +36,7 @@ def test_static_parameters_are_what_standing_and_creeping_can_show() -> None:
     assert STATIC.size < base_parameters(TINY.chain, TINY.layout).size
 
 
+@pytest.mark.slow
 def test_a_few_postures_in_a_tiny_workspace_teach_all_static_parameters_and_everything_is_proven() -> None:
     basis = PostureBasis(5, (1.0,) * 4 + (2.0,) * 4, 0.2)
     designed = design_motion(TINY, quick(), budget=ONE_START, basis=basis, base=STATIC)
@@ -46,6 +48,7 @@ def test_a_few_postures_in_a_tiny_workspace_teach_all_static_parameters_and_ever
     assert np.isfinite(deviations).all()
 
 
+@pytest.mark.slow
 def test_a_description_can_ask_for_postures() -> None:
     design = quick(motion="postures", postures=4, way=1.0, dwell=0.1)
     basis, base = family(design, TINY)

@@ -18,6 +18,8 @@ from ident_service.record.recording import Recording
 from ident_service.results.run_folder import write_manifest, write_results
 from ident_service.service.commission import record_motion
 
+COARSE = 250.0  # Hz
+
 
 def truth_of(config: ArmConfig) -> dict[str, float]:
     """The simulated plant's link parameters by name."""
@@ -34,6 +36,7 @@ def changed(
     motion: int | None = None,
     factors: Mapping[str, float] | None = None,
     added: Mapping[str, float] | None = None,
+    rate: float | None = None,
 ) -> ArmConfig:
     """An arm whose plant is another one.
 
@@ -43,6 +46,8 @@ def changed(
         motion: seed of the identification motion; the description's when None.
         factors: what true parameters are multiplied by.
         added: what is added to them, in SI units.
+        rate: of the control loop [Hz], the description's when None; a quarter of it moves and records an arm in a
+            quarter of the time.
     """
     config = load_arm(arm) if isinstance(arm, str) else arm
     truth = truth_of(config)
@@ -57,7 +62,8 @@ def changed(
         planned = motions.identification
         assert isinstance(planned, SeededMotion)
         motions = motions.model_copy(update={"identification": planned.model_copy(update={"seed": motion})})
-    return config.model_copy(update={"driver": driver, "motions": motions})
+    control = config.control if rate is None else config.control.model_copy(update={"rate": rate})
+    return config.model_copy(update={"driver": driver, "motions": motions, "control": control})
 
 
 def recorded_arm(config: ArmConfig, path: Path, motion: str = "identification") -> Recording:

@@ -82,6 +82,7 @@ def test_merging_in_any_order_and_grouping_gives_the_same_estimate(
     np.testing.assert_array_equal(merged.rows, equations.keep.sum(axis=0))
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(seed=st.integers(0, 10_000), joints=st.integers(1, 4), weighted=st.booleans())
 def test_the_stacked_factor_is_the_qr_of_all_rows(seed: int, joints: int, weighted: bool) -> None:

@@ -27,6 +27,7 @@ def coupled(rng: np.random.Generator, joints: int) -> tuple[Chain, Layout]:
     return chain, Layout(chain.revolute, TERMS, tuple(rng.uniform(0.5, 2.0, size=joints)))
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 4))
 def test_the_pull_is_what_central_differences_say(seed: int, joints: int) -> None:

@@ -34,6 +34,7 @@ def assert_inside(enclosure: Taylor, values: Array, size: float) -> None:
     assert (np.abs(values) <= enclosure.size[:, None] + rounding).all()
 
 
+@pytest.mark.slow
 @settings(max_examples=150)
 @given(recipe=recipes(), seed=st.integers(0, 2**16), longest=st.sampled_from([1e-4, 1e-2, 0.3]))
 def test_a_thousand_times_finer_values_of_any_program_lie_inside(recipe: Recipe, seed: int, longest: float) -> None:

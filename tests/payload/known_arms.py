@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import reduce
+from functools import lru_cache, reduce
 
 import numpy as np
 from helpers.random_arms import model_around, random_chain, random_delta
@@ -36,29 +36,36 @@ def with_body(added: np.ndarray, sign: float = 1.0) -> np.ndarray:
     return delta
 
 
+@lru_cache
+def regressors(blocks: int, samples: int, speed: float) -> tuple[np.ndarray, ...]:
+    """Of random states block by block, the same ones for every arm: what is drawn anew is the noise."""
+    rng = np.random.default_rng(14)
+    states = (rng.uniform(-2.0, 2.0, size=(3, samples, JOINTS)) for _ in range(blocks))
+    return tuple(joint_regressor(ARM.chain, ARM.layout, q, speed * dq, speed * ddq, BASE.base) for q, dq, ddq in states)
+
+
 def blocks_of(
     delta: np.ndarray, rng: np.random.Generator, blocks: int = 40, samples: int = 40, *, speed: float = 1.0
 ) -> Equations:
     """Equations at random states with white noise; `speed` 0 for states at rest."""
     joint_supports = supports(ARM.chain, ARM.layout, BASE.base)
     made: list[Information] = []
-    for _ in range(blocks):
-        q, dq, ddq = rng.uniform(-2.0, 2.0, size=(3, samples, JOINTS))
-        H = joint_regressor(ARM.chain, ARM.layout, q, speed * dq, speed * ddq, BASE.base)
-        torque = np.einsum("jps,p->sj", H, BASE.K @ delta) + NOISE * rng.normal(size=q.shape)
-        made.append(information_of(H, torque, np.ones(q.shape, dtype=bool), joint_supports))
+    for H in regressors(blocks, samples, speed):
+        torque = np.einsum("jps,p->sj", H, BASE.K @ delta) + NOISE * rng.normal(size=(samples, JOINTS))
+        made.append(information_of(H, torque, np.ones(torque.shape, dtype=bool), joint_supports))
     return Equations(tuple(made), blocks * samples)
 
 
-def true_covariance(recorded: Equations) -> np.ndarray:
-    """Of weighted least squares, with the noise known."""
-    information = reduce(Information.merged, recorded.blocks)
+@lru_cache
+def true_covariance() -> np.ndarray:
+    """Of weighted least squares at these states, with the noise known."""
+    information = reduce(Information.merged, blocks_of(DELTA, np.random.default_rng(15)).blocks)
     R = information.stacked(1.0 / NOISE)[:-1, :-1]
     return np.linalg.inv(R.T @ R)
 
 
 def known(rng: np.random.Generator, delta: np.ndarray = DELTA, *, scale: float = 1.0) -> KnownArm:
     """An arm as an identification finds it: the truth, off by a draw from its covariance."""
-    covariance = scale**2 * true_covariance(blocks_of(delta, rng))
+    covariance = scale**2 * true_covariance()
     beta = BASE.K @ delta + rng.multivariate_normal(np.zeros(BASE.size), covariance, method="cholesky")
     return KnownArm(ARM, BASE, beta, covariance)

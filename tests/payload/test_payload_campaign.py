@@ -47,13 +47,6 @@ def found_on(arm: str, seeds: range, folder: Path) -> tuple[int, int, list[float
     return missed, invented, errors
 
 
-@pytest.mark.slow
-def test_a_few_loads_of_the_planar_arm(tmp_path: Path) -> None:
-    missed, invented, errors = found_on("planar2", range(50, 52), tmp_path)
-    assert (missed, invented) == (0, 0)
-    assert max(errors) < 3.0
-
-
 @pytest.mark.campaign
 @pytest.mark.parametrize("arm", LOADS)
 def test_loads_of_simulated_arms(arm: str, tmp_path: Path) -> None:

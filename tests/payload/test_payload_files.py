@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from compare.conftest import Ident
-from helpers.changed_arms import changed, identified_folder, recorded_arm
+from helpers.changed_arms import COARSE, changed, identified_folder, recorded_arm
 
 from ident_service.estimation.proof.certificate_exact import verify
 from ident_service.results.run_folder import read_results
@@ -36,10 +36,10 @@ TOOL = {
 def arms(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folders of results `bare` and `tooled`, recordings `bare.mcap` and `tooled.mcap`."""
     folder = tmp_path_factory.mktemp("arms")
-    identified_folder(changed("planar2", seed=11), folder / "bare")
-    identified_folder(changed("planar2", seed=12, added=TOOL), folder / "tooled")
-    recorded_arm(changed("planar2", seed=13), folder / "bare.mcap")
-    recorded_arm(changed("planar2", seed=14, added=TOOL), folder / "tooled.mcap")
+    identified_folder(changed("planar2", rate=COARSE, seed=11), folder / "bare")
+    identified_folder(changed("planar2", rate=COARSE, seed=12, added=TOOL), folder / "tooled")
+    recorded_arm(changed("planar2", rate=COARSE, seed=13), folder / "bare.mcap")
+    recorded_arm(changed("planar2", rate=COARSE, seed=14, added=TOOL), folder / "tooled.mcap")
     return folder
 
 
