@@ -39,6 +39,9 @@ from sim_backend.faults import Fault, FaultKind
 Array = np.ndarray
 HOLD = 0.3  # s
 PERIOD = 1e-3
+# States that somebody at the controls brings about; the same hands lead through all of a line.
+PAUSED = (State.PAUSING, State.PAUSED, State.RESUMING)
+STOPPED = (State.STOPPING, State.STOPPED)
 PAUSED_FOR = 300  # cycles from the wish to pause to the wish to go on
 # What a drive that is stuck, weak, loaded or lies can end in: physics says in which.
 UNTRUE = {
@@ -184,10 +187,8 @@ class Script(Switches):
     def __init__(self, arm: WatchedArm, which: Subject, state: State, speed: float = 1.0) -> None:
         super().__init__()
         self._arm = arm
-        pausing = state in (State.PAUSING, State.PAUSED, State.RESUMING)
-        stopping = state in (State.STOPPING, State.STOPPED)
-        self._pause = round(which.pause / speed) if pausing else 10**9
-        self._stop = round(which.stop / speed) if stopping else 10**9
+        self._pause = round(which.pause / speed) if state in PAUSED else 10**9
+        self._stop = round(which.stop / speed) if state in STOPPED else 10**9
 
     def lease_ok(self, now_ns: int) -> bool:
         cycle = self._arm.cycle - 1
@@ -255,9 +256,14 @@ def play(
     return Outcome(story, arm, moments, latch, fault)
 
 
-@cache
 def windows(name: str, state: State, speed: float = 1.0) -> dict[str, tuple[int, int]]:
     """First and last cycle of every state of a healthy run of a script."""
+    script = PAUSED if state in PAUSED else STOPPED if state in STOPPED else (State.EXCITING,)
+    return _windows(name, script[0], speed)
+
+
+@cache
+def _windows(name: str, state: State, speed: float) -> dict[str, tuple[int, int]]:
     healthy = play(subject(name), state, (), None, speed)
     assert healthy.fault is None
     first, told = healthy.story.samples[0], [event for event in healthy.story.events if event[1] == 20]
