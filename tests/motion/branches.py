@@ -10,7 +10,6 @@ import os
 import pickle
 import signal
 import traceback
-import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from campaign_bench import HOLD, Subject
+from helpers.forks import fork
 from motion_bench import Story, WatchedArm
 
 from ident_service.errors import ArmFault
@@ -77,7 +77,7 @@ def endings(which: Subject, strikes: Callable[[int], Sequence[Fault]], speed: fl
             if fault.at_cycle != cycle:
                 continue
             reading, writing = os.pipe()
-            if (child := _fork()) == 0:
+            if (child := fork()) == 0:
                 os.close(reading)
                 answer = writing
                 arm.inner.faults = (fault,)  # type: ignore[attr-defined]
@@ -121,10 +121,3 @@ def endings(which: Subject, strikes: Callable[[int], Sequence[Fault]], speed: fl
     for ending in found.values():
         assert isinstance(ending, Ending), ending
     return [found[number] for number in range(len(faults))]
-
-
-def _fork() -> int:
-    with warnings.catch_warnings():
-        # Threads of a test runner that this one does not wait for; nothing here takes their locks.
-        warnings.simplefilter("ignore", DeprecationWarning)
-        return os.fork()
