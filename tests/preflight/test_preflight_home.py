@@ -53,6 +53,16 @@ def test_an_arm_inside_or_a_little_outside_passes(start: float) -> None:
         assert furthest < start + 0.02
     else:
         assert furthest > start + 0.03
+    is_for_this_arm_only(ticket)
+
+
+def is_for_this_arm_only(ticket: Ticket) -> None:
+    subject, now = ticket.subject, ticket.created
+    assert ticket.valid_for(subject, now) == []
+    assert ticket.valid_for(replace(subject, excitation="identification", excitation_sha256="0" * 64), now) == [
+        "the motion has changed since"
+    ]
+    assert ticket.valid_for(replace(subject, model_sha256="0" * 64), now) != []
 
 
 def test_farther_outside_nothing_is_touched() -> None:
@@ -68,15 +78,3 @@ def test_for_a_motion_a_little_outside_is_outside() -> None:
     flight.motion = Flight().motion
     only_failure(flight.ticket(), "at_rest")
     assert flight.arm.torques == []
-
-
-@pytest.mark.slow
-def test_a_ticket_without_a_motion_is_for_this_arm_only() -> None:
-    ticket = standing(0.5).ticket()
-    subject = ticket.subject
-    now = ticket.created
-    assert ticket.valid_for(subject, now) == []
-    assert ticket.valid_for(replace(subject, excitation="identification", excitation_sha256="0" * 64), now) == [
-        "the motion has changed since"
-    ]
-    assert ticket.valid_for(replace(subject, model_sha256="0" * 64), now) != []
