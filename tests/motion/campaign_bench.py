@@ -225,17 +225,21 @@ class _Both:
         return self._story.event(stamp_ns, level, message)
 
 
+def built(which: Subject, faults: tuple[Fault | Strike, ...], observer: Callable[[Truth], None]) -> WatchedArm:
+    """The arm, not open, with faults in it and an eye on the truth."""
+    if which.build is None:
+        inner = from_config(which.config, faults=[f for f in faults if isinstance(f, Fault)], observer=observer)
+        return WatchedArm(inner)
+    (strike,) = [f for f in faults if isinstance(f, Strike)] or [None]
+    return which.build(strike, observer)
+
+
 def play(
     which: Subject, state: State, faults: tuple[Fault | Strike, ...], path: Path | None, speed: float = 1.0
 ) -> Outcome:
     """One run on a new arm, with what the script of a state does, recorded if a path is given."""
     truth: list[Truth] = []
-    if which.build is None:
-        inner = from_config(which.config, faults=[f for f in faults if isinstance(f, Fault)], observer=truth.append)
-        arm = WatchedArm(inner)
-    else:
-        (strike,) = [f for f in faults if isinstance(f, Strike)] or [None]
-        arm = which.build(strike, truth.append)
+    arm = built(which, faults, truth.append)
     story, latch, fault = Story(), Latch(), None
     options: dict[str, Any] = {"latch": latch, "hold_seconds": HOLD, "speed": speed}
     script = Script(arm, which, state, speed)
@@ -258,8 +262,12 @@ def play(
 
 def windows(name: str, state: State, speed: float = 1.0) -> dict[str, tuple[int, int]]:
     """First and last cycle of every state of a healthy run of a script."""
-    script = PAUSED if state in PAUSED else STOPPED if state in STOPPED else (State.EXCITING,)
-    return _windows(name, script[0], speed)
+    return _windows(name, script_of(state), speed)
+
+
+def script_of(state: State) -> State:
+    """The state that stands for all that one script leads through."""
+    return PAUSED[0] if state in PAUSED else STOPPED[0] if state in STOPPED else State.EXCITING
 
 
 @cache

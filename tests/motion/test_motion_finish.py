@@ -98,6 +98,7 @@ def test_a_run_is_finished_from_every_part_of_it(make: Callable[..., Bench], hea
     assert bench.arm.cycle < whole.arm.cycle
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None, phases=[Phase.explicit, Phase.generate])
 @given(cycle=st.integers(1, 2600), speed=st.sampled_from([1.0, 0.6]), pause=st.integers(-400, 400))
 def test_limits_are_kept_whenever_a_run_is_finished(cycle: int, speed: float, pause: int) -> None:
@@ -168,6 +169,7 @@ def test_a_run_on_its_way_back_is_not_finished_early(make: Callable[..., Bench],
     assert bench.arm.cycle == whole.arm.cycle
 
 
+@pytest.mark.slow
 def test_one_way_is_not_finished_early(make: Callable[..., Bench]) -> None:
     ways = []
     away = {"joints": {name: joint | {"home": 0.6} for name, joint in JOINTS.items()}}

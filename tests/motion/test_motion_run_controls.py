@@ -109,6 +109,7 @@ def test_a_pause_wanted_for_a_moment_is_a_pause(make: Callable[..., Bench]) -> N
     assert bench.story.states.count("paused") == 1
 
 
+@pytest.mark.slow
 def test_a_rehearsal_goes_on_as_slowly_as_it_went(make: Callable[..., Bench]) -> None:
     bench = make()
     assert played(bench, Hands(((3000, 3500),)), speed=0.4).state is State.DONE
