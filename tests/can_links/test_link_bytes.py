@@ -103,6 +103,7 @@ def test_noise_is_frames_that_exist_or_one_error(data: bytes) -> None:
             check_sendable(frame, fd=True)
 
 
+@pytest.mark.slow
 @given(
     st.text(max_size=20),
     st.booleans(),

@@ -8,6 +8,7 @@ import stat
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
 
@@ -254,23 +255,19 @@ def test_an_end_of_another_version_is_told_so(wire: Wire) -> None:
         assert packets.unpack_welcome(sock.recv(packets.MAX_BYTES)).answer == packets.OTHER_VERSION
 
 
-@pytest.mark.slow
 def test_something_else_at_the_address_is_told_from_a_wire(name: str) -> None:
     with address.listen(name) as listener:
         listener.setblocking(True)
         answers = [b"HTTP/1.1 200 OK", packets.pack_welcome(packets.Welcome(packets.OTHER_VERSION))]
         complaints = ["does not answer as a wire does", "another version"]
         for answer, complaint in zip(answers, complaints, strict=True):
-            child = subprocess.Popen(
-                [sys.executable, "-c", f"from link_bench import end_of; end_of({name!r})"],
-                stderr=subprocess.PIPE,
-                text=True,
-                cwd=Path(__file__).parent,
-            )
-            with listener.accept()[0] as sock:
-                sock.recv(packets.MAX_BYTES)
-                sock.send(answer)
-                assert complaint in child.communicate(timeout=PATIENCE)[1]
+            with ThreadPoolExecutor() as pool:
+                end = pool.submit(end_of, name)
+                with listener.accept()[0] as sock:
+                    sock.recv(packets.MAX_BYTES)
+                    sock.send(answer)
+                    with pytest.raises(DriverError, match=complaint):
+                        end.result(PATIENCE)
 
 
 def test_who_does_not_read_loses_frames_and_is_told_and_holds_nobody_up(wire: Wire) -> None:

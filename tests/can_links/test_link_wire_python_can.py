@@ -6,12 +6,11 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import can
 import canopen
 import pytest
-from link_bench import PATIENCE, content, end_of, greeted, soon, wait_for
+from link_bench import PATIENCE, content, end_of, soon
 
 from drivers.canopen.frame import Frame
 from drivers.canopen.wire.hub import Wire
@@ -88,18 +87,24 @@ def test_the_canopen_library_reads_an_object_over_the_wire(wire: Wire) -> None:
 
 
 @pytest.mark.slow
-def test_the_logger_of_python_can_sees_the_wire(wire: Wire, tmp_path: Path) -> None:
-    link, path = end_of(wire.name), tmp_path / "seen.log"
-    command = [sys.executable, "-m", "can.logger", "-i", "ident_wire", "-c", wire.name, "-f", str(path)]
-    child = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+def test_the_logger_of_python_can_sees_the_wire(wire: Wire) -> None:
+    link = end_of(wire.name)
+    command = [sys.executable, "-u", "-m", "can.logger", "-i", "ident_wire", "-c", wire.name]
+    child = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
-        greeted(wire, 2)
+        assert child.stdout is not None
+        told = iter(child.stdout)
+        assert any(line.startswith("Can Logger (Started") for line in told)
         for k in range(10):
             link.send(Frame(0x181, bytes([k])))
-        wait_for(lambda: all(not port.inbox for port in wire.medium.ports))
-        time.sleep(0.5)  # what the logger has heard it writes in a thread of its own
-    finally:
+        heard = [next(told).split() for _ in range(10)]
         child.send_signal(signal.SIGINT)
-        child.wait(PATIENCE)
-    assert [line.split()[2] for line in path.read_text().splitlines()] == [f"181#{k:02X}" for k in range(10)]
+        assert list(told) == []
+        assert child.wait() == 0
+    finally:
+        child.kill()
+        child.communicate()
+    assert [(words[words.index("ID:") + 1], words[words.index("DL:") + 2]) for words in heard] == [
+        ("181", f"{k:02x}") for k in range(10)
+    ]
     link.close()

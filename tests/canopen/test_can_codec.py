@@ -320,11 +320,25 @@ def stirred(bus: BusCodec, frames: list[Frame]) -> Iterator[list[Frame]]:
         yield bus.torque_frames(TORQUES)
 
 
-@pytest.mark.slow
+LISTS = st.lists(any_frame(), min_size=20, max_size=20)
+
+
+@pytest.mark.campaign
 @settings(max_examples=500)
-@given(st.lists(any_frame(), min_size=20, max_size=20))
+@given(LISTS)
+def test_no_frame_of_many_raises_and_none_changes_a_torque(frames: list[Frame]) -> None:
+    change_nothing(frames)
+
+
+@pytest.mark.slow
+@settings(max_examples=50)
+@given(LISTS)
 @example([Frame(0x040, b"", error=True), Frame(0x081, b""), Frame(2**32 - 1, b"\xff" * 64, extended=True)])
 def test_no_frame_raises_and_none_changes_a_torque(frames: list[Frame]) -> None:
+    change_nothing(frames)
+
+
+def change_nothing(frames: list[Frame]) -> None:
     bus = codec()
     expected = codec().torque_frames(TORQUES)
     for sent in stirred(bus, frames):

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from canopen_run_bench import STALLS, TRIES, Said, canopen, channel, checked, described, emulated, write
+from canopen_run_bench import MOTION, STALLS, TRIES, Said, canopen, channel, checked, described, emulated, write
 
 from drivers.canopen.bits import unstuffed
 from drivers.canopen.frame import Frame
@@ -36,7 +36,9 @@ def tree(name: str, bus: dict[str, Any], rate: float = RATE, **driver: Any) -> d
 
 @pytest.mark.slow
 def test_a_run_in_virtual_time_has_every_answer_in_its_cycle(tmp_path: Path) -> None:
-    path, state, run = write(tmp_path, tree("fd", {"interface": "lock_step"})), tmp_path / "state", tmp_path / "run"
+    section = tree("fd", {"interface": "lock_step"})
+    section["motions"]["identification"] = MOTION | {"base_frequency": 0.4, "harmonics": 2, "periods": 1}
+    path, state, run = write(tmp_path, section), tmp_path / "state", tmp_path / "run"
     assert checked(path, "fd", state)
     assert main(["run", str(path), "--out", str(run), "--state", str(state), "--can-log"]) == 0
     stamps = np.concatenate([b.stamp_ns for b in open_recording(run / "run.mcap", ("shoulder", "elbow")).blocks()])

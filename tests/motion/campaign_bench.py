@@ -39,6 +39,9 @@ from sim_backend.faults import Fault, FaultKind
 Array = np.ndarray
 HOLD = 0.3  # s
 PERIOD = 1e-3
+# States that somebody at the controls brings about; the same hands lead through all of a line.
+PAUSED = (State.PAUSING, State.PAUSED, State.RESUMING)
+STOPPED = (State.STOPPING, State.STOPPED)
 PAUSED_FOR = 300  # cycles from the wish to pause to the wish to go on
 # What a drive that is stuck, weak, loaded or lies can end in: physics says in which.
 UNTRUE = {
@@ -184,10 +187,8 @@ class Script(Switches):
     def __init__(self, arm: WatchedArm, which: Subject, state: State, speed: float = 1.0) -> None:
         super().__init__()
         self._arm = arm
-        pausing = state in (State.PAUSING, State.PAUSED, State.RESUMING)
-        stopping = state in (State.STOPPING, State.STOPPED)
-        self._pause = round(which.pause / speed) if pausing else 10**9
-        self._stop = round(which.stop / speed) if stopping else 10**9
+        self._pause = round(which.pause / speed) if state in PAUSED else 10**9
+        self._stop = round(which.stop / speed) if state in STOPPED else 10**9
 
     def lease_ok(self, now_ns: int) -> bool:
         cycle = self._arm.cycle - 1
@@ -224,17 +225,21 @@ class _Both:
         return self._story.event(stamp_ns, level, message)
 
 
+def built(which: Subject, faults: tuple[Fault | Strike, ...], observer: Callable[[Truth], None]) -> WatchedArm:
+    """The arm, not open, with faults in it and an eye on the truth."""
+    if which.build is None:
+        inner = from_config(which.config, faults=[f for f in faults if isinstance(f, Fault)], observer=observer)
+        return WatchedArm(inner)
+    (strike,) = [f for f in faults if isinstance(f, Strike)] or [None]
+    return which.build(strike, observer)
+
+
 def play(
     which: Subject, state: State, faults: tuple[Fault | Strike, ...], path: Path | None, speed: float = 1.0
 ) -> Outcome:
     """One run on a new arm, with what the script of a state does, recorded if a path is given."""
     truth: list[Truth] = []
-    if which.build is None:
-        inner = from_config(which.config, faults=[f for f in faults if isinstance(f, Fault)], observer=truth.append)
-        arm = WatchedArm(inner)
-    else:
-        (strike,) = [f for f in faults if isinstance(f, Strike)] or [None]
-        arm = which.build(strike, truth.append)
+    arm = built(which, faults, truth.append)
     story, latch, fault = Story(), Latch(), None
     options: dict[str, Any] = {"latch": latch, "hold_seconds": HOLD, "speed": speed}
     script = Script(arm, which, state, speed)
@@ -255,9 +260,18 @@ def play(
     return Outcome(story, arm, moments, latch, fault)
 
 
-@cache
 def windows(name: str, state: State, speed: float = 1.0) -> dict[str, tuple[int, int]]:
     """First and last cycle of every state of a healthy run of a script."""
+    return _windows(name, script_of(state), speed)
+
+
+def script_of(state: State) -> State:
+    """The state that stands for all that one script leads through."""
+    return PAUSED[0] if state in PAUSED else STOPPED[0] if state in STOPPED else State.EXCITING
+
+
+@cache
+def _windows(name: str, state: State, speed: float) -> dict[str, tuple[int, int]]:
     healthy = play(subject(name), state, (), None, speed)
     assert healthy.fault is None
     first, told = healthy.story.samples[0], [event for event in healthy.story.events if event[1] == 20]

@@ -112,6 +112,9 @@ class EmulatedArm(WatchedArm):
         duration = None if strike.duration is None else strike.duration * PERIOD
         self.behind.inject(PuckFault(strike.kind, strike.joint, strike.later * PERIOD, duration, strike.size))
 
+    def strike(self, fault: Strike) -> None:
+        self._strike = fault
+
     def left_alone(self) -> None:
         """Longer than the drives wait for torque frames, and for a ramp."""
         self.behind.settle(self.clock.now_ns() + 50_000_000)

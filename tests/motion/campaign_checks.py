@@ -8,11 +8,27 @@ not shown it yet; what an arm does after its torque is gone is physics.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from campaign_bench import HOLD, PERIOD, Case, Outcome, Promise, Subject, injected, play, subject, windows
+from branches import outcomes
+from campaign_bench import (
+    HOLD,
+    PERIOD,
+    Case,
+    Outcome,
+    Promise,
+    Strike,
+    Subject,
+    injected,
+    play,
+    script_of,
+    subject,
+    windows,
+)
 from motion_bench import LOOKED
 
 from drivers.arm import StopKind
@@ -21,18 +37,57 @@ from ident_service.motion.checks import VELOCITY_OFF
 from ident_service.motion.faults import FAULTS, LOWER, LOWER_AFTER, SETTLE, Reaction
 from ident_service.motion.loop import REST_CYCLES
 from ident_service.motion.run import run
+from ident_service.record.cycle import Cycle
 from ident_service.record.open import open_recording
+from ident_service.record.writer import RecordingWriter
+from sim_backend.faults import Fault
 
 
 def keeps_its_promise(case: Case, folder: Path) -> Outcome:
     which, fault, path = subject(case.arm), injected(case), folder / "run.mcap"
     outcome = play(which, case.state, (fault,), path, case.speed)
+    is_kept(case, fault, outcome, path)
+    return outcome
+
+
+def keep_their_promises(
+    cases: Sequence[Case], folder: Path, also: Callable[[Case, Outcome], None] = lambda case, outcome: None
+) -> None:
+    """Check cases of one arm, script and speed, in branches of one run, whose recordings are written afterwards."""
+    one = cases[0]
+    faults = [injected(case) for case in cases]
+
+    def check(number: int, outcome: Outcome) -> None:
+        case, path = cases[number], folder / f"{number}.mcap"
+        chain = subject(case.arm).model.chain
+        with RecordingWriter(path, chain.names, "<robot/>", 0) as writer:
+            for sample in outcome.story.samples:
+                writer.sample(Cycle(**sample))
+            for event in outcome.story.events:
+                writer.event(*event)
+        is_kept(case, faults[number], outcome, path)
+        also(case, outcome)
+
+    outcomes(subject(one.arm), one.state, faults, check, one.speed)
+
+
+def together(cases: Sequence[Case]) -> list[Any]:
+    """The cases that one run can have in branches, for each such run."""
+    groups: dict[str, list[Case]] = {}
+    for case in cases:
+        groups.setdefault(f"{case.arm}-{script_of(case.state).value}-{case.speed:g}", []).append(case)
+    return [pytest.param(group, id=name) for name, group in groups.items()]
+
+
+def is_kept(case: Case, fault: Fault | Strike, outcome: Outcome, path: Path) -> None:
+    """Hold one outcome to its promise."""
+    which = subject(case.arm)
     plant_stays_within_limits(which, outcome)
     recording_is_readable(which, outcome, path)
     promise = which.promises[case.kind]
     if outcome.fault is None:
         went_on(case, promise, fault.at_cycle, outcome)
-        return outcome
+        return
     assert outcome.fault.code in promise.codes, outcome.fault
     assert any(words in str(outcome.fault) for words in promise.words or ("",)), outcome.fault
     is_latched(which, outcome)
@@ -41,7 +96,6 @@ def keeps_its_promise(case: Case, folder: Path) -> Outcome:
     if promise.within is not None:
         assert found_in(outcome) < fault.at_cycle + promise.within
         assert found_in(outcome) >= fault.at_cycle
-    return outcome
 
 
 def went_on(case: Case, promise: Promise, at_cycle: int, outcome: Outcome) -> None:

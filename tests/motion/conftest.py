@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from motion_bench import WatchedArm, watched
-from run_bench import Bench
+from run_bench import Bench, Healthy
 
 from sim_backend.arm import Truth
 from sim_backend.faults import Fault
@@ -30,3 +30,12 @@ def make() -> Iterator[Callable[..., Bench]]:
     yield build
     for arm in arms:
         arm.close()
+
+
+@pytest.fixture(scope="session")
+def healthy() -> Healthy:
+    """An undisturbed run of the bench, for all to read and none to change."""
+    truth: list[Truth] = []
+    with watched((), truth.append) as arm:
+        bench = Bench(arm, truth)
+        return Healthy(bench, bench.run())

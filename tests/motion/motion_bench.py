@@ -105,6 +105,10 @@ class WatchedArm(Arm):
         if self.stop_error is not None:
             raise self.stop_error
 
+    def strike(self, fault: Any) -> None:
+        """Let a fault come, now or later."""
+        self.inner.faults = (fault,)
+
     def left_alone(self) -> None:
         """A run has ended, and whoever ran it may have died: for arms that must then stop by themselves."""
 

@@ -80,6 +80,19 @@ class Bench:
         assert self.story.samples == []
 
 
+@dataclass(frozen=True)
+class Healthy:
+    """A run that nothing disturbed, and what came of it."""
+
+    bench: Bench
+    report: RunReport
+
+    @property
+    def story(self) -> Story:
+        """What its sink kept."""
+        return self.bench.story
+
+
 def with_series(series: FourierSeries) -> Excitation:
     """The bench's motion with another series."""
     assert isinstance(MOTION.path, FourierPath)

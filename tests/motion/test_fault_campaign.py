@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from campaign_bench import PROMISES, Case
-from campaign_checks import keeps_its_promise
+from branches import outcomes
+from campaign_bench import PROMISES, Case, Outcome, subject
+from campaign_checks import keep_their_promises, keeps_its_promise, together
 
 from ident_service.config.simulation import FAULT_RULES
 from ident_service.motion.faults import FAULTS
 from ident_service.motion.states import State
-from sim_backend.faults import FaultKind
+from sim_backend.faults import Fault, FaultKind
 
 STATES = (
     *(State.APPROACHING, State.EXCITING, State.RETURNING, State.PAUSING, State.PAUSED, State.RESUMING),
@@ -58,7 +59,8 @@ def sample() -> list[Case]:
         case for kind in FaultKind for case in rng.sample([case for case in small if case.kind == kind.value], 2)
     ]  # fmt: skip
     chosen += rng.sample([case for case in large if case.state in (State.EXCITING, State.STOPPING)], 5)
-    return chosen + rng.sample(list(slow_freezes("bench", 1)), 3)
+    resuming = [case for case in slow_freezes("bench", 1) if case.state is State.RESUMING]
+    return chosen + resuming
 
 
 def test_every_kind_of_fault_has_its_promise() -> None:
@@ -68,10 +70,23 @@ def test_every_kind_of_fault_has_its_promise() -> None:
         assert promise.codes <= set(FAULTS)
 
 
+def test_what_fails_in_a_branch_fails_here() -> None:
+    """A drive's fault, of which another one is promised."""
+    faults = [Fault(cycle, FaultKind.DRIVE_FAULT, 0) for cycle in (100, 200)]
+
+    def check(number: int, outcome: Outcome) -> None:
+        assert outcome.fault is not None
+        assert (outcome.fault.code == "drive_fault") == (number == 0), "not as promised"
+
+    with pytest.raises(AssertionError, match=r"at_cycle=200.*(\n.*)*not as promised"):
+        outcomes(subject("bench"), State.EXCITING, faults, check)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("case", sample(), ids=str)
-def test_a_sample_of_the_campaign(case: Case, tmp_path: Path) -> None:
-    keeps_its_promise(case, tmp_path)
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("some", together(sample()))
+def test_a_sample_of_the_campaign(some: list[Case], tmp_path: Path) -> None:
+    keep_their_promises(some, tmp_path)
 
 
 def campaign() -> list[Any]:

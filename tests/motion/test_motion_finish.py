@@ -11,7 +11,7 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from motion_bench import JOINTS, LOOKED, WatchedArm, bench_model, watched
-from run_bench import FOREVER, HOLD, HOME, LIMITS, MIDWAY, MOTION, PERIOD, Bench
+from run_bench import FOREVER, HOLD, HOME, LIMITS, MIDWAY, MOTION, PERIOD, Bench, Healthy
 
 from drivers.arm import StopKind
 from ident_service.config.limits import MotionLimits
@@ -83,9 +83,8 @@ def ended_where_it_began(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("cycle", [1, 150, MIDWAY, 1300])
-def test_a_run_is_finished_from_every_part_of_it(make: Callable[..., Bench], cycle: int) -> None:
-    bench, whole = make(), make()
-    whole.run()
+def test_a_run_is_finished_from_every_part_of_it(make: Callable[..., Bench], healthy: Healthy, cycle: int) -> None:
+    bench, whole = make(), healthy.bench
     report = played(bench, Hands(finished=cycle))
     assert report.state is State.DONE
     left = "exciting" if cycle * PERIOD > times(whole)["exciting"] - LOOKED * PERIOD else "approaching"
@@ -99,6 +98,7 @@ def test_a_run_is_finished_from_every_part_of_it(make: Callable[..., Bench], cyc
     assert bench.arm.cycle < whole.arm.cycle
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None, phases=[Phase.explicit, Phase.generate])
 @given(cycle=st.integers(1, 2600), speed=st.sampled_from([1.0, 0.6]), pause=st.integers(-400, 400))
 def test_limits_are_kept_whenever_a_run_is_finished(cycle: int, speed: float, pause: int) -> None:
@@ -160,9 +160,8 @@ def test_the_way_back_of_a_finished_run_can_be_paused(make: Callable[..., Bench]
     ended_where_it_began(bench)
 
 
-def test_a_run_on_its_way_back_is_not_finished_early(make: Callable[..., Bench]) -> None:
-    whole, bench = make(), make()
-    whole.run()
+def test_a_run_on_its_way_back_is_not_finished_early(make: Callable[..., Bench], healthy: Healthy) -> None:
+    whole, bench = healthy.bench, make()
     cycle = round(times(whole)["returning"] / PERIOD) - LOOKED + 50
     report = played(bench, Hands(finished=cycle))
     assert (report.state, report.finished_at, report.not_finished) == (State.DONE, None, "")
@@ -170,6 +169,7 @@ def test_a_run_on_its_way_back_is_not_finished_early(make: Callable[..., Bench])
     assert bench.arm.cycle == whole.arm.cycle
 
 
+@pytest.mark.slow
 def test_one_way_is_not_finished_early(make: Callable[..., Bench]) -> None:
     ways = []
     away = {"joints": {name: joint | {"home": 0.6} for name, joint in JOINTS.items()}}

@@ -44,6 +44,7 @@ def positions(bench: Bench) -> Array:
     return np.array([truth.position for truth in bench.truth])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [(-1.2, 1.0), (1.7, -1.9), (0.1, -0.1)])
 def test_it_goes_home_and_is_held_there(make: Callable[..., Bench], start: tuple[float, float]) -> None:
     bench = make(**standing(*start))
@@ -57,6 +58,7 @@ def test_it_goes_home_and_is_held_there(make: Callable[..., Bench], start: tuple
     assert bench.story.column("stamp_ns")[-1] - stopped >= (HOLD - 2 * PERIOD) * 1e9
 
 
+@pytest.mark.slow
 def test_no_joint_is_faster_than_a_tenth_of_its_limit(make: Callable[..., Bench]) -> None:
     bench = make(**standing(-1.2, 1.0))
     go(bench)
@@ -66,6 +68,7 @@ def test_no_joint_is_faster_than_a_tenth_of_its_limit(make: Callable[..., Bench]
     assert (np.abs([truth.velocity for truth in bench.truth]) < 0.3 * LIMITS.velocity).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("destination", list(Destination))
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_from_a_little_outside_the_way_leads_inwards_only(
@@ -115,6 +118,7 @@ def test_a_stop_on_the_way_home_is_a_stop(make: Callable[..., Bench]) -> None:
     assert abs(positions(bench)[-1][0] - HOME[0]) > 0.5
 
 
+@pytest.mark.slow
 def test_a_pause_on_the_way_home_ends_at_home(make: Callable[..., Bench]) -> None:
     bench, switches = make(**standing(-1.2, 1.0)), Switches()
     bench.arm.before_exchange = lambda cycle: setattr(switches, "pause", 1500 < cycle < 3000)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from motion_bench import LOOKED, PRIOR
-from run_bench import HOME, LIMITS, MIDWAY, MOTION, PERIOD, Bench, with_series
+from run_bench import HOME, LIMITS, MIDWAY, MOTION, PERIOD, Bench, Healthy, with_series
 
 from drivers.arm import Sample
 from ident_service.errors import UsageError
@@ -20,9 +20,8 @@ from ident_service.motion.states import State
 Array = np.ndarray
 
 
-def test_a_run_goes_out_and_comes_back(make: Callable[..., Bench]) -> None:
-    bench = make()
-    report = bench.run()
+def test_a_run_goes_out_and_comes_back(healthy: Healthy) -> None:
+    bench, report = healthy.bench, healthy.report
     assert report.state is State.DONE
     assert bench.story.states == ["checked", "armed", "approaching", "exciting", "returning", "done"]
     assert bench.story.errors == []
@@ -36,9 +35,8 @@ def test_a_run_goes_out_and_comes_back(make: Callable[..., Bench]) -> None:
     assert not bench.story.column("lateness_ns").any()
 
 
-def test_the_recorded_reference_is_the_excitation(make: Callable[..., Bench]) -> None:
-    bench = make()
-    bench.run()
+def test_the_recorded_reference_is_the_excitation(healthy: Healthy) -> None:
+    bench = healthy.bench
     position, velocity = bench.story.column("reference_position"), bench.story.column("reference_velocity")
     np.testing.assert_allclose(position[0], HOME, atol=1e-9)
     told = {message: stamp for stamp, _, message in bench.story.events}
@@ -59,9 +57,8 @@ def test_the_recorded_reference_is_the_excitation(make: Callable[..., Bench]) ->
     assert (np.abs(np.diff(velocity, axis=0)) <= LIMITS.acceleration * PERIOD * 1.001).all()
 
 
-def test_the_report_says_what_was_recorded(make: Callable[..., Bench]) -> None:
-    bench = make()
-    report = bench.run()
+def test_the_report_says_what_was_recorded(healthy: Healthy) -> None:
+    bench, report = healthy.bench, healthy.report
     torque, position = bench.story.column("torque"), bench.story.column("position")
     np.testing.assert_array_equal(report.peak_torque, np.abs(torque).max(axis=0))
     error = np.abs(bench.story.column("reference_position") - position).max(axis=0)
@@ -70,9 +67,8 @@ def test_the_report_says_what_was_recorded(make: Callable[..., Bench]) -> None:
     assert (error < 0.5 * LIMITS.following_error).all()
 
 
-def test_what_is_recorded_is_the_torque_that_acted(make: Callable[..., Bench]) -> None:
-    bench = make()
-    bench.run()
+def test_what_is_recorded_is_the_torque_that_acted(healthy: Healthy) -> None:
+    bench = healthy.bench
     acted = np.array([truth.torque for truth in bench.truth])[LOOKED : LOOKED + len(bench.story.samples)]
     np.testing.assert_array_equal(bench.story.column("torque"), acted)
 
@@ -85,10 +81,8 @@ def test_an_arm_that_has_nowhere_to_go_is_done_at_once(make: Callable[..., Bench
     assert (report.peak_following_error < 1e-3).all()
 
 
-@pytest.mark.slow
-def test_two_runs_are_the_same_to_the_last_bit(make: Callable[..., Bench]) -> None:
-    one, other = make(), make()
-    one.run()
+def test_two_runs_are_the_same_to_the_last_bit(make: Callable[..., Bench], healthy: Healthy) -> None:
+    one, other = healthy, make()
     other.run()
     for name in ("position", "torque", "reference_position"):
         np.testing.assert_array_equal(one.story.column(name), other.story.column(name))
@@ -109,9 +103,8 @@ def test_enabling_may_take_its_time(make: Callable[..., Bench]) -> None:
 
 
 @pytest.mark.slow
-def test_a_rehearsal_is_the_same_run_in_slow_motion(make: Callable[..., Bench]) -> None:
-    full, slow = make(), make()
-    full.run()
+def test_a_rehearsal_is_the_same_run_in_slow_motion(make: Callable[..., Bench], healthy: Healthy) -> None:
+    full, slow = healthy, make()
     report = run(slow.arm, slow.model, MOTION, slow.story, speed=0.2)
     assert report.state is State.DONE
     assert slow.story.states == full.story.states

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from motion_bench import LOOKED
-from run_bench import FOREVER, LIMITS, MIDWAY, PERIOD, Bench
+from run_bench import FOREVER, LIMITS, MIDWAY, PERIOD, Bench, Healthy
 
 from drivers.arm import Sample
 from ident_service.motion.checks import FROZEN_CYCLES, JUMP
@@ -18,12 +18,12 @@ from sim_backend.faults import Fault, FaultKind
 Array = np.ndarray
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("joint", [0, 1, None])
 @pytest.mark.parametrize("cycles", [1, 2])
-def test_feedback_lost_for_a_moment_is_bridged(make: Callable[..., Bench], joint: int | None, cycles: int) -> None:
-    healthy, bench = make(), make(Fault(MIDWAY, FaultKind.LOST_FEEDBACK, joint, cycles))
-    expected = healthy.run()
+def test_feedback_lost_for_a_moment_is_bridged(
+    make: Callable[..., Bench], healthy: Healthy, joint: int | None, cycles: int
+) -> None:
+    bench, expected = make(Fault(MIDWAY, FaultKind.LOST_FEEDBACK, joint, cycles)), healthy.report
     report = bench.run()
     assert report.state is State.DONE
     assert report.warnings == {"lost_feedback": cycles}
@@ -41,11 +41,9 @@ def test_feedback_gone_takes_the_torque(make: Callable[..., Bench], joint: int |
     assert bench.story.column("cycle")[-1] == MIDWAY + 2
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("joint", [0, 1])
-def test_one_encoder_jump_is_passed_over(make: Callable[..., Bench], joint: int) -> None:
-    healthy, bench = make(), make(Fault(MIDWAY, FaultKind.ENCODER_JUMP, joint, 1, 1.0))
-    expected = healthy.run()
+def test_one_encoder_jump_is_passed_over(make: Callable[..., Bench], healthy: Healthy, joint: int) -> None:
+    bench, expected = make(Fault(MIDWAY, FaultKind.ENCODER_JUMP, joint, 1, 1.0)), healthy.report
     report = bench.run()
     assert report.state is State.DONE
     assert report.warnings == {"encoder_jump": 1}

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from motion_bench import LOOKED
-from run_bench import FOREVER, HOLD, HOME, LIMITS, MIDWAY, MOTION, PERIOD, Bench
+from run_bench import FOREVER, HOLD, HOME, LIMITS, MIDWAY, MOTION, PERIOD, Bench, Healthy
 
 from drivers.arm import StopKind
 from ident_service.errors import ArmFault, MotionRefused
@@ -90,9 +90,8 @@ def test_a_pause_is_gone_on_from(make: Callable[..., Bench], cycle: int) -> None
     assert (np.abs(bench.truth[-1].position - HOME) < 0.25 * LIMITS.following_error).all()
 
 
-def test_the_whole_motion_is_made_in_spite_of_pauses(make: Callable[..., Bench]) -> None:
-    healthy, bench = make(), make()
-    healthy.run()
+def test_the_whole_motion_is_made_in_spite_of_pauses(make: Callable[..., Bench], healthy: Healthy) -> None:
+    bench = make()
     # Short enough that the second one strikes on the way back from the first.
     report = played(bench, Hands(((700, 701), (1000, 1001), (1600, 1800))))
     assert report.state is State.DONE
@@ -110,6 +109,7 @@ def test_a_pause_wanted_for_a_moment_is_a_pause(make: Callable[..., Bench]) -> N
     assert bench.story.states.count("paused") == 1
 
 
+@pytest.mark.slow
 def test_a_rehearsal_goes_on_as_slowly_as_it_went(make: Callable[..., Bench]) -> None:
     bench = make()
     assert played(bench, Hands(((3000, 3500),)), speed=0.4).state is State.DONE

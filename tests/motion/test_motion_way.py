@@ -24,6 +24,7 @@ Array = np.ndarray
 LIMITS = bench_limits()
 
 
+@pytest.mark.slow
 @given(setpoints(LIMITS), setpoints(LIMITS))
 def test_a_way_keeps_to_every_limit_or_is_refused(start: Setpoint, end: Setpoint) -> None:
     try:
@@ -47,6 +48,7 @@ def test_between_gentle_states_a_way_exists(start: Setpoint, end: Setpoint) -> N
     assert (np.abs(velocity) <= LIMITS.velocity * (1 + 1e-6)).all()
 
 
+@pytest.mark.slow
 @given(setpoints(LIMITS), setpoints(LIMITS))
 def test_the_extent_of_a_way_is_where_it_goes(start: Setpoint, end: Setpoint) -> None:
     wide = 100.0 * np.ones(2)

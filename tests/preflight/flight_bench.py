@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from datetime import timedelta
 from typing import Any
 
 import numpy as np
@@ -140,6 +141,27 @@ class Flight:
                 self.arm.inner.open()
                 np.testing.assert_array_equal(self.arm.inner.exchange(None).torque, 0.0)
                 self.arm.inner.close()
+
+
+@dataclass
+class Flown:
+    """A preflight that is over.
+
+    Attributes:
+        flight: what was checked.
+        ticket: what came of it.
+        told: codes of the checks in the order told.
+        seen: positions of all samples [rad].
+    """
+
+    flight: Flight
+    ticket: Ticket = field(init=False)
+    told: list[str] = field(default_factory=list)
+    seen: list[np.ndarray] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.flight.arm.shown = lambda sample: self.seen.append(sample.position) or sample
+        self.ticket = self.flight.ticket(tell=lambda check: self.told.append(check.code), valid=timedelta(minutes=3))
 
 
 def check_of(ticket: Ticket, code: str) -> Check:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from flight_bench import Flight, check_of, verdicts
+from flight_bench import Flight, Flown, check_of, verdicts
 
 from drivers.arm import Arm
 from ident_service.errors import DriverError
@@ -65,12 +65,12 @@ def test_with_a_motion_that_does_not_fit() -> None:
     assert for_a_way_home(ticket) == ["the check did not pass: gravity"]
 
 
-def test_when_every_check_has_been_made() -> None:
+@pytest.mark.slow
+def test_when_every_check_has_been_made(unnamed: Flown) -> None:
     """Nobody typed the arm's name, so that the watchdog's check stands; then the bus goes while torque fades."""
-    whole = Flight(typed="")
-    assert checked(whole, whole.arm, whole.motion).verdict is Verdict.NEEDS_PERSON
-    flight = Flight(typed="")
-    ticket = checked(flight, bus_goes(flight, len(whole.arm.torques) - 50), flight.motion)
+    assert unnamed.ticket.verdict is Verdict.NEEDS_PERSON
+    flight = Flight(typed=" ")
+    ticket = checked(flight, bus_goes(flight, len(unnamed.flight.arm.torques) - 50), flight.motion)
     assert check_of(ticket, "direction").verdict is Verdict.PASSED
     assert check_of(ticket, "watchdog").reason == "the bus is gone"
     assert ticket.verdict is Verdict.FAILED

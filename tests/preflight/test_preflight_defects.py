@@ -50,6 +50,7 @@ def test_a_model_without_prior_opens_nothing() -> None:
     assert flight.arm.calls == []
 
 
+@pytest.mark.slow
 def test_a_motion_of_another_description_is_refused_but_the_arm_is_still_checked() -> None:
     flight = Flight()
     flight.motion = replace(flight.motion, arm_sha256="0" * 64)
@@ -59,6 +60,7 @@ def test_a_motion_of_another_description_is_refused_but_the_arm_is_still_checked
     assert verdicts(ticket)["direction"] is Verdict.PASSED
 
 
+@pytest.mark.slow
 def test_a_motion_beyond_a_limit_is_refused() -> None:
     flight = Flight()
     slow = Flight(changes={"joints": joint_changes("elbow", velocity=0.3)})
@@ -197,6 +199,7 @@ def on_clock(clock: VirtualClock) -> Flight:
     return flight
 
 
+@pytest.mark.slow
 def test_a_machine_that_keeps_the_rate_passes_with_numbers() -> None:
     check = check_of(on_clock(_LateClock(50, 600_000)).ticket(), "rate")
     assert check.verdict is Verdict.PASSED
@@ -263,6 +266,7 @@ def geared(ratio: float, joint: int) -> Callable[[FlightArm], None]:
     return apply
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [0.45, 1.6])
 def test_a_wrong_gear_ratio_shows_in_the_answer_to_torque(ratio: float) -> None:
     level = {"gravity": (0.0, 0.0, -9.81)}  # the axes upright: gravity cannot tell
@@ -273,6 +277,7 @@ def test_a_wrong_gear_ratio_shows_in_the_answer_to_torque(ratio: float) -> None:
     assert "gear ratio" in check.remedy
 
 
+@pytest.mark.slow
 def test_a_blocked_joint_does_not_follow() -> None:
     truth = TRUTH | {"fc2": 30.0}
     flight = Flight(changes={"driver": {"kind": "simulated", "truth": truth, "encoder_resolution": 2e-5}})
@@ -312,6 +317,7 @@ def test_an_encoder_that_freezes_while_the_joint_moves_is_noticed() -> None:
     assert check.remedy.startswith("Check the encoder of the joint named")
 
 
+@pytest.mark.slow
 def test_a_drive_that_limits_its_torque_is_named_and_not_the_joint_that_it_drags_along() -> None:
     # As the drives tell it: the arm of the other tests says that the torque asked for has acted.
     model = arm_model(load_arm("planar2"))
@@ -348,6 +354,7 @@ def test_a_bus_that_goes_is_a_failed_check() -> None:
     assert "bus" in only_failure(flight.ticket(), "direction").reason
 
 
+@pytest.mark.slow
 def test_drives_without_a_watchdog_are_refused() -> None:
     flight = Flight(
         changes={"driver": {"kind": "simulated", "truth": TRUTH, "encoder_resolution": 2e-5, "watchdog": 1e6}}

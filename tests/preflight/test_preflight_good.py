@@ -7,10 +7,10 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
-from flight_bench import LIMIT, PRIOR, TRUTH, Flight, check_of, verdicts
+from flight_bench import LIMIT, PRIOR, TRUTH, Flight, Flown, check_of, verdicts
+from helpers.forks import fork_plants
 
 from drivers.arm import Sample
-from drivers.clock import VirtualClock
 from ident_service.config.load import load_arm
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import arm_model
@@ -20,22 +20,21 @@ from ident_service.motion.preflight.check import CODES, Verdict
 from ident_service.motion.preflight.direction import LEAST_ANSWER
 from ident_service.motion.preflight.preflight import preflight
 from ident_service.motion.preflight.session import trace_of
+from ident_service.motion.preflight.ticket import Ticket
 from ident_service.motion.reference import Setpoint
 
 
-def test_a_good_arm_passes_all_that_virtual_time_can_tell() -> None:
-    flight = Flight()
-    told: list[str] = []
-    ticket = flight.ticket(tell=lambda check: told.append(check.code))
+def test_a_good_arm_passes_all_that_virtual_time_can_tell(good: Flown) -> None:
+    ticket = good.ticket
     assert verdicts(ticket) == {code: Verdict.SKIPPED if code == "rate" else Verdict.PASSED for code in CODES}
     assert "virtual" in check_of(ticket, "rate").reason
     assert ticket.verdict is Verdict.PASSED
     assert all(check.remedy == "" for check in ticket.checks)
-    assert told == list(CODES)
+    assert good.told == list(CODES)
 
 
-def test_it_measures_what_is_true() -> None:
-    ticket = Flight().ticket()
+def test_it_measures_what_is_true(good: Flown) -> None:
+    ticket = good.ticket
     answers = [one for one in check_of(ticket, "direction").measures if one.what.startswith("answer to torque, mea")]
     # The truth is 5 % heavier at the shoulder.
     assert [one.value for one in answers] == pytest.approx([0.93, 1.0], abs=0.06)
@@ -44,6 +43,7 @@ def test_it_measures_what_is_true() -> None:
     assert abs((held["shoulder"] or 0.0) - 12.3) < 0.7
 
 
+@pytest.mark.slow
 def test_a_scale_that_cannot_be_judged_is_not_reported_as_if_it_were() -> None:
     """An elbow of whose drive inertia the model knows nothing passes with a third of the answer, and says why."""
     prior = {name: value for name, value in PRIOR.items() if name != "Ia2"}
@@ -67,33 +67,20 @@ def test_a_scale_that_cannot_be_judged_is_not_reported_as_if_it_were() -> None:
     assert (judged["shoulder"].least, judged["elbow"].least) == (LEAST_ANSWER, 0.0)
 
 
-def test_the_arm_moves_no_farther_than_told_and_within_its_band_of_torque() -> None:
-    flight = Flight()
-    seen: list[np.ndarray] = []
-    flight.arm.shown = lambda sample: seen.append(sample.position) or sample
-    flight.ticket()
-    powered = np.array(seen[: 121 + len(flight.arm.torques)])
+def test_the_arm_moves_no_farther_than_told_and_within_its_band_of_torque(good: Flown) -> None:
+    powered = np.array(good.seen[: 121 + len(good.flight.arm.torques)])
     assert (np.abs(powered - powered[0]) < 0.06).all()
-    torques = np.array(flight.arm.torques)
+    torques = np.array(good.flight.arm.torques)
     assert (np.abs(torques - torques[0]) < 0.3 * LIMIT + 1.0).all()
 
 
-def test_a_person_is_asked_by_the_arms_name_before_anything_is_energised() -> None:
-    flight = Flight()
-    flight.ticket()
-    (question,) = flight.questions
+def test_a_person_is_asked_by_the_arms_name_before_anything_is_energised(good: Flown) -> None:
+    (question,) = good.flight.questions
     assert "bench" in question
     assert "sinks" in question
 
 
-@pytest.mark.parametrize(
-    ("typed", "why"), [("yes", "'yes' is not the arm's name, bench,"), (" ", "nobody typed the arm's name, bench,")]
-)
-def test_without_the_name_the_watchdog_is_not_tried_and_the_arm_is_handed_back_to_its_support(
-    typed: str, why: str
-) -> None:
-    flight = Flight(typed=typed)
-    ticket = flight.ticket()
+def is_handed_back(ticket: Ticket, why: str) -> None:
     assert ticket.verdict is Verdict.NEEDS_PERSON
     check = check_of(ticket, "watchdog")
     assert check.verdict is Verdict.NEEDS_PERSON
@@ -102,6 +89,16 @@ def test_without_the_name_the_watchdog_is_not_tried_and_the_arm_is_handed_back_t
     assert verdicts(ticket)["direction"] is Verdict.PASSED
 
 
+def test_without_the_name_the_watchdog_is_not_tried_and_the_arm_is_handed_back_to_its_support(unnamed: Flown) -> None:
+    is_handed_back(unnamed.ticket, "nobody typed the arm's name, bench,")
+
+
+@pytest.mark.slow
+def test_another_word_is_not_the_name() -> None:
+    is_handed_back(Flight(typed="yes").ticket(), "'yes' is not the arm's name, bench,")
+
+
+@pytest.mark.slow
 def test_a_driver_that_does_not_tell_about_its_drives_skips_the_watchdog_unasked() -> None:
     flight = Flight()
     flight.arm.shown = lambda sample: replace(sample, status=())
@@ -111,14 +108,14 @@ def test_a_driver_that_does_not_tell_about_its_drives_skips_the_watchdog_unasked
     assert flight.questions == []
 
 
-def test_the_ticket_is_stamped_by_the_clock_it_is_given() -> None:
-    ticket = Flight(clock=VirtualClock(10**9, 1_700_000_000 * 10**9)).ticket(valid=timedelta(minutes=3))
-    assert ticket.created == datetime.fromtimestamp(1_700_000_001, UTC)
-    assert ticket.expires - ticket.created == timedelta(minutes=3)
+def test_the_ticket_is_stamped_by_the_clock_it_is_given(good: Flown) -> None:
+    assert good.ticket.created == datetime.fromtimestamp(1_700_000_001, UTC)
+    assert good.ticket.expires - good.ticket.created == timedelta(minutes=3)
 
 
 @pytest.mark.slow
-def test_the_watchdog_of_a_plant_in_its_own_process_is_seen_to_act() -> None:
+def test_the_watchdog_of_a_plant_in_its_own_process_is_seen_to_act(monkeypatch: pytest.MonkeyPatch) -> None:
+    fork_plants(monkeypatch)
     driver = {"kind": "simulated", "truth": TRUTH, "encoder_resolution": 2e-5, "process": "separate"}
     flight = Flight(changes={"driver": driver})
     ticket = preflight(

@@ -36,7 +36,11 @@ def shown_furthest(flight: Flight) -> tuple[Ticket, float]:
 @pytest.mark.parametrize("start", [-1.0, 1.5, UPPER + 0.5 * AWAY])
 def test_an_arm_inside_or_a_little_outside_passes(start: float) -> None:
     flight = standing(start)
+    before = motion_limits(flight.model.config)
     ticket, furthest = shown_furthest(flight)
+    # The limits that the description has stay what they are.
+    after = motion_limits(flight.model.config)
+    np.testing.assert_array_equal([after.lower, after.upper], [before.lower, before.upper])
     assert ticket.verdict is Verdict.PASSED, [check.reason for check in ticket.checks]
     assert ticket.subject.excitation == ""
     for code in ("motion_fits", "motion_proven"):
@@ -49,6 +53,16 @@ def test_an_arm_inside_or_a_little_outside_passes(start: float) -> None:
         assert furthest < start + 0.02
     else:
         assert furthest > start + 0.03
+    is_for_this_arm_only(ticket)
+
+
+def is_for_this_arm_only(ticket: Ticket) -> None:
+    subject, now = ticket.subject, ticket.created
+    assert ticket.valid_for(subject, now) == []
+    assert ticket.valid_for(replace(subject, excitation="identification", excitation_sha256="0" * 64), now) == [
+        "the motion has changed since"
+    ]
+    assert ticket.valid_for(replace(subject, model_sha256="0" * 64), now) != []
 
 
 def test_farther_outside_nothing_is_touched() -> None:
@@ -64,22 +78,3 @@ def test_for_a_motion_a_little_outside_is_outside() -> None:
     flight.motion = Flight().motion
     only_failure(flight.ticket(), "at_rest")
     assert flight.arm.torques == []
-
-
-def test_the_limits_that_the_description_has_stay_what_they_are() -> None:
-    flight = standing(UPPER + 0.5 * AWAY)
-    before = motion_limits(flight.model.config)
-    flight.ticket()
-    after = motion_limits(flight.model.config)
-    np.testing.assert_array_equal(after.upper, before.upper)
-
-
-def test_a_ticket_without_a_motion_is_for_this_arm_only() -> None:
-    ticket = standing(0.5).ticket()
-    subject = ticket.subject
-    now = ticket.created
-    assert ticket.valid_for(subject, now) == []
-    assert ticket.valid_for(replace(subject, excitation="identification", excitation_sha256="0" * 64), now) == [
-        "the motion has changed since"
-    ]
-    assert ticket.valid_for(replace(subject, model_sha256="0" * 64), now) != []

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 from pucks_bench import Host, pucks_config
 
+from ident_service.config.schema import ArmConfig
+
+
+@pytest.fixture(scope="session")
+def planar2(tmp_path_factory: pytest.TempPathFactory) -> ArmConfig:
+    """The arm of `pucks_config`, which nobody can change."""
+    return pucks_config(tmp_path_factory.mktemp("pucks"))
+
 
 @pytest.fixture
-def host(tmp_path: Path) -> Host:
+def host(planar2: ArmConfig) -> Host:
     """A host on the bus of planar2 behind a differential, nothing configured yet."""
-    return Host.on(pucks_config(tmp_path))
+    return Host.on(planar2)
 
 
 @pytest.fixture

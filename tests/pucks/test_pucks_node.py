@@ -165,7 +165,7 @@ frames = st.builds(
 
 
 @pytest.mark.slow
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(
     st.lists(
         frames | st.builds(Frame, st.sampled_from([0x601, 0x602, 0x201, 0x80]), st.binary(max_size=8)), max_size=20
@@ -181,7 +181,7 @@ def test_no_frame_breaks_a_node(enabled: Host, sent: list[Frame]) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(st.lists(frames, max_size=20))
 def test_no_frame_for_others_moves_a_motor(enabled: Host, sent: list[Frame]) -> None:
     enabled.cycle(70, -30)

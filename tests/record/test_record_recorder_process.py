@@ -310,8 +310,17 @@ def test_a_recording_that_nobody_wrote_ends(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_whoever_is_killed_something_readable_is_left(tmp_path: Path) -> None:
-    chance = random.Random(time.time_ns())  # noqa: S311
-    for k in range(24):
+    killed(tmp_path, 6, random.Random(1))  # noqa: S311
+
+
+@pytest.mark.campaign
+def test_whoever_of_many_is_killed_something_readable_is_left(tmp_path: Path) -> None:
+    killed(tmp_path, 60, random.Random(time.time_ns()))  # noqa: S311
+
+
+def killed(tmp_path: Path, rounds: int, chance: random.Random) -> None:
+    """Kill the motion, the recorder or both at some time."""
+    for k in range(rounds):
         path = tmp_path / str(k)
         lock_step = chance.choice([True, False])
         with actor("recording", path, 0.0 if lock_step else 1e-3, lock_step) as (motion, (pid,)), ending(pid):

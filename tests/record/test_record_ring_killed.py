@@ -61,7 +61,7 @@ def campaign(rounds: int, seed: int) -> None:
 
 @pytest.mark.slow
 def test_processes_killed_at_random() -> None:
-    campaign(6, 5)
+    campaign(2, 5)
 
 
 @pytest.mark.campaign

@@ -11,11 +11,10 @@ from sim_backend.arm import from_config
 WEIGHT = 2.0 * 9.81 * 0.4  # of the pendulum at zero [N m]
 
 
-@pytest.mark.slow
-def test_holds_exactly_for_a_minute_inside_the_cone():
+def test_holds_exactly_for_ten_seconds_inside_the_cone():
     plant = plant_of(pendulum(fc=1.0, fv=0.1, fo=0.2), position=np.array([0.0]))
     torque = np.array([WEIGHT + 0.2 + 0.99])
-    for _ in range(60_000):
+    for _ in range(10_000):
         plant.step(torque)
     assert plant.position[0] == 0.0
     assert plant.velocity[0] == 0.0

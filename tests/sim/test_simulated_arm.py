@@ -57,7 +57,7 @@ def test_another_seed_gives_another_motion():
 def test_noise_is_white_has_its_size_and_is_not_in_the_sample():
     truths = []
     arm = running(free_slider(torque_noise=0.3), observer=truths.append)
-    n = 20_000
+    n = 5_000
     samples = [arm.exchange(np.array([2.0])) for _ in range(n)]
     assert all(sample.torque[0] == 2.0 for sample in samples)
     acted = np.array([truth.acceleration[0] for truth in truths[1:]]) - 2.0
