@@ -149,7 +149,7 @@ _COARSE = "control: {rate: 250}\n"
 _GAINS = ("following_error: 0.2, home: 0, kp: 400, kd: 40", "following_error: 0.4, home: 0, kp: 225, kd: 30")
 
 
-def quick_text(name: str = "quick", periods: int = 2) -> str:
+def quick_text(name: str = "quick", periods: int = 4) -> str:
     """The shipped planar arm at 250 Hz with motions of periods of five seconds, under another name."""
     text = shipped_arms()["planar2"].read_text()
     changes = (
@@ -177,11 +177,17 @@ def checked_before(state: Path, text: str) -> None:
     write_checked_ticket(load_arm(path), state)
 
 
+# Each place that imports the fixture has a session of its own of it; the arm is commissioned once for all of them.
+_COMMISSIONED: list[Path] = []
+
+
 @pytest.fixture(scope="session")
 def commissioned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a whole job on the small arm `quick`; not to be changed."""
-    folder = tmp_path_factory.mktemp("commissioned")
-    path = folder / "quick.yaml"
-    path.write_text(quick_text())
-    simulate(load_arm(path), folder / "first-run")
-    return folder / "first-run"
+    if not _COMMISSIONED:
+        folder = tmp_path_factory.mktemp("commissioned")
+        path = folder / "quick.yaml"
+        path.write_text(quick_text())
+        simulate(load_arm(path), folder / "first-run")
+        _COMMISSIONED.append(folder / "first-run")
+    return _COMMISSIONED[0]
