@@ -221,7 +221,7 @@ def test_one_motion_at_a_time_and_a_lease_while_it_waits(state: Path) -> None:
             daemon.post("/api/v1/arms", {"description": quick_text(name)})
         db = daemon.service.db
         asked = [daemon.begin({"kind": "check", "arm": name}, confirmed=True)["id"] for name in (ARM, ARM, "other")]
-        # Of what the queue does, the registry tells more than somebody who looks now and then: when each began and ended.
+        # The registry tells when each began and ended, which somebody who looks now and then may miss.
         for job in asked[::-1]:
             while rows.known_job(db, job)["state"] in rows.LIVE:
                 for one in asked:

@@ -97,7 +97,7 @@ def test_no_request_makes_the_service_fail(daemon: Asked, monkeypatch: pytest.Mo
 
 
 @pytest.mark.slow
-@settings(max_examples=examples0, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
 @given(
     body=st.one_of(st.binary(max_size=300), st.text(max_size=300).map(lambda text: text.encode("utf-8", "replace"))),
     path=st.sampled_from(["/api/v1/jobs", "/api/v1/arms", "/api/v1/motions", "/api/v1/login"]),

@@ -9,7 +9,6 @@ from kill_bench import REAL, SLOW
 
 from ident_service.config.load import shipped_arms
 
-
 GAINS = "{kp: 225, kd: 30, following_error: 0.4}"
 # A quarter of the cycles of a real arm, with gains that are stable at this rate.
 COARSE = f"control: {{rate: 250}}\njoints: {{shoulder: {GAINS}, elbow: {GAINS}}}\n"
