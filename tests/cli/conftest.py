@@ -72,6 +72,13 @@ def left_over(folder: Path) -> list[str]:
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
 
 
+# A quarter of the cycles of a real arm, with gains that are stable at this rate.
+COARSE = (
+    ("gravity: [0", "control: {rate: 250}\ngravity: [0"),
+    ("following_error: 0.2, home: 0, kp: 400, kd: 40", "following_error: 0.4, home: 0, kp: 225, kd: 30"),
+)
+
+
 def quick_arm(folder: Path, *changes: tuple[str, str]) -> Path:
     """The shipped planar arm with motions of ten seconds, and other changes to its text."""
     text = shipped_arms()["planar2"].read_text()

@@ -39,6 +39,7 @@ def test_an_arm_whose_description_is_a_daemons_is_stopped_by_its_name(ident: Ide
     assert ident("stop", "../uploaded").code == 2
 
 
+@pytest.mark.slow
 def test_a_check_comes_after_the_faults(ident: Ident, state: Path) -> None:
     fault_file(state, "planar2").latch("lease_lost", "nobody was there")
     ended = ident("check", "planar2", "--confirm", "planar2")

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from cli.conftest import Ident, quick_arm
+from cli.conftest import COARSE, Ident, quick_arm
 
 from ident_service.motion.control_file import in_use
 from ident_service.service.arm_state import control_path
@@ -37,7 +37,7 @@ def piped(state: Path, said: bytes | None, *words: object) -> tuple[int, dict[st
 
 
 def test_a_preflight_and_a_run_end_with_their_input(state: Path, tmp_path: Path) -> None:
-    arm = quick_arm(tmp_path)
+    arm = quick_arm(tmp_path, *COARSE)
     # Somebody who says stop first has no torque sent at all.
     code, document = piped(state, b"stop\n", "check", arm, "--confirm", "planar2", "--lease-from-stdin")
     assert code == 3

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
-from cli.conftest import Ident, left_over, quick_arm
+from cli.conftest import Ident, left_over, quick_arm, run_main
 
 QUICK = ("--starts", 1, "--workers", 1)
 
@@ -75,13 +76,22 @@ def test_blanks_in_an_expression_do_not_matter(tmp_path: Path, ident: Ident) -> 
     assert ident("design", quick_arm(tmp_path), *QUICK, *words).json["criterion"] == "a_optimal"
 
 
+@pytest.fixture(scope="module")
+def designed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """A motion of the small arm, as its file says it."""
+    folder = tmp_path_factory.mktemp("designed")
+    assert run_main("design", quick_arm(folder), *QUICK, "--out", folder / "m") == 0
+    return dict(json.loads((folder / "m" / "motion.json").read_text()))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("key", "value"), [("a", 1e300), ("base_frequency", 1e12), ("q0", -1e7)])
-def test_numbers_that_no_arm_can_mean_are_refused(key: str, value: float, tmp_path: Path, ident: Ident) -> None:
-    assert ident("design", quick_arm(tmp_path), *QUICK, "--out", tmp_path / "m").code == 0
-    motion = json.loads((tmp_path / "m" / "motion.json").read_text())
+def test_numbers_that_no_arm_can_mean_are_refused(
+    key: str, value: float, designed: dict[str, Any], tmp_path: Path, ident: Ident
+) -> None:
+    motion = dict(designed)
     motion[key] = value if key == "base_frequency" else [[value] * 5] * 2 if key == "a" else [value] * 2
     (tmp_path / "huge.json").write_text(json.dumps(motion))
-    ended = ident("preview", tmp_path / "quick.yaml", tmp_path / "huge.json")
+    ended = ident("preview", quick_arm(tmp_path), tmp_path / "huge.json")
     assert ended.code == 2
     assert key in ended.err

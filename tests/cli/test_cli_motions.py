@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cli.conftest import Commissioned, Ended, Ident, left_over, quick_arm, run_main
+from cli.conftest import COARSE, Commissioned, Ended, Ident, left_over, quick_arm, run_main
 
 pytestmark = pytest.mark.slow  # designs and whole jobs
 
 FILES = ["arm.svg", "joints.svg", "motion.json", "preview.json", "preview.txt", "search.json"]
-QUICK = ("--starts", 2, "--workers", 1, "--base-frequency", 0.2, "--periods", 2, "--ramp", 1)
+QUICK = ("--starts", 1, "--workers", 1, "--base-frequency", 0.2, "--periods", 2, "--ramp", 1)
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class DesignedBefore:
 @pytest.fixture(scope="module")
 def designed(tmp_path_factory: pytest.TempPathFactory) -> DesignedBefore:
     folder = tmp_path_factory.mktemp("designed")
-    arm = quick_arm(folder)
+    arm = quick_arm(folder, *COARSE)
     assert run_main("design", arm, *QUICK, "--out", folder / "motion") == 0
     return DesignedBefore(arm, folder / "motion")
 
@@ -82,7 +82,7 @@ def test_design_goes_on_from_an_earlier_search(designed: DesignedBefore, tmp_pat
         "--json",
     )
     assert ended.code == 0
-    assert ended.json["starts"] == 4
+    assert ended.json["starts"] == 2
     before = read(designed.folder / "motion.json")["made"]["criterion_value"]
     assert ended.json["criterion_value"] <= before + 1e-3  # a proof may cost the better candidate a little
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli.conftest import Commissioned, Ended, Ident, Samples, left_over, quick_arm
+from cli.conftest import COARSE, Commissioned, Ended, Ident, Samples, left_over, quick_arm
 
 from ident_service.config.load import load_arm
 from ident_service.errors import ArmError
@@ -284,10 +284,10 @@ def test_a_fault_stops_the_arm(place: Path, ident: Ident) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("cycles", "motion"), [(100, "identification"), (9000, "identification"), (18000, "validation")]
+    ("cycles", "motion"), [(100, "identification"), (2250, "identification"), (4500, "validation")]
 )
 def test_a_stop_on_request_is_no_success_and_nothing_moves_again(place: Path, cycles: int, motion: str) -> None:
-    config = load_arm(quick_arm(place))
+    config = load_arm(quick_arm(place, *COARSE))
     before = left_over(place)
     asked = iter([False] * cycles)
     told: list[str] = []

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from daemon.conftest import patient_text, quick_text, serving
+from daemon.conftest import checked_before, patient_text, quick_text, serving
 from daemon.served import daemon_process
 
 from ident_service.errors import MotionRefused
@@ -40,7 +40,7 @@ def carried(client: Client, job: str, seconds: float) -> bool:
         if client.get(f"/api/v1/jobs/{job}")["state"] not in ("queued", "running"):
             return False
         _renewed(client, job)
-        time.sleep(0.1)
+        time.sleep(0.2)
     return True
 
 
@@ -70,11 +70,11 @@ def _renewed(client: Client, job: str) -> None:
 def kill_once(state: Path, seed: int) -> str:
     """One kill; what became of the job."""
     chance = random.Random(seed)  # noqa: S311 - a seeded choice
-    kind = chance.choice(KINDS)
+    kind, text = chance.choice(KINDS), quick_text(ARM, 8)  # a motion of some seconds of this machine's time
+    if kind == "run":
+        checked_before(state, text)
     with daemon_process(state) as (process, client):
-        client.post("/api/v1/arms", {"description": quick_text(ARM)})
-        if kind == "run":
-            checked(client)
+        client.post("/api/v1/arms", {"description": text})
         job, waiting = begin(client, kind), begin(client, "home")
         alive = carried(client, job, chance.uniform(0.0, 9.0))
         process.kill()
@@ -137,9 +137,9 @@ def test_thirty_kills(state: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_a_daemon_that_is_asked_to_end_stops_its_arm_first(state: Path) -> None:
+    checked_before(state, patient_text(ARM))
     with daemon_process(state) as (process, client):
         client.post("/api/v1/arms", {"description": patient_text(ARM)})
-        checked(client)
         job = begin(client, "run")
         excited(client, job)
         process.send_signal(signal.SIGTERM)

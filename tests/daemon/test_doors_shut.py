@@ -265,6 +265,7 @@ def test_a_motion_needs_the_typed_name_and_a_fresh_challenge(daemon: Asked, view
     assert daemon.get("/api/v1/jobs").json() == []
 
 
+@pytest.mark.slow
 def test_a_request_that_comes_twice_moves_the_arm_once(daemon: Asked) -> None:
     body = {"job": MOTION, "confirm": {"name": "planar2", "challenge": daemon.challenge("planar2")}}
     assert daemon.post("/api/v1/jobs", body).status_code == 201
@@ -302,6 +303,7 @@ def test_stop_needs_no_token_here_and_any_token_from_elsewhere(daemon: Asked, vi
     assert {line["who"] for line in trail(daemon.service.db) if line["what"] == "stop"} == {"looks", "anybody"}
 
 
+@pytest.mark.slow
 def test_only_whoever_asked_renews_a_lease(daemon: Asked) -> None:
     job = daemon.begin(MOTION, confirmed=True)
     daemon.as_token(add_token(daemon.service.db, "other", "operator", "test"))

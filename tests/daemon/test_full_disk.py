@@ -12,6 +12,7 @@ from daemon.conftest import Asked
 from ident_service.service.registry import jobs as rows
 
 
+@pytest.mark.slow
 def test_the_end_of_a_job_waits_for_room(daemon: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
     ended, full = rows.ended, [True]
 

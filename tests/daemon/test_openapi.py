@@ -56,13 +56,13 @@ def _operations(daemon: Asked) -> dict[str, Any]:
     return found
 
 
-def _statuses(daemon: Asked, operation: Any) -> set[int]:
+def _statuses(daemon: Asked, operation: Any, examples: int) -> set[int]:
     """Statuses of the answers to some requests that the description allows; each is one that it names."""
     allowed = {int(status) for status in operation.definition.raw["responses"] if status.isdigit()}
     seen = set()
 
     @settings(
-        max_examples=15,
+        max_examples=examples,
         deadline=None,
         database=None,
         derandomize=True,
@@ -84,12 +84,13 @@ def _statuses(daemon: Asked, operation: Any) -> set[int]:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_no_request_makes_the_service_fail(daemon: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("examples", [4, pytest.param(40, marks=pytest.mark.campaign)])
+def test_no_request_makes_the_service_fail(daemon: Asked, monkeypatch: pytest.MonkeyPatch, examples: int) -> None:
     # What is asked for is taken and queued; that the queue runs it is another test's.
     monkeypatch.setattr(daemon.service.engine, "_look", lambda: None)
     operations = _operations(daemon)
     assert len(operations) > 25
-    statuses = {name: _statuses(daemon, operation) for name, operation in operations.items()}
+    statuses = {name: _statuses(daemon, operation, examples) for name, operation in operations.items()}
     assert all(max(found) < 500 for found in statuses.values()), statuses
     # It was not refused all of the time.
     assert sum(min(found) < 300 for found in statuses.values()) >= 10, statuses

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 from cli.hands import Hands
-from daemon.conftest import quick_text
+from daemon.conftest import checked_before, patient_text, quick_text
 from daemon.served import daemon_process
 from daemon.verbs_bench import ON_A_BUS, on_a_bus, unstable_text
 
@@ -246,9 +246,13 @@ def test_a_rehearsal_elsewhere_ends_with_the_key_here(
 ) -> None:
     monkeypatch.setattr("ident_service.cli.moving.RELEASED", 2.0)  # a busy machine is no hand that lets go
     master, slave = pty.openpty()
+    texts = {"patient": patient_text("patient"), "short": quick_text("short", 1)}
+    for text in texts.values():
+        checked_before(state, text)
     with served(state, commissioned) as (client, server):
-        assert main(["check", "quick", "--confirm", "quick", *server]) == 0
-        rehearse = ["rehearse", "quick", "--confirm", "quick", *server]
+        for text in texts.values():
+            client.post("/api/v1/arms", {"description": text})
+        rehearse = ["rehearse", "patient", "--confirm", "patient", *server]
         assert main([*rehearse, "--json"]) == 2  # a program holds no key
         assert "no terminal" in capsys.readouterr().err
         before = termios.tcgetattr(slave)
@@ -267,10 +271,10 @@ def test_a_rehearsal_elsewhere_ends_with_the_key_here(
         assert (job["kind"], job["state"]) == ("rehearse", "cancelled"), (job, said)
         assert "cancelled by owner" in job["detail"]
         assert client.get(f"/api/v1/runs/{job['run']}")["ending"] == "stopped"
-        assert client.get("/api/v1/arms/quick")["faults"] == []
+        assert client.get("/api/v1/arms/patient")["faults"] == []
         assert termios.tcgetattr(slave) == before
         # Without a key it goes to its end, its lease renewed by the command.
-        assert main([*rehearse, "--no-key"]) == 0
+        assert main(["rehearse", "short", "--confirm", "short", "--no-key", *server]) == 0
         assert client.get("/api/v1/jobs?most=1")[0]["state"] == "done"
     os.close(master)
     os.close(slave)

@@ -33,9 +33,11 @@ class Clock:
         self.at += seconds
 
 
-def description(*, unattended: str | None = None, seed: int = 1, drier: float = 1.0, name: str = ARM) -> str:
-    """The small arm; `drier` multiplies the elbow's friction in the plant."""
-    text = quick_text(name)
+def description(
+    *, unattended: str | None = None, seed: int = 1, drier: float = 1.0, name: str = ARM, periods: int = 4
+) -> str:
+    """The small arm; `drier` multiplies the elbow's friction in the plant, a motion has `periods` of five seconds."""
+    text = quick_text(name, periods)
     changes = {
         "seed: 1\n  truth": f"seed: {seed}\n  truth",
         "fv2: 0.2, fc2: 0.3": f"fv2: {0.2 * drier!r}, fc2: {0.3 * drier!r}",

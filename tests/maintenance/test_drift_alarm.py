@@ -53,7 +53,7 @@ def test_a_drier_joint_raises_an_alarm_that_stands_until_a_person_acts(
     assert {one["id"] for one in db.rows("SELECT id FROM runs")} >= {row["run"], row["recorded"]}
     driven = db.row("SELECT seconds FROM runs WHERE id = ?", row["recorded"])
     assert driven is not None
-    assert 10.0 < driven["seconds"] < 30.0  # the motion of ten seconds, and the ways there and back
+    assert 20.0 < driven["seconds"] < 40.0  # the motion of twenty seconds, and the ways there and back
 
     assert main(["alarm", "list", "--state", str(state)]) == 3
     assert main(["alarm", "ack", "1", "--note", "seal ordered", "--by", "bob", "--state", str(state)]) == 0

@@ -34,7 +34,7 @@ def followed(daemon: Asked, name: str, *, lease: bool) -> dict[str, Any]:
     while (seen := dict(daemon.get(f"/api/v1/reidentifications/{name}").json()))["state"] == "running":
         if lease:
             assert daemon.post(f"/api/v1/reidentifications/{name}/lease").status_code == 200
-        time.sleep(0.1)
+        time.sleep(0.3)
     return seen
 
 
@@ -160,7 +160,7 @@ def test_a_kill_in_the_midst_is_told_and_nothing_moves_by_itself(accepted: str, 
         while not (row["step"] == step and client.get(f"/api/v1/jobs/{row['job']}")["state"] == "running"):
             assert row["state"] == "running", row
             client.post(f"{path}/{row['id']}/lease")
-            time.sleep(0.02)
+            time.sleep(0.1)
             row = client.get(f"{path}/{row['id']}")
         process.kill()
         process.wait()

@@ -12,16 +12,29 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
+from daemon.conftest import checked_before, patient_text, quick_text
 from page.conftest import Reached, log_in
 from playwright.sync_api import Browser, Page, expect
 
 from ident_service.motion.control_file import in_use
 from ident_service.service.arm_state import control_path
 from ident_service.service.registry import jobs as rows
+from ident_service.service.registry.arms import add_arm
 from ident_service.service.registry.tokens import add_token
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
-ARM = "planar2"
+ARM = "quick"
+
+
+def known(reached: Reached, text: str) -> None:
+    """The service knows the arm of this description."""
+    add_arm(reached.service.db, reached.service.state, text, {}, "test")
+
+
+def ready(reached: Reached) -> None:
+    """The service knows an arm that may be moved, whose motion outlasts what is done meanwhile."""
+    known(reached, patient_text(ARM))
+    checked_before(reached.service.state, patient_text(ARM))
 
 
 def arm_page(page: Page, reached: Reached) -> None:
@@ -58,6 +71,7 @@ def current_step(page: Page, reached: Reached) -> str:
 
 
 def test_from_the_first_page_to_the_urdf_and_back(browser: Browser, reached: Reached, state: Path) -> None:
+    known(reached, quick_text(ARM, 8))  # its motion takes some seconds of this machine's time
     page = log_in(browser, reached)
     problems = list[str]()
     page.on("pageerror", lambda error: problems.append(str(error)))
@@ -74,7 +88,7 @@ def test_from_the_first_page_to_the_urdf_and_back(browser: Browser, reached: Rea
     seen = set()
     while page.locator("#live").count() and len(seen) < 4:
         seen.add(page.locator("#values").inner_text())
-        page.wait_for_timeout(400)
+        page.wait_for_timeout(100)
     assert len(seen) >= 4  # values that move
     drawn = page.evaluate(
         "() => { const c = document.getElementById('plot-position');"
@@ -139,8 +153,6 @@ def accept(page: Page, note: str) -> None:
 
 def moving(page: Page, reached: Reached, state: Path) -> None:
     """A run on its way."""
-    begin(page, reached, "Check")
-    assert ended(page) == "done"
     begin(page, reached, "Run")
     page.get_by_role("heading", name="The arm now").wait_for()
     assert in_use(control_path(state, ARM))
@@ -148,6 +160,7 @@ def moving(page: Page, reached: Reached, state: Path) -> None:
 
 @pytest.mark.parametrize("how", ["escape", "button", "without scripts", "leaving"])
 def test_a_stop_in_the_middle(browser: Browser, reached: Reached, state: Path, how: str) -> None:
+    ready(reached)
     page = log_in(browser, reached)
     moving(page, reached, state)
     if how == "escape":
@@ -178,9 +191,8 @@ def test_a_stop_in_the_middle(browser: Browser, reached: Reached, state: Path, h
 
 
 def test_a_run_is_finished_by_keyboard_and_its_target_is_shown(browser: Browser, reached: Reached, state: Path) -> None:
+    ready(reached)
     page = log_in(browser, reached)
-    begin(page, reached, "Check")
-    assert ended(page) == "done"
     arm_page(page, reached)
     page.get_by_label("End early, once every deviation").fill("0.001")
     begin_from_here(page, "Run")
@@ -195,9 +207,8 @@ def test_a_run_is_finished_by_keyboard_and_its_target_is_shown(browser: Browser,
 
 
 def test_a_rehearsal_moves_while_a_key_is_held(browser: Browser, reached: Reached, state: Path) -> None:
+    ready(reached)
     page = log_in(browser, reached)
-    begin(page, reached, "Check")
-    assert ended(page) == "done"
     arm_page(page, reached)
     page.get_by_role("button", name="Rehearse", exact=True).click()
     page.get_by_label("Type the arm's name").fill(ARM)
@@ -215,6 +226,7 @@ def test_a_rehearsal_moves_while_a_key_is_held(browser: Browser, reached: Reache
 
 
 def test_a_rehearsal_with_another_name_moves_nothing(browser: Browser, reached: Reached) -> None:
+    ready(reached)
     page = log_in(browser, reached)
     arm_page(page, reached)
     page.get_by_role("button", name="Rehearse", exact=True).click()
@@ -230,6 +242,7 @@ def test_a_rehearsal_with_another_name_moves_nothing(browser: Browser, reached: 
 def test_nothing_is_wider_than_the_window_and_stop_is_in_it(
     browser: Browser, reached: Reached, width: int, scheme: str
 ) -> None:
+    known(reached, quick_text(ARM))
     page = log_in(browser, reached)
     page.set_viewport_size({"width": width, "height": 800})
     page.emulate_media(color_scheme="dark" if scheme == "dark" else "light")

@@ -41,9 +41,10 @@ def arm_page(page: Page, reached: Reached) -> None:
     page.get_by_role("heading", name=ARM, level=1).wait_for()
 
 
-def plant(reached: Reached, seed: int, drier: float = 1.0) -> None:
+def plant(reached: Reached, seed: int, drier: float = 1.0, periods: int = 4) -> None:
     """From now on the simulated arm is this one."""
-    add_arm(reached.service.db, reached.service.state, description(seed=seed, drier=drier), {}, "test")
+    text = description(seed=seed, drier=drier, periods=periods)
+    add_arm(reached.service.db, reached.service.state, text, {}, "test")
 
 
 def make_due(page: Page, reached: Reached) -> None:
@@ -79,7 +80,7 @@ def verdict(page: Page) -> str:
 def test_what_is_due_is_seen_and_done(browser: Browser, reached: Reached) -> None:
     page, problems = log_in(browser, reached), list[str]()
     page.on("pageerror", lambda error: problems.append(str(error)))
-    plant(reached, 41)
+    plant(reached, 41, periods=8)  # some seconds of this machine's time, in which its motion is seen
     make_due(page, reached)
     page.goto(reached.url)
     expect(page.locator("section", has=page.get_by_role("heading", name="Due"))).to_contain_text(
@@ -155,12 +156,13 @@ def test_a_drier_joint_raises_an_alarm_that_a_person_acknowledges(browser: Brows
 
 def test_leaving_its_page_stops_the_arm_and_ends_it(browser: Browser, reached: Reached) -> None:
     page = log_in(browser, reached)
+    plant(reached, 43, periods=240)  # its motion outlasts what is done meanwhile
     arm_page(page, reached)
     begin(page)
     page.locator("#step-run.busy").wait_for()
     page.get_by_role("heading", name="The arm now").wait_for()
     page.goto(f"{reached.url}/audit")
-    reached.service.engine._factor = 0.1  # of two seconds; the simulated arm is done soon
+    reached.service.engine._factor = 0.1  # of two seconds
     db = reached.service.db
     until = 600
     while (row := reidentifications(db)[0])["state"] == "running" and (until := until - 1):

@@ -13,11 +13,10 @@ from urllib.parse import urlencode
 
 import pytest
 from daemon.conftest import URL, Asked, quick_text, serving
+from daemon.conftest import commissioned as commissioned
 from fastapi.routing import APIRoute
 
-from ident_service.config.load import load_arm
 from ident_service.service.arm_state import arm_folder, fault_file
-from ident_service.service.commission import simulate
 from ident_service.service.import_run import import_run
 from ident_service.service.maintenance.alarms import alarms
 from ident_service.service.maintenance.reidentification import enter_concluded
@@ -32,15 +31,6 @@ ARM = "quick"
 EVIL = "<script>alert('x')</script>\"'&"
 FORM = {"Content-Type": "application/x-www-form-urlencoded", "Origin": URL}
 VOID = {"meta", "link", "input", "br", "hr", "img"}
-
-
-@pytest.fixture(scope="session")
-def commissioned(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a whole job on a small arm."""
-    folder = tmp_path_factory.mktemp("commissioned")
-    (folder / "quick.yaml").write_text(quick_text(ARM))
-    simulate(load_arm(folder / "quick.yaml"), folder / "first-run")
-    return folder / "first-run"
 
 
 @pytest.fixture

@@ -9,6 +9,18 @@ from kill_bench import REAL, SLOW
 
 from ident_service.config.load import shipped_arms
 
+GAINS = "{kp: 225, kd: 30, following_error: 0.4}"
+# A quarter of the cycles of a real arm, with gains that are stable at this rate.
+COARSE = f"control: {{rate: 250}}\njoints: {{shoulder: {GAINS}, elbow: {GAINS}}}\n"
+
+
+def written(path: Path, motion: str) -> Path:
+    """The planar arm in virtual time with one motion for all."""
+    path.write_text(
+        f"extends: {shipped_arms()['planar2']}\n{COARSE}motions: {{identification: {motion}, validation: {motion}}}\n"
+    )
+    return path
+
 
 @pytest.fixture
 def real_arm(tmp_path: Path) -> Path:
@@ -21,10 +33,5 @@ def real_arm(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def virtual_arm(tmp_path: Path) -> Path:
-    """The same in virtual time, with motions of ten seconds."""
-    path = tmp_path / "virtual.yaml"
-    motion = "{kind: seeded, seed: 1, base_frequency: 0.2, harmonics: 5, periods: 2}"
-    path.write_text(
-        f"extends: {shipped_arms()['planar2']}\nmotions: {{identification: {motion}, validation: {motion}}}\n"
-    )
-    return path
+    """The same in virtual time at 250 Hz, with motions of ten seconds."""
+    return written(tmp_path / "virtual.yaml", "{kind: seeded, seed: 1, base_frequency: 0.2, harmonics: 5, periods: 2}")

@@ -13,10 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers.tickets import write_checked_ticket
 from kill_bench import TAG, VICTIMS, tagged
+from runs.conftest import written
 
 from ident_service.cli import main
-from ident_service.config.load import load_arm, shipped_arms
+from ident_service.config.load import load_arm
 from ident_service.errors import ArmError, ArmFault, MotionRefused
 from ident_service.service.arm_state import fault_file, ticket_path
 from ident_service.service.watching import Ending
@@ -30,20 +32,14 @@ pytestmark = pytest.mark.usefixtures("hangups_are_heard")
 @pytest.fixture
 def arm(tmp_path: Path) -> Path:
     """The planar arm in virtual time with short motions."""
-    path = tmp_path / "arm.yaml"
-    motion = "{kind: seeded, seed: 1, base_frequency: 0.4, harmonics: 2, periods: 1}"
-    path.write_text(
-        f"extends: {shipped_arms()['planar2']}\nmotions: {{identification: {motion}, validation: {motion}}}\n"
-    )
-    return path
+    return written(tmp_path / "arm.yaml", "{kind: seeded, seed: 1, base_frequency: 0.4, harmonics: 2, periods: 1}")
 
 
 @pytest.fixture
 def words(arm: Path, tmp_path: Path) -> list[str]:
     """Of a run of the arm, which has been checked."""
-    state = ["--state", str(tmp_path / "state")]
-    assert main(["check", str(arm), "--confirm", "planar2", *state]) == 0
-    return ["run", str(arm), "--out", str(tmp_path / "run"), *state]
+    write_checked_ticket(load_arm(arm), tmp_path / "state")
+    return ["run", str(arm), "--out", str(tmp_path / "run"), "--state", str(tmp_path / "state")]
 
 
 def when(monkeypatch: pytest.MonkeyPatch, then: dict[str, Callable[[], None]]) -> list[str]:

@@ -1,0 +1,37 @@
+"""Tickets for tests of what comes after a preflight: each arm is checked once in a test process."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+from ident_service.config.schema import ArmConfig
+from ident_service.excitation.plan import excitation
+from ident_service.model.arm_model import arm_model
+from ident_service.motion.factory import make_arm
+from ident_service.motion.preflight.check import Verdict
+from ident_service.motion.preflight.preflight import preflight
+from ident_service.motion.preflight.ticket import VALID, Ticket
+from ident_service.service.arm_state import ticket_path
+from ident_service.service.preflight import write_ticket
+
+_MADE: dict[str, Ticket] = {}
+
+
+def write_checked_ticket(config: ArmConfig, state: Path) -> None:
+    """Write the ticket that `ident check` writes for the identification motion of an arm in virtual time.
+
+    Args:
+        config: of an arm without a plant that outlives it, so that one preflight speaks for all tests.
+        state: folder of the state, made where it is missing.
+    """
+    ticket = _MADE.get(config.sha256)
+    if ticket is None or ticket.expires - datetime.now(UTC) < VALID / 2:
+        model = arm_model(config)
+        motion = excitation(model, "identification")
+        ticket = preflight(make_arm(config), model, motion, confirm=lambda _: config.name)
+        assert ticket.verdict is Verdict.PASSED, ticket
+        _MADE[config.sha256] = ticket
+    path = ticket_path(state, config.name)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_ticket(path, ticket)
