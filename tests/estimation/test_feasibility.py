@@ -164,6 +164,8 @@ def test_results_are_members_and_consistent(kind: FeasibleSetName) -> None:
         for result in (corrected, constrained):
             np.testing.assert_allclose(base.K @ result.delta, result.beta, rtol=0, atol=1e-9)
             assert result.margin == pytest.approx(EPSILON, abs=1e-7)
+            # The most central body may give up half of the paper's margin, and no more.
+            assert 0.5 * EPSILON < result.centred(base, conditions).margin < 1.1 * EPSILON
             assert feasibility_test(result.beta, base, conditions).margin > 0.0
             assert result.tight
         # Each is the best of all members by its own measure.

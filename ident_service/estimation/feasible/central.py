@@ -6,8 +6,8 @@ its path, so on rounding and on the processor. The answer here does not: it mini
     f(delta) = sum_blocks -logdet(D_b(delta) - t 1) + sum_links tr(S_b^-1 D_b(delta))
     over all delta with K delta = beta and E delta + e = 0
 
-with S_b the reference scales of `blocks.py`, and t nine tenths of the paper's margin (eq. 21), so that where data press
-against the set only the last tenth is given up. The first sum is the barrier whose minimiser is the analytic
+with S_b the reference scales of `blocks.py`, and t half of the paper's margin (eq. 21), so that where data press
+against the set no more than the other half is given up. The first sum is the barrier whose minimiser is the analytic
 centre (Boyd and Vandenberghe, *Convex Optimization*, 8.5.3); with the second, f is per link the entropic divergence
 from the reference body of 1 kg and 0.1 m (Lee, Wensing and Park 2020), so that nothing is drawn to infinity where
 nothing bounds a mass. f is strictly convex and self-concordant; Newton's method finds its minimiser to the last digits.
@@ -33,7 +33,7 @@ _CONVERGED = 1e-10  # Newton's decrement: the distance from the minimiser in the
 _QUADRATIC = 1e-2  # decrement from which Newton's method at least halves it with every step, unless rounding forbids
 _STEP = 0.99  # of the way to the boundary, at most
 _LONGEST = 10.0  # Newton's steps at a time
-_KEPT = 0.9  # share of the margin, at most the paper's, that is left where data press against the set
+_KEPT = 0.5  # share of the margin, at most the paper's, that is left where data press against the set
 
 
 @dataclass(frozen=True)
