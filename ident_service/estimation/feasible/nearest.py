@@ -24,7 +24,8 @@ from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 
 _AT_TARGET = 1e-8  # of the target's size: a distance that is none
-_SHARPNESS = 8.0  # per unit of distance over the largest column: a gap of 1e-9 is one of about 1e-10 there
+_SHARPNESS = 1e-2  # a gap of 1e-9 in the solver is at most one of 1e-7 in the distance
+_LEAST_SHARPNESS = 8.0  # and one of about 1e-10 of the largest column
 
 
 @dataclass(frozen=True)
@@ -147,7 +148,7 @@ def nearest(
     problem.second_order(distance, np.concatenate([[0.0], -target / scale]))
     to_delta = np.column_stack([lift.of_beta * columns, lift.of_dependent, np.zeros(len(base.names))])
     hold(problem, conditions, to_delta)
-    objective = np.append(np.zeros(variables - 1), _SHARPNESS)
+    objective = np.append(np.zeros(variables - 1), max(_LEAST_SHARPNESS, _SHARPNESS * scale))
     size = float(np.max(np.abs(beta), initial=0.0))
     delta, solution = solve_inside(problem, objective, name, to_delta, conditions, size)
     found = columns * solution.x[:n] if not conditions.equalities else base.K @ delta
