@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import subprocess
@@ -19,7 +20,10 @@ def fork() -> int:
     with warnings.catch_warnings():
         # Python 3.12 warns of the threads of a test runner; no child here takes their locks.
         warnings.simplefilter("ignore", DeprecationWarning)
-        return os.fork()
+        child = os.fork()
+    if child == 0:
+        gc.freeze()  # what the parent has made is not looked through again, nor copied for that
+    return child
 
 
 class ForkedPlant:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import signal
 import subprocess
 import time
 
@@ -19,8 +20,9 @@ def campaign(rounds: int, seed: int) -> None:
     """A writer and two readers in processes of their own; the writer is killed, sometimes a reader too."""
     chance = random.Random(seed)  # noqa: S311
     returned = lost = 0
-    for _ in range(rounds):
-        fd = create_ring(3, chance.choice([4, 64, 4096]))
+    for number_of_round in range(rounds):
+        capacity = (4096, 64, 4)[number_of_round % 3]
+        fd = create_ring(3, capacity)
         number = inode(fd)
         plan = [("writer", chance.choice([0, 0, 1e-4]))]
         plan += [("reader", chance.choice([0, 0, 0.003])), ("reader", 0.02)]
@@ -30,8 +32,10 @@ def campaign(rounds: int, seed: int) -> None:
         ]
         try:
             with RingReader(fd) as watch:
-                while not watch.memory.words[ring_memory.WRITTEN]:
-                    time.sleep(0.001)
+                written(watch, 1000)  # of which a reader of the largest ring finds all or most, however late it comes
+                processes[2].send_signal(signal.SIGSTOP)
+                written(watch, watch.memory.words[ring_memory.WRITTEN] + 2 * capacity)
+                processes[2].send_signal(signal.SIGCONT)
                 time.sleep(chance.uniform(0.0, 0.25))
                 victim = chance.choice([None, None, processes[1]])
                 if victim is not None:
@@ -59,9 +63,15 @@ def campaign(rounds: int, seed: int) -> None:
     assert lost > 0
 
 
+def written(watch: RingReader, count: int) -> None:
+    """Wait until so many records have been written."""
+    while watch.memory.words[ring_memory.WRITTEN] < count:
+        time.sleep(0.001)
+
+
 @pytest.mark.slow
 def test_processes_killed_at_random() -> None:
-    campaign(2, 5)
+    campaign(3, 5)
 
 
 @pytest.mark.campaign
