@@ -18,7 +18,7 @@ import pytest
 from cli.hands import Hands
 from daemon.conftest import checked_before, patient_text, quick_text
 from daemon.served import daemon_process
-from daemon.verbs_bench import ON_A_BUS, on_a_bus, unstable_text
+from daemon.verbs_bench import ON_A_BUS, on_a_bus, singular_copy, unstable_text
 
 from ident_service.cli import main, parser
 from ident_service.cli.remote import LOCAL_ONLY, table
@@ -28,6 +28,7 @@ from ident_service.errors import ArmError
 from ident_service.service.client import Client
 
 RUN = "20260101T000000Z-quick"
+SINGULAR = "20260103T000000Z-quick"
 
 
 def verbs() -> dict[str, Parser]:
@@ -143,14 +144,15 @@ def test_a_daemon_does_not_choose_where_files_go_here(tmp_path: Path) -> None:
 
 @contextmanager
 def served(state: Path, commissioned: Path) -> Iterator[tuple[Client, list[str]]]:
-    """A daemon with two arms and two runs; the words that lead to it."""
+    """A daemon with two arms and three runs; the words that lead to it."""
     for run in (RUN, RUN.replace("0101", "0102")):
         shutil.copytree(commissioned, state / "runs" / run)
+    singular_copy(commissioned, state / "runs" / SINGULAR)
     with daemon_process(state) as (_, client):
         for body in ({"description": quick_text()}, on_a_bus()):
             client.post("/api/v1/arms", body)
         until = time.monotonic() + 30.0
-        while len(client.get("/api/v1/runs")) < 2:
+        while len(client.get("/api/v1/runs")) < 3:
             assert time.monotonic() < until
             time.sleep(0.05)
         yield client, ["--server", client._url, "--state", str(state)]
@@ -185,7 +187,7 @@ def test_verbs_are_done_by_a_daemon(
 
         assert done("verify", RUN)["answer"]["verdict"] == "feasible"
         assert done("feasible", RUN, "--arm", "quick")["answer"]["feasible"] is True
-        singular = done("correct", RUN, "--metric", "covariance", "--out", tmp_path / "none.json", code=1)
+        singular = done("correct", SINGULAR, "--metric", "covariance", "--out", tmp_path / "none.json", code=1)
         assert "singular" in singular["job"]["detail"]  # the metric was told
         assert not (tmp_path / "none.json").exists()
         done("correct", RUN, "--feasible-set", "inertia", "--out", tmp_path / "near.json")

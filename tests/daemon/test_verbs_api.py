@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from daemon.conftest import Asked, quick_text, serving
 from daemon.test_doors_shut import refusal
-from daemon.verbs_bench import ON_A_BUS, answered, on_a_bus, unstable_text, with_arms, with_run
+from daemon.verbs_bench import ON_A_BUS, answered, on_a_bus, singular_copy, unstable_text, with_arms, with_run
 
 from ident_service.service.acceptance import accept
 from ident_service.service.api.doors import MOST_UPLOAD
@@ -44,8 +44,10 @@ def test_what_is_made_of_a_run_is_listed_and_fetched(daemon: Asked, state: Path,
     corrected = json.loads(content.content)
     assert corrected["method"] == "correction"
     assert corrected["base_parameters"]["values"] == said["values"]
-    ended, _ = answered(daemon, {"kind": "correct", "run": run, "metric": "covariance"})
-    assert ended["state"] == "failed"  # the covariance of this run is singular
+    singular = with_run(daemon, state, singular_copy(commissioned, state.parent / "20260103T000000Z-quick"))
+    ended, _ = answered(daemon, {"kind": "correct", "run": singular, "metric": "covariance"})
+    assert ended["state"] == "failed"
+    assert "singular" in ended["detail"]
     assert [path.name for path in (state / "exports").iterdir()] == [export["id"]]
 
     ended, said = answered(daemon, {"kind": "figures", "run": run})

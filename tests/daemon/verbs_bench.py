@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from daemon.conftest import Asked, quick_text
 
 from ident_service.config.load import shipped_arms
+from ident_service.results.manifest import write_manifest
 from ident_service.service.import_run import import_run
 
 ON_A_BUS = "relative"
@@ -53,6 +56,20 @@ def with_arms(daemon: Asked) -> None:
 def with_run(daemon: Asked, state: Path, commissioned: Path) -> str:
     """The whole job on `quick` is a run of this daemon."""
     return str(import_run(daemon.service.db, state, commissioned, "test")["id"])
+
+
+def singular_copy(commissioned: Path, folder: Path) -> Path:
+    """A copy of a run whose first two base parameters err together, so that their covariance has no inverse."""
+    shutil.copytree(commissioned, folder)
+    path = folder / "parameters.json"
+    document = json.loads(path.read_text())
+    covariance = np.array(document["base_parameters"]["covariance"])
+    covariance[1] = covariance[0]
+    covariance[:, 1] = covariance[:, 0]
+    document["base_parameters"]["covariance"] = covariance.tolist()
+    path.write_text(json.dumps(document))
+    write_manifest(folder)
+    return folder
 
 
 def answered(daemon: Asked, job: dict[str, Any], *, confirmed: bool = False) -> tuple[dict[str, Any], dict[str, Any]]:

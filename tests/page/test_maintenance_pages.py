@@ -134,6 +134,7 @@ def test_the_ladder_says_re_identify_when_something_asks_for_it(daemon: Asked) -
     assert sent(daemon, "/arms/planar2/reidentify/confirm")[0] == 400
 
 
+@pytest.mark.slow
 def test_a_re_identification_needs_the_typed_name_and_a_fresh_page(daemon: Asked) -> None:
     enter(daemon, "operator")
     db = daemon.service.db

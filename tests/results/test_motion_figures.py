@@ -155,6 +155,7 @@ def test_a_minute_of_noise_at_a_kilohertz_is_small() -> None:
 
 
 @given(seed=st.integers(0, 2**32 - 1), spike=st.integers(0, 19_999), height=st.floats(3.0, 50.0))
+@pytest.mark.slow
 def test_no_spike_is_lost(seed: int, spike: int, height: float) -> None:
     values = np.random.default_rng(seed).uniform(-1.0, 1.0, (20_000, 1))
     values[spike] = height
