@@ -1,8 +1,8 @@
 """What all feasibility problems share: delta from (beta, delta_d), blocks into cones, optima that lie too far out.
 
 Where nothing bounds the mass of a link that hardly shows in beta, an optimum may only be approached as masses grow
-beyond all limits, and where a solver stops on that way depends on rounding, so on the processor. Every estimate is
-therefore sought with each link's tr(P) = m + tr(Sigma) bounded by a reach that no robot has. A feasibility test asks
+beyond all limits, and where a solver stops on that way depends on rounding, so on the processor. Every estimate
+without a prior is therefore sought with each link's tr(P) = m + tr(Sigma) bounded by a reach that no robot has. A feasibility test asks
 whether any body exists; it is bounded only where it cannot be solved otherwise.
 """
 

@@ -26,7 +26,7 @@ from ident_service.estimation.feasible.blocks import reference, symmetric
 from ident_service.estimation.feasible.conic import ConicProblem, triangle_entries
 from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet, feasible_set
 from ident_service.estimation.feasible.nearest import FeasibleEstimate, hold, solve_inside
-from ident_service.estimation.feasible.posing import pressing
+from ident_service.estimation.feasible.posing import OF_TESTS, pressing
 from ident_service.estimation.least_squares import LeastSquares
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
@@ -163,9 +163,9 @@ def towards_prior(fit: LeastSquares, base: BaseParameters, conditions: FeasibleS
         objective += known * (trace @ to_delta)
         objective[start + 10 : start + 14] -= known
     size = float(np.max(np.abs(np.concatenate([fit.beta, prior.delta])), initial=0.0))
-    delta, solution = solve_inside(
-        problem, objective, "constrained least squares with a prior", to_delta, conditions, size, quadratic
-    )
+    name = "constrained least squares with a prior"
+    # The prior itself keeps masses from growing beyond all limits.
+    delta, solution = solve_inside(problem, objective, name, to_delta, conditions, size, quadratic, OF_TESTS)
     beta = base.K @ delta
     return FeasibleEstimate(
         beta=beta,
