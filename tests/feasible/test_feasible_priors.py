@@ -58,9 +58,9 @@ def test_no_weight_is_no_prior_and_a_small_one_is_nearly_none(kind: Kind) -> Non
     prior = Prior(kind, case.base.names, guess(case), 0.0)
     np.testing.assert_array_equal(constrained_least_squares(case.fit, case.base, conditions, prior).beta, without.beta)
     light = constrained_least_squares(case.fit, case.base, conditions, replace(prior, weight=1e-9))
-    assert light.objective == pytest.approx(without.objective, rel=1e-3)
-    # The bound on masses, which scales with the largest number of the problem, is not the same for both.
-    assert light.objective >= without.objective - 1e-4 * np.linalg.norm(case.fit.rho1)
+    # Without a prior links are no heavier than a bound that no robot has, which costs a little of the residual.
+    off = 1e-4 * np.linalg.norm(case.fit.rho1)
+    assert without.objective - off < light.objective < without.objective * (1 + 1e-3)
 
 
 @pytest.mark.parametrize("kind", KINDS)

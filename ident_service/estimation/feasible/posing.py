@@ -2,8 +2,8 @@
 
 Where nothing bounds the mass of a link that hardly shows in beta, an optimum may only be approached as masses grow
 beyond all limits, and where a solver stops on that way depends on rounding, so on the processor. Every estimate
-without a prior is therefore sought with each link's tr(P) = m + tr(Sigma) bounded by a reach that no robot has. A feasibility test asks
-whether any body exists; it is bounded only where it cannot be solved otherwise.
+without a prior is therefore sought with each link's tr(P) = m + tr(Sigma) bounded by a reach that no robot has. A
+feasibility test asks whether any body exists; it is bounded only where it cannot be solved otherwise.
 """
 
 from __future__ import annotations
