@@ -19,6 +19,7 @@ _Report = TypeVar("_Report", pytest.TestReport, pytest.CollectReport)
 _CI = os.environ.get("CI") == "true"
 # Small matrices on several BLAS threads are slow, and very slow on a busy machine; child processes inherit this.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.pop("PYTHONUNBUFFERED", None)  # it hides what a buffer does when the command ends
 threadpool_limits(limits=1, user_api="blas")
 _SHARED = Path(__file__).resolve().parents[2] / "shared"
 # The only reasons to skip with CI=true: what no package gives a machine, and what CI runs by a command of its own.

@@ -39,6 +39,7 @@ from ident_service.cli.answer import (
     USAGE,
     VERDICT_NO,
     Answer,
+    discard,
     hear_interrupts,
     print_answer,
     print_error,
@@ -104,6 +105,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print_answer(arguments, code, text, document)
     except OSError as error:
         print_to_person(f"ident: done, but the answer cannot be written: {error.strerror}\n")
+        discard(sys.stdout)
         return FAILED
     return code
 

@@ -69,10 +69,14 @@ def write(stream: TextIO | None, text: str) -> None:
     except OSError as error:
         if error.errno not in (errno.EPIPE, errno.EIO):
             raise
-        # What is left in the buffer would fail again when the interpreter ends, and change the exit code.
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, stream.fileno())
-        os.close(nowhere)
+        discard(stream)
+
+
+def discard(stream: TextIO) -> None:
+    """Lead a stream nowhere: what its buffer holds would fail again when the interpreter ends, with exit code 120."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
 
 
 def state_folder(arguments: argparse.Namespace) -> Path:

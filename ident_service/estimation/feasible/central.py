@@ -86,7 +86,8 @@ def central(delta: Array, base: BaseParameters, conditions: FeasibleSet) -> Arra
             wanted.append((np.eye(len(L)) - (L.T @ L if matrix.bounded else 0.0)).ravel())
             moves.append(move)
         J, r = np.vstack(rows), np.concatenate(wanted)
-        unit = 1.0 / np.linalg.norm(J, axis=0)
+        norms = np.linalg.norm(J, axis=0)
+        unit = np.divide(1.0, norms, out=np.zeros(len(norms)), where=norms > 0.0)  # 0: no condition feels the direction
         step = unit * scipy.linalg.lstsq(J * unit, r, lapack_driver="gelsy")[0]
         decrement = float(np.linalg.norm(J @ step))
         if decrement < _CONVERGED or (decrement < _QUADRATIC and decrement > 0.5 * before):

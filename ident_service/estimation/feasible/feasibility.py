@@ -15,7 +15,16 @@ from ident_service.estimation.feasible.consistency import ConditionsError
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.feasible.metric import whitening
 from ident_service.estimation.feasible.nearest import FeasibleEstimate, nearest
-from ident_service.estimation.feasible.posing import EPSILON, Lift, check, constrain, minimise, pressing
+from ident_service.estimation.feasible.posing import (
+    EPSILON,
+    OF_TABLES,
+    OF_TESTS,
+    Lift,
+    check,
+    constrain,
+    minimise,
+    pressing,
+)
 from ident_service.estimation.feasible.priors import Prior, towards_prior
 from ident_service.estimation.feasible.torque_scales import constrained_least_squares_with_scales
 from ident_service.estimation.least_squares import LeastSquares
@@ -153,7 +162,9 @@ def feasibility_correction(
     """
     check(beta, base, conditions)
     metric = np.eye(base.size) if covariance is None else whitening(covariance, base)
-    return nearest(metric, metric @ beta, beta, base, conditions, "feasibility correction")
+    # A bound on masses depends on the size of beta, so on the base columns, which this metric must not.
+    reaches = OF_TABLES if covariance is None else OF_TESTS
+    return nearest(metric, metric @ beta, beta, base, conditions, "feasibility correction", reaches)
 
 
 def constrained_least_squares(

@@ -123,7 +123,13 @@ def solve_inside(
 
 
 def nearest(
-    metric: Array, target: Array, beta: Array, base: BaseParameters, conditions: FeasibleSet, name: str
+    metric: Array,
+    target: Array,
+    beta: Array,
+    base: BaseParameters,
+    conditions: FeasibleSet,
+    name: str,
+    reaches: Sequence[float] = OF_ESTIMATES,
 ) -> FeasibleEstimate:
     """Minimise |metric b - target| over feasible b.
 
@@ -134,6 +140,7 @@ def nearest(
         base: grouping of the parameters.
         conditions: the set.
         name: of the problem, for errors.
+        reaches: bounds of links' masses to try, in turn, see `posing.py`.
 
     Raises:
         ConditionsError: no parameters at all fulfil the conditions.
@@ -158,7 +165,7 @@ def nearest(
     for weight in _WEIGHTS:
         objective = np.append(np.zeros(variables - 1), weight)
         try:
-            delta, solution = solve_inside(problem, objective, name, to_delta, conditions, size)
+            delta, solution = solve_inside(problem, objective, name, to_delta, conditions, size, reaches=reaches)
         except SolverError:
             if best is None:
                 raise

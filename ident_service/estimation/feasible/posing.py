@@ -22,6 +22,7 @@ EPSILON = 1e-6  # eq. 21, the paper's margin
 MULTIPLIER = 1e-6  # smaller ones are the interior-point method's own distance from the boundary
 # Bounds of tr(P) to try, in turn: kg and kg m^2, times the largest base parameter or bound if that is above 1.
 OF_TESTS = (np.inf, 1e4, 1e3, 1e2)
+OF_TABLES = (1e4, 1e3, 1e2)  # the nearest feasible table; the paper's table 1 takes masses of thousands of kg to print
 OF_ESTIMATES = (1e2, 1e3, 1e4)
 
 
