@@ -37,7 +37,7 @@ settings.load_profile("default")
 
 @pytest.fixture(scope="session", autouse=True)
 def interrupts_are_heard() -> Iterator[None]:
-    """A shell that starts the tests in its background tells them, and whatever they start, to ignore Ctrl-C."""
+    """Hear Ctrl-C, here and in child processes, although a shell that starts a background command ignores it."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -45,7 +45,7 @@ def interrupts_are_heard() -> Iterator[None]:
 
 @pytest.fixture
 def hangups_are_heard() -> Iterator[None]:
-    """Whoever runs the tests may have told them to ignore hangups, as `nohup` does."""
+    """Hear hangups although the tests were started with `nohup`, which ignores them."""
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
     signal.signal(signal.SIGHUP, before)

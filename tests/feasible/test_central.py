@@ -1,4 +1,4 @@
-"""Of all link parameters behind the same base parameters, the most central ones: unique, and inside the set."""
+"""Central link parameters are unique among those with the same base parameters, and inside the feasible set."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ def estimated(arm: str, recording: str | None) -> Estimate:
 
 
 def told(estimate: Estimate) -> dict[str, Any]:
-    """What a report prints of an estimate, and whether its certificate proves what it says."""
+    """Collect what a report prints of an estimate, and the result of checking its certificate."""
     assert estimate.delta is not None
     proof = certify(
         estimate.beta, estimate.base, estimate.conditions, estimate.delta, expressions=list(estimate.base.expressions)
