@@ -1,4 +1,4 @@
-"""What comes of faults that strike one run at many moments, each simulated from its fault on.
+"""Simulate faults that strike one run at many moments, each from its fault on.
 
 The run goes on healthy in this process. Before the exchange at which a fault strikes, a child process inherits the run
 as it stands (`fork`), goes on with the fault, and hands back what came of it.
@@ -56,7 +56,7 @@ class _Branches:
         arm.exchange = branching  # type: ignore[method-assign]
 
     def results(self, body: Callable[[], Any]) -> list[Any]:
-        """What `body`, which drives the arm, returns in the branch of each fault."""
+        """Return, for each fault, the result that `body`, which drives the arm, has in its branch."""
         result: Any = None
         try:
             with suppress(_Enough):

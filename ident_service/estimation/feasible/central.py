@@ -62,7 +62,8 @@ def central(delta: Array, base: BaseParameters, conditions: FeasibleSet) -> Arra
         conditions: the feasible set.
 
     Returns:
-        Link parameters with the same base parameters to rounding, inside the set, shape (parameters,).
+        Link parameters with the same base parameters to rounding, inside the set, shape (parameters,); `delta` itself
+        where rounding forbids a step.
     """
     free = Lift(base).of_dependent
     E, _ = conditions.equality_rows()
@@ -77,7 +78,10 @@ def central(delta: Array, base: BaseParameters, conditions: FeasibleSet) -> Arra
         # condition number.
         rows, wanted, moves = [], [], []
         for matrix in matrices:
-            L = np.linalg.cholesky(matrix.value + np.tensordot(y[matrix.directions], matrix.slopes, 1))
+            try:
+                L = np.linalg.cholesky(matrix.value + np.tensordot(y[matrix.directions], matrix.slopes, 1))
+            except np.linalg.LinAlgError:  # so close to the boundary, at such size, that rounding decides
+                return delta
             inverse = np.linalg.inv(L)
             move = inverse @ matrix.slopes @ inverse.T
             J = np.zeros((L.size, len(y)))
