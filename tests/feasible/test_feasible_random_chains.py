@@ -48,13 +48,13 @@ HARD = (22, 25, 42, 54, 61)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", (*range(4), *HARD))
+@pytest.mark.parametrize("seed", [*range(4), *HARD])
 def test_random_chains_are_solved(seed: int) -> None:
     check_all_answers(seed)
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize("seed", (*range(64), *range(1000, 1300)))
+@pytest.mark.parametrize("seed", [*range(64), *range(1000, 1300)])
 def test_many_random_chains_are_solved(seed: int) -> None:
     check_all_answers(seed)
 
