@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -76,7 +77,7 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
     scored, estimate = result.score, result.estimate
     lines = [
         "",
-        summary(estimate),
+        summary(estimate, result.unusable),
         "score against the truth, which the estimate never saw",
         f"  predicted torque against noise-free torque (validation): {scored.noise_free_percent:.3f} %",
         f"  validation residual over what the true parameters leave: {scored.residual_ratio:.4f}",
@@ -86,8 +87,9 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
         *(f"  {path.name}" for path in sorted(result.folder.iterdir())),
         "",
     ]
-    document = {"folder": str(result.folder), "score": score_document(scored), **_estimate_document(estimate)}
-    return (DONE if estimate.feasible else VERDICT_NO), "\n".join(lines), document
+    document = {"folder": str(result.folder), "score": score_document(scored)}
+    document |= _estimate_document(estimate, result.unusable)
+    return _exit_code(estimate, result.unusable), "\n".join(lines), document
 
 
 def _identify(arguments: argparse.Namespace) -> Answer:
@@ -114,16 +116,22 @@ def _identify(arguments: argparse.Namespace) -> Answer:
     result = identify_files(request, folder, lambda line: tell(arguments, line))
     estimate = result.estimate
     sys.stderr.write("".join(f"ident: {line}\n" for line in result.warnings))
-    text = summary(estimate) + f"\nfiles: {folder}\n" + "".join(f"  {name}\n" for name in result.files)
-    code = DONE if estimate.feasible else VERDICT_NO
+    text = summary(estimate, result.unusable) + f"\nfiles: {folder}\n" + "".join(f"  {name}\n" for name in result.files)
     document = {"folder": str(folder), "files": list(result.files), "warnings": list(result.warnings)}
-    return code, text, document | _estimate_document(estimate)
+    document |= _estimate_document(estimate, result.unusable)
+    return _exit_code(estimate, result.unusable), text, document
 
 
-def _estimate_document(estimate: Estimate) -> dict[str, Any]:
+def _exit_code(estimate: Estimate, unusable: Sequence[str]) -> int:
+    return DONE if estimate.feasible and not unusable else VERDICT_NO
+
+
+def _estimate_document(estimate: Estimate, unusable: Sequence[str]) -> dict[str, Any]:
     own = estimate.candidates[estimate.chosen]
     return {
         "arm": estimate.model.config.name,
+        "usable": estimate.feasible and not unusable,
+        "unusable": list(unusable),
         "feasible": estimate.feasible,
         "margin": estimate.margin,
         "relative_error_percent": own.identification.relative_percent,

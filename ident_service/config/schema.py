@@ -34,6 +34,10 @@ FeasibleSetName = Literal["pseudo_inertia", "inertia"]
 Method = Literal["ols", "wls", "huber", "iv"]
 
 
+_LARGEST_ANGLE = 6.3  # rad
+_LONGEST_LINK = 20.0  # m; the largest arms that move torque-controlled joints are a tenth of it
+
+
 class DHRow(Section):
     """One row of a Denavit-Hartenberg table (table 2); the joint variable adds to theta or, if prismatic, to d."""
 
@@ -42,6 +46,18 @@ class DHRow(Section):
     d: Number = 0.0
     a: Number = 0.0
     alpha: Angle = 0.0
+
+    @model_validator(mode="after")
+    def _of_an_arm(self) -> DHRow:
+        for name, angle in (("theta", self.theta), ("alpha", self.alpha)):
+            if abs(angle) > _LARGEST_ANGLE:
+                raise ValueError(
+                    f"{name}: {angle:g} rad is more than a turn; numbers are rad, degrees are written '{angle:g} deg'"
+                )
+        for name, length in (("d", self.d), ("a", self.a)):
+            if abs(length) > _LONGEST_LINK:
+                raise ValueError(f"{name}: {length:g} m is longer than the link of any arm; in mm? lengths are metres")
+        return self
 
 
 class DHTable(Section):

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ident_service.config.schema import FrictionShape
 from ident_service.estimation.equations import Equations
 from ident_service.estimation.friction_trials import FOLDS, FrictionTrials
-from ident_service.estimation.least_squares import weighted_least_squares
+from ident_service.estimation.least_squares import unit_columns, weighted_least_squares
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
@@ -137,10 +137,10 @@ class _Search:
 def _solved(information: Information, weights: Array) -> Array:
     """Solve eq. 60 alone, without what `least_squares` says about its quality."""
     R = information.stacked(weights)
-    norms = np.linalg.norm(R[:, :-1], axis=0)
-    unit = np.where(norms > 0.0, norms, 1.0)
+    unit, seen = unit_columns(R[:, :-1])
     # By columns of unit length, with pivots: a shape may make two columns of a drive alike.
-    return np.asarray(scipy.linalg.lstsq(R[:, :-1] / unit, R[:, -1], cond=1e-10, lapack_driver="gelsy")[0] / unit)
+    columns = np.where(seen, R[:, :-1], 0.0) / unit
+    return np.asarray(scipy.linalg.lstsq(columns, R[:, -1], cond=1e-10, lapack_driver="gelsy")[0] / unit)
 
 
 def _own_terms(model: ArmModel, base: BaseParameters) -> NDArray[np.bool_]:

@@ -10,12 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
+from numpy.typing import NDArray
 
 from ident_service.errors import ModelError
 from ident_service.model.chain import Array
 from ident_service.model.information import Information
 
 _RANK_TOLERANCE = 1e-10
+_LEAST_COLUMN = 1e-14  # of the longest
 _SETTLED = 1e-9
 _MOST_ROUNDS = 500
 
@@ -77,9 +79,8 @@ def ordinary_least_squares(information: Information, weights: Array | None = Non
     stacked = information.stacked(weights)
     R1, rho1, rho2 = stacked[:-1, :-1], stacked[:-1, -1], abs(float(stacked[-1, -1]))
     # Columns differ by orders of magnitude in SI units; rank is judged on unit columns.
-    norms = np.linalg.norm(R1, axis=0)
-    scale = np.where(norms > 0.0, norms, 1.0)
-    U, s, Vt = scipy.linalg.svd(R1 / scale)
+    scale, seen = unit_columns(R1)
+    U, s, Vt = scipy.linalg.svd(np.where(seen, R1, 0.0) / scale)
     rank = int(np.sum(s > _RANK_TOLERANCE * s[0])) if s[0] > 0.0 else 0
     inverse = ((Vt[:rank].T / s[:rank]) @ U[:, :rank].T) / scale[:, None]
     singular = np.linalg.svd(R1, compute_uv=False)
@@ -99,6 +100,16 @@ def ordinary_least_squares(information: Information, weights: Array | None = Non
         standard_deviations=np.where(unseen, np.inf, deviations),
         weights=np.ones(information.joints) if weights is None else weights,
     )
+
+
+def unit_columns(matrix: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Give what to divide each column by so that it has unit length, and which columns are more than rounding.
+
+    The Stribeck column of rows that are all fast underflows; divided by its length it would be rounding of unit length.
+    """
+    norms = np.linalg.norm(matrix, axis=0)
+    seen = norms > _LEAST_COLUMN * norms.max(initial=0.0)
+    return np.where(seen, norms, 1.0), seen
 
 
 @dataclass(frozen=True)

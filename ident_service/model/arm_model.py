@@ -11,6 +11,8 @@ from ident_service.errors import ModelError
 from ident_service.model.chain import Array, Chain, chain_from_dh
 from ident_service.model.layout import Layout
 
+_LONGEST_LINK = 20.0  # m, as in DH tables
+
 
 @dataclass(frozen=True)
 class ArmModel:
@@ -51,6 +53,12 @@ def arm_model(config: ArmConfig) -> ArmModel:
             chain, inertias = read_mjcf(kinematics.mjcf, config.gravity)
         else:
             raise ModelError(f"{config.name}: no kinematics")
+    offsets = np.maximum(np.abs(chain.translation), np.abs(chain.link_translation)).max(axis=1)
+    if too_long := [name for name, offset in zip(chain.names, offsets, strict=True) if offset > _LONGEST_LINK]:
+        raise ModelError(
+            f"{config.name}: {', '.join(too_long)} is more than {_LONGEST_LINK:g} m from the joint before it; lengths"
+            " are metres"
+        )
     if config.joints and tuple(config.joints) != chain.names:
         raise ModelError(
             f"{config.name}: joints are configured as {', '.join(config.joints)} "

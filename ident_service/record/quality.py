@@ -44,6 +44,11 @@ class JointQuality:
         torque: smallest and largest [N m or N].
         smallest_step: of the position between samples [rad or m], which estimates the encoder's resolution; 0 for a
             joint that never moves.
+        largest_step: of the position between neighbouring samples [rad or m].
+        speed: at that step [rad/s or m/s].
+        where: that step ends [s] after the first sample.
+        usual_step: root mean square of all other steps [rad or m].
+        steps: their number.
     """
 
     name: str
@@ -52,6 +57,11 @@ class JointQuality:
     position: tuple[float, float]
     torque: tuple[float, float]
     smallest_step: float
+    largest_step: float = 0.0
+    speed: float = 0.0
+    where: float = 0.0
+    usual_step: float = 0.0
+    steps: int = 0
 
 
 @dataclass(frozen=True)
@@ -178,6 +188,8 @@ class _Joints:
         self._position = (np.full(joints, np.inf), np.full(joints, -np.inf))
         self._torque = (np.full(joints, np.inf), np.full(joints, -np.inf))
         self._step = np.full(joints, np.inf)
+        self._largest, self._squares = np.zeros((3, joints)), np.zeros(joints)
+        self._steps = 0
         self._at_limit = np.zeros(joints)
         self._still, self._pairs = np.zeros(joints), 0
         self._timing = Timing(stamps)
@@ -196,6 +208,7 @@ class _Joints:
         run = block if self._tail is None else join([self._tail, block])
         fresh = len(run.stamp_ns) - len(block.stamp_ns)
         steps = np.abs(np.diff(run.position[max(0, fresh - 1) :], axis=0))
+        self._count(steps, run.stamp_ns[max(0, fresh - 1) :])
         moved = np.where(steps > _LEAST_STEP, steps, np.inf)
         self._step = np.minimum(self._step, moved.min(axis=0, initial=np.inf))
         # Each pair's later sample is of this block, so that every pair counts once.
@@ -206,6 +219,26 @@ class _Joints:
         self._still += (speed[whole] < STANDSTILL).sum(axis=0)
         self._pairs += int(whole.sum())
         self._tail = cut(run, max(0, len(run.stamp_ns) - lag), len(run.stamp_ns))
+
+    def _usual(self, joint: int) -> float:
+        largest = self._largest[0, joint] ** 2
+        # A jump comes with the way back, and both are left out.
+        others = self._squares[joint] - largest * (2.0 if self._squares[joint] > 2.0 * largest else 1.0)
+        return float(np.sqrt(max(others, 0.0) / max(self._steps - 2, 1)))
+
+    def _count(self, steps: Array, stamps_ns: NDArray[np.int64]) -> None:
+        taken = np.diff(stamps_ns) * 1e-9
+        near = (taken > 0.0) & (taken <= self._stamps.gap_s)
+        steps, taken, ends = steps[near], taken[near], stamps_ns[1:][near]
+        if not len(steps):
+            return
+        self._squares += np.einsum("sj,sj->j", steps, steps)
+        self._steps += len(steps)
+        largest = np.argmax(steps, axis=0)
+        size = steps[largest, np.arange(steps.shape[1])]
+        since = (ends[largest] - self._stamps.first_ns) * 1e-9
+        now = np.vstack([size, size / np.maximum(taken[largest], 0.5 * self._stamps.own_period_s), since])
+        self._largest = np.where(size > self._largest[0], now, self._largest)
 
     def arrival(self) -> bool | None:
         """Whether stamps are of arrival; see `Quality`."""
@@ -228,6 +261,11 @@ class _Joints:
                     position=(float(self._position[0][k]), float(self._position[1][k])),
                     torque=(float(self._torque[0][k]), float(self._torque[1][k])),
                     smallest_step=float(self._step[k]) if np.isfinite(self._step[k]) else 0.0,
+                    largest_step=float(self._largest[0, k]),
+                    speed=float(self._largest[1, k]),
+                    where=float(self._largest[2, k]),
+                    usual_step=self._usual(k),
+                    steps=self._steps,
                 )
             )
         return tuple(found)

@@ -5,7 +5,7 @@ Nothing is believed of a folder that is read before every file has the hash that
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -69,22 +69,26 @@ def read_results(folder: Path) -> Results:
     return Results(folder, config, parameters, sha256)
 
 
-def write_results(folder: Path, estimate: Estimate, more: dict[str, Any] | None = None) -> list[str]:
+def write_results(
+    folder: Path, estimate: Estimate, more: dict[str, Any] | None = None, unusable: Sequence[str] = ()
+) -> list[str]:
     """Write an estimate's files into an existing folder.
 
     Args:
         folder: where to.
         estimate: what to write.
         more: further entries of `parameters.json`.
+        unusable: why the estimate must not be used.
 
     Returns:
         The names of the files. An estimate that no body has comes without a URDF, because URDF cannot express it.
     """
-    write_parameters(folder / PARAMETERS, parameters_document(estimate) | (more or {}))
+    document = parameters_document(estimate) | {"unusable": list(unusable)} | (more or {})
+    write_parameters(folder / PARAMETERS, document)
     write_atomically(folder / ARM, estimate.model.config.model_dump_json(indent=1) + "\n")
     names = [PARAMETERS, ARM]
     if estimate.delta is not None:
         write_urdf(folder / URDF, estimate.model, estimate.delta)
         names.append(URDF)
-    write_atomically(folder / REPORT, summary(estimate) + "\n" + parameter_table(estimate))
+    write_atomically(folder / REPORT, summary(estimate, unusable) + "\n" + parameter_table(estimate))
     return [*names, REPORT]

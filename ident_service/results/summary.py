@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import textwrap
+from collections.abc import Sequence
+
 import numpy as np
 
 from ident_service.estimation.doubt import IDENTIFIED_BELOW, WEAK_BELOW
@@ -9,12 +12,18 @@ from ident_service.estimation.identify import Candidate, Estimate
 from ident_service.estimation.least_squares import TorqueError
 
 
-def summary(estimate: Estimate) -> str:
-    """Several lines of plain text, no wider than a terminal."""
+def summary(estimate: Estimate, unusable: Sequence[str] = ()) -> str:
+    """Describe an estimate in lines no wider than a terminal.
+
+    Args:
+        estimate: to describe.
+        unusable: why it must not be used; that comes first.
+    """
     names = estimate.model.chain.names
     own = estimate.candidates[estimate.chosen]
     columns = ["identification", *(score.recording for score in own.validation)]
     lines = [
+        *_refusal(unusable),
         f"{estimate.model.config.name}: {estimate.base.size} base parameters of {len(estimate.base.names)} link "
         f"parameters, from {estimate.samples} samples",
         f"condition number of the regressor: {estimate.fit.condition_number:.1f}",
@@ -51,6 +60,13 @@ def summary(estimate: Estimate) -> str:
             f"+- {estimate.standard_deviations[i]:.2g} {estimate.base.units[i]}"
         )
     return "\n".join(lines) + "\n"
+
+
+def _refusal(unusable: Sequence[str]) -> list[str]:
+    if not unusable:
+        return []
+    paragraphs = [textwrap.fill(reason, 100, initial_indent="  - ", subsequent_indent="    ") for reason in unusable]
+    return ["DO NOT USE these parameters:", *paragraphs, ""]
 
 
 def _errors(candidate: Candidate) -> list[tuple[TorqueError, TorqueError]]:

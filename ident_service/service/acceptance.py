@@ -82,6 +82,8 @@ def accept(db: Database, state: Path, folder: Path, note: str, who: str, *, arm:
     results = read_results(folder)
     if results.parameters.content.get("feasibility", {}).get("feasible") is not True:
         raise ParameterError(f"{folder}: no body can have these parameters, so no arm has them; accept a feasible set")
+    if unusable := results.parameters.content.get("unusable"):
+        raise ParameterError(f"{folder}: must not be used: {'; '.join(unusable)}; identify again and accept that")
     if arm not in (None, results.config.name):
         raise UsageError(f"{folder.name} is about the arm {results.config.name}, not {arm}")
     arm = results.config.name

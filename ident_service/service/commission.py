@@ -31,7 +31,7 @@ from ident_service.record.recorder_process import RecorderProcess
 from ident_service.results.files import appearing_folder, write_atomically
 from ident_service.results.report_files import write_report
 from ident_service.results.run_folder import write_manifest, write_results
-from ident_service.service.identification import recording_quality
+from ident_service.service.identification import recording_quality, unusable_because
 from ident_service.service.score import Score, score, true_parameters
 from sim_backend.arm import SimulatedArm, Truth
 from sim_backend.remote_arm import RemoteArm
@@ -48,12 +48,14 @@ class Commissioning:
         estimate: what was identified.
         runs: how the two motions went.
         score: against the truth.
+        unusable: why the estimate must not be used; empty where nothing says so.
     """
 
     folder: Path
     estimate: Estimate
     runs: tuple[RunReport, RunReport]
     score: Score
+    unusable: tuple[str, ...]
 
 
 def record_motion(
@@ -161,13 +163,14 @@ def simulate(
         recordings = [KeptRecording(open_recording(path, model.chain.names)) for path in paths]
         estimate = identify(model, recordings[:1], recordings[1:], set_name=set_name)
         scored = score(estimate, truth, observed, equations(recordings[1], model, estimate.base))
-        write_results(staging, estimate)
+        found = [(one, recording_quality(one, model)) for one in recordings]
+        unusable = unusable_because(estimate, found)
+        write_results(staging, estimate, unusable=unusable)
         write_atomically(staging / "score.json", json.dumps(score_document(scored), indent=1) + "\n")
-        seen = [(one.path.name, recording_quality(one, model).warnings()) for one in recordings]
-        warnings = [f"{name}: {line}" for name, lines in seen for line in lines]
+        warnings = [f"{one.path.name}: {line}" for one, seen in found for line in seen.warnings()]
         write_report(staging, estimate, recordings[:1], recordings[1:], warnings)
         write_manifest(staging)
-    return Commissioning(folder, estimate, (reports[0], reports[1]), scored)
+    return Commissioning(folder, estimate, (reports[0], reports[1]), scored, unusable)
 
 
 def score_document(scored: Score) -> dict[str, object]:

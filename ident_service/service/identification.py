@@ -12,11 +12,12 @@ import numpy as np
 
 from ident_service.config.load import load_arm, load_recording_format
 from ident_service.config.schema import ArmConfig, Method
-from ident_service.errors import UsageError
+from ident_service.errors import RecordingError, SolverError, UsageError
 from ident_service.estimation.bootstrap import bootstrap
 from ident_service.estimation.essential import essential_parameters
 from ident_service.estimation.feasible.feasible_set import SetName
 from ident_service.estimation.identify import Estimate, identify
+from ident_service.estimation.plausibility import reasons_against, reasons_in_recording
 from ident_service.estimation.proof.sdpa import bpfc_sdpa, bpft_sdpa, fbpe_sdpa
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.record.kept import KeptRecording
@@ -73,11 +74,13 @@ class Identified:
         estimate: with everything known of it.
         files: names of the files in the folder.
         warnings: what is wrong with the recordings, in words.
+        unusable: why the estimate must not be used; empty where nothing says so.
     """
 
     estimate: Estimate
     files: tuple[str, ...]
     warnings: tuple[str, ...]
+    unusable: tuple[str, ...]
 
 
 def identify_files(request: Request, folder: Path, tell: Callable[[str], None] = lambda _: None) -> Identified:
@@ -100,7 +103,15 @@ def identify_files(request: Request, folder: Path, tell: Callable[[str], None] =
     validation = [open_for(path, model) for path in request.validation]
     found = [(recording, recording_quality(recording, model)) for recording in [*recordings, *validation]]
     warnings = tuple(f"{recording.path}: {line}" for recording, seen in found for line in seen.warnings())
-    estimate = identify(model, recordings, validation, method=request.method, set_name=request.set_name)
+    try:
+        estimate = identify(model, recordings, validation, method=request.method, set_name=request.set_name)
+    except SolverError as error:
+        # Numbers of another size than the solver can hold are the recording's fault, and the reason says so.
+        for recording, seen in found:
+            for reason in reasons_in_recording(recording.path.name, seen.joints, model):
+                raise RecordingError(recording.path, reason) from error
+        raise
+    unusable = unusable_because(estimate, found)
     more: dict[str, Any] = {"recording_quality": [_quality_document(recording, seen) for recording, seen in found]}
     if request.replicates:
         tell(f"bootstrap of {request.replicates} replicates")
@@ -109,12 +120,19 @@ def identify_files(request: Request, folder: Path, tell: Callable[[str], None] =
         tell("essential parameters")
         more["essential"] = _essential(estimate)
     with appearing_folder(folder) as staging:
-        files = write_results(staging, estimate, more)
+        files = write_results(staging, estimate, more, unusable)
         if request.sdpa:
             files += _write_sdpa(staging, estimate)
         files += write_report(staging, estimate, recordings, validation, warnings)
         write_manifest(staging)
-    return Identified(estimate, (*files, MANIFEST), warnings)
+    return Identified(estimate, (*files, MANIFEST), warnings, unusable)
+
+
+def unusable_because(estimate: Estimate, found: Sequence[tuple[Recording, Quality]]) -> tuple[str, ...]:
+    """Say why an estimate must not be used, from the recordings that it knows and from its errors."""
+    model = estimate.model
+    seen = (reasons_in_recording(recording.path.name, one.joints, model) for recording, one in found)
+    return (*(reason for reasons in seen for reason in reasons), *reasons_against(estimate))
 
 
 def _config(request: Request) -> ArmConfig:

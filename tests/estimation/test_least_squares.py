@@ -90,6 +90,15 @@ def test_a_column_of_zeros_is_blind_and_alone() -> None:
     assert np.isinf(fit.condition_number)
 
 
+def test_a_column_of_rounding_is_as_blind_as_one_of_zeros() -> None:
+    W, omega = linear_problem(2)
+    W[:, 2] *= 1e-160
+    fit = ordinary_least_squares(one_joint_information(W, omega))
+    np.testing.assert_array_equal(np.isinf(fit.standard_deviations), np.arange(6) == 2)
+    assert np.isfinite(fit.beta).all()
+    assert fit.rank == 5
+
+
 def test_two_columns_that_only_occur_together_are_both_blind() -> None:
     W, omega = linear_problem(3)
     W[:, 4] = -0.3 * W[:, 1]

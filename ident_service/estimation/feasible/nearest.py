@@ -21,6 +21,7 @@ from ident_service.estimation.feasible.posing import (
     pressing,
     project,
 )
+from ident_service.estimation.least_squares import unit_columns
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 
@@ -150,9 +151,9 @@ def nearest(
     n, variables = base.size, len(base.names) + 1
     problem = ConicProblem(variables)
     # Unit columns for beta: in SI units they differ by orders of magnitude.
-    norms = np.linalg.norm(metric, axis=0)
-    unit = np.where(norms > 0.0, norms, 1.0)
-    scale = max(float(norms.max()), np.finfo(float).tiny)
+    unit, seen = unit_columns(metric)
+    metric = np.where(seen, metric, 0.0)
+    scale = float(unit[seen].max(initial=np.finfo(float).tiny))
     columns = scale / unit
     distance = np.zeros((len(target) + 1, variables))
     distance[0, -1] = 1.0

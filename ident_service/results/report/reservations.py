@@ -77,7 +77,7 @@ def active_conditions(evidence: Evidence, parameters: ParameterFile) -> str:
 
 def reservations(evidence: Evidence, parameters: ParameterFile) -> list[str]:
     """What stands against using the estimate, in sentences; empty where nothing does."""
-    found = []
+    found = [f"Must not be used: {reason}." for reason in parameters.content.get("unusable", [])]
     if parameters.content.get("feasibility", {}).get("margin", 1.0) <= 0.0:
         found.append("No real body has these parameters.")
     poor = poor_joints(evidence, parameters)

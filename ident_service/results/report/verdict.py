@@ -34,6 +34,7 @@ def verdict(evidence: Evidence, parameters: ParameterFile, *, simulated: bool = 
     """
     return [
         *([SIMULATED] if simulated else []),
+        *(f"Do not use these parameters: {reason}." for reason in parameters.content.get("unusable", [])),
         *_feasibility(evidence, parameters),
         _prediction(evidence),
         *_joints(evidence, parameters),
@@ -141,6 +142,8 @@ def _knowledge(parameters: ParameterFile) -> str:
 
 def _next(evidence: Evidence, parameters: ParameterFile) -> str:
     """What a person should do now, the most urgent thing first."""
+    if parameters.content.get("unusable"):
+        return "Next: mend what forbids their use, and identify again."
     steps = []
     found = parameters.content.get("feasibility")
     if found is not None and found["margin"] <= 0.0:

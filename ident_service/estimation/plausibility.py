@@ -1,0 +1,180 @@
+"""Reasons why an estimate cannot be right: data in wrong units, swapped columns, wrong signs, another arm's geometry.
+
+A set of parameters can be physically feasible, and its regression well conditioned, and still describe nothing: the
+recording may be in degrees, or of other joints. Each rule here compares with what any arm, or this arm by its
+description, can do. Its limits are far from what sound recordings show, so that a reason is a verdict, not a hint.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from ident_service.config.schema import JointTerm
+from ident_service.estimation.identify import Candidate, Estimate
+from ident_service.estimation.least_squares import TorqueError
+from ident_service.model.arm_model import ArmModel
+from ident_service.record.quality import JointQuality
+
+LARGEST_ERROR = 30.0  # percent of the torque (eq. 84): a controller is better off without such a model
+MUCH_WORSE, WORSE_FROM = 4.0, 10.0  # times the error on what was fitted to, and percent from which that counts
+CONSTRAINED_WORSE, CONSTRAINED_FROM = 1.8, 2.0  # times the unconstrained error, and percent from which that counts
+WRONG_SIGN = 8.0  # deviations by which friction is negative
+CONSTRAINED_WORSE_WITH_SIGN, PERHAPS_WRONG_SIGN = 1.3, 4.0  # both together
+_OUTSIDE = 0.1  # of a joint's range: what limits of a description may be off
+_TURNS = 100.0  # rad, for joints without limits
+_TOO_FAST, _TOO_STRONG = 4.0, 4.0  # times the limit of the description
+_JUMP = 20.0  # times the usual step between samples
+_LEAST_JUMP = 0.02  # rad or m
+_DENSITY = 1000.0  # kg for an arm of one metre, growing with its volume
+_SAMPLES_OF_A_JUMP = 100  # fewer say nothing about what is usual
+
+
+def reasons_against(estimate: Estimate) -> tuple[str, ...]:
+    """Say why an estimate must not be used, by its errors; empty where nothing does.
+
+    The words name the most likely cause where the numbers tell one.
+    """
+    own = estimate.candidates[estimate.chosen]
+    return (*_errors(own), *_against_the_unconstrained(estimate))
+
+
+def reasons_in_recording(recording: str, joints: Sequence[JointQuality], model: ArmModel) -> tuple[str, ...]:
+    """Say why a recording cannot be of this arm in SI units; empty where nothing does.
+
+    Args:
+        recording: its name, for the words.
+        joints: what was seen of its joints.
+        model: the arm and its limits.
+    """
+    found = [
+        f"{recording}: {reason}"
+        for index, seen in enumerate(joints)
+        for reason in _of_joint(model.chain.names[index], seen, model, revolute=model.chain.revolute[index])
+    ]
+    return (*found, *(f"{recording}: {reason}" for reason in _weight(joints, model)))
+
+
+def _errors(own: Candidate) -> Iterator[str]:
+    fitted = own.moving.relative_percent
+    judged: list[tuple[str, TorqueError]] = [(score.recording, score.moving) for score in own.validation]
+    if not judged:
+        judged = [("the recordings that it was fitted to", own.moving)]
+    name, worst = max(judged, key=lambda one: one[1].relative_percent)
+    error = worst.relative_percent
+    if error > LARGEST_ERROR:
+        yield (
+            f"its torque error is {error:.0f} % where joints move on {name}, more than {LARGEST_ERROR:g} %: compare"
+            " units (rad, N m), the order and the signs of the columns, gravity, and the kinematics with the arm's (DH"
+            " convention, metres)"
+        )
+    elif own.validation and error > WORSE_FROM and error > MUCH_WORSE * fitted:
+        yield (
+            f"its torque error is {error:.0f} % where joints move on {name} but {fitted:.1f} % on what it was fitted"
+            " to: compare load, tool and columns of the two recordings, and fit to a motion that excites more"
+        )
+
+
+def _against_the_unconstrained(estimate: Estimate) -> Iterator[str]:
+    free, own = estimate.candidates[0], estimate.candidates[estimate.chosen]
+    before, after = free.moving.relative_percent, own.moving.relative_percent
+    much = estimate.constrained and after > CONSTRAINED_FROM and after > CONSTRAINED_WORSE * before
+    worse = estimate.constrained and after > CONSTRAINED_WORSE_WITH_SIGN * before
+    wrong = _driving_friction(estimate, PERHAPS_WRONG_SIGN if worse else WRONG_SIGN)
+    words = f"its torque error is {after:.1f} %, and {before:.1f} % without the conditions of a real body"
+    if wrong:
+        which = ", ".join(name for name, _, _ in wrong)
+        name, torque, deviation = min(wrong, key=lambda one: one[1] / one[2])
+        yield (
+            f"the torque, or the position, may have the wrong sign at {which}: without conditions, the friction of"
+            f" {name} drives it ({torque:.3g} +- {deviation:.2g} at its usual speed)" + (f"; {words}" if much else "")
+        )
+    elif much:
+        yield (
+            f"{words}: gravity, signs, order or units of the columns, or the description's bodies, contradict the"
+            " recording"
+        )
+
+
+def _driving_friction(estimate: Estimate, deviations: float) -> list[tuple[str, float, float]]:
+    """Find drives whose unconstrained friction adds energy: name, friction at the usual speed, its deviation.
+
+    Coulomb, Stribeck and viscous terms explain each other's torque, so only their sum at a speed has a sign. The usual
+    speed is the root mean square of the velocity, which is the viscous column's, of the rows that were fitted to.
+    """
+    layout, base, total = estimate.model.layout, estimate.base, estimate.fitted.total
+    place = {int(column): index for index, column in enumerate(base.base)}
+    coupling, found = estimate.model.chain.coupling, []
+    for drive, viscous in enumerate(layout.term_columns("viscous")):
+        joint = drive if coupling[drive, drive] else int(np.argmax(np.abs(coupling[drive])))
+        column = np.flatnonzero(total.supports[joint] == place[int(viscous)])[0]
+        moved = np.linalg.norm(total.factors[joint][:, column]) / np.sqrt(max(total.rows[joint], 1))
+        speed = float(moved / abs(coupling[drive, joint]))
+        shares: dict[JointTerm, float] = {"viscous": speed, "coulomb": 1.0, "quadratic": speed**2}
+        if layout.stribeck_velocity:
+            shares["stribeck"] = float(np.exp(-((speed / layout.stribeck_velocity[drive]) ** 2)))
+        row = np.zeros(base.size)
+        for term, share in shares.items():
+            if len(columns := layout.term_columns(term)):
+                row[place[int(columns[drive])]] = share
+        used = np.flatnonzero(row)  # of the others, some may have no finite deviation
+        variance = float(row[used] @ estimate.covariance[np.ix_(used, used)] @ row[used])
+        torque = float(row @ estimate.fit.beta)
+        if np.isfinite(variance) and torque < -deviations * np.sqrt(variance):
+            found.append((estimate.model.chain.names[joint], torque, float(np.sqrt(variance))))
+    return found
+
+
+def _of_joint(name: str, seen: JointQuality, model: ArmModel, *, revolute: bool) -> Iterator[str]:
+    unit, small = ("rad", "degrees") if revolute else ("m", "millimetres")
+    low, high = seen.position
+    described = model.config.joints.get(name)
+    limits = None if described is None else described.position
+    if limits is not None:
+        room = _OUTSIDE * (limits[1] - limits[0])
+        if low < limits[0] - room or high > limits[1] + room:
+            yield (
+                f"{name} is recorded from {low:.4g} to {high:.4g} {unit}, and its limits are {limits[0]:.4g} and"
+                f" {limits[1]:.4g}: are the positions in {small}, or those of another joint?"
+            )
+            return
+    elif revolute and max(-low, high) > _TURNS:
+        yield f"{name} is recorded from {low:.4g} to {high:.4g} rad: are the positions in {small}?"
+        return
+    speed = None if described is None else described.velocity
+    if speed is not None and seen.speed > _TOO_FAST * speed:
+        yield (
+            f"{name} moves {seen.largest_step:.3g} {unit} between two samples, {seen.speed / speed:.0f} times its"
+            f" largest velocity: cut or mend the samples {seen.where:.4g} s after the first"
+        )
+    elif seen.largest_step > max(_LEAST_JUMP, _JUMP * seen.usual_step) and seen.steps > _SAMPLES_OF_A_JUMP:
+        yield (
+            f"{name} jumps by {seen.largest_step:.3g} {unit} between two samples, {seen.usual_step:.2g} as a rule: cut"
+            f" or mend the samples {seen.where:.4g} s after the first"
+        )
+    torque, most = (None if described is None else described.torque), max(-seen.torque[0], seen.torque[1])
+    if torque is not None and most > _TOO_STRONG * torque:
+        yield (
+            f"the torque of {name} reaches {most:.4g}, {most / torque:.0f} times its limit of {torque:g}: is it in"
+            " other units, or of another joint?"
+        )
+
+
+def _weight(joints: Sequence[JointQuality], model: ArmModel) -> Iterator[str]:
+    """Whether holding this arm up can take such torques."""
+    chain = model.chain
+    # Where the first joint stands is not part of the arm.
+    offsets = np.concatenate([chain.translation[1:], chain.link_translation])
+    reach = float(np.linalg.norm(offsets, axis=1).sum())
+    gravity = float(np.linalg.norm(chain.gravity))
+    if reach <= 0.0 or gravity <= 0.0:
+        return
+    peaks = (max(-seen.torque[0], seen.torque[1]) for seen, turns in zip(joints, chain.revolute, strict=True) if turns)
+    largest = max(peaks, default=0.0)
+    held, allowed = largest / (gravity * reach), _DENSITY * max(reach, reach**3)
+    if held > allowed:
+        yield (
+            f"a torque of {largest:.3g} N m would hold {held:.3g} kg at the end of this arm, which reaches"
+            f" {reach:.2g} m: is it in other units?"
+        )

@@ -1,0 +1,202 @@
+"""Recordings and descriptions that cannot be right are told so, and nobody is given their parameters for use."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from benchmarks.real_data import CASES, DATA
+from ident_service.cli import main
+from ident_service.config.load import load_arm
+from ident_service.config.quantities import TextFile
+from ident_service.config.schema import ArmConfig, Identification
+from ident_service.errors import ConfigError, ModelError
+from ident_service.estimation.identify import identify
+from ident_service.model.arm_model import arm_model
+from ident_service.record.open import open_recording
+from ident_service.record.recording import Block, Recording
+from ident_service.service.identification import recording_quality, unusable_because
+
+pytestmark = [pytest.mark.usefixtures("shared")]
+
+KUKA = next(case for case in CASES if case.arm == "kuka_lwr4")
+Change = Callable[[np.ndarray, np.ndarray], None]
+
+
+@dataclass
+class Changed:
+    """A recording whose samples went through wrong hands."""
+
+    behind: Recording
+    change: Change
+
+    def __post_init__(self) -> None:
+        self.path, self.joints, self.joint_names = self.behind.path, self.behind.joints, self.behind.joint_names
+        self.torque_held, self.torn = self.behind.torque_held, False
+        self.sha256 = self.behind.sha256
+
+    def blocks(self, samples: int = 1 << 30) -> Iterator[Block]:
+        parts = list(self.behind.blocks())
+        position, torque = (np.concatenate([getattr(one, name) for one in parts]) for name in ("position", "torque"))
+        self.change(position, torque)
+        yield Block(np.concatenate([one.stamp_ns for one in parts]), position, torque)
+
+
+def kuka(**changes: Any) -> ArmConfig:
+    """Give the KUKA without what its description knows of identifying it."""
+    return load_arm("kuka_lwr4").model_copy(update={"identification": Identification(), **changes})
+
+
+def judged(change: Change, config: ArmConfig | None = None) -> tuple[str, ...]:
+    """Identify from the first recording, judge on the second, and give the reasons against using the result."""
+    model = arm_model(config or kuka())
+    recordings = [
+        Changed(open_recording(DATA / KUKA.folder / str(name), model.chain.names, fmt=model.config.recording), change)
+        for name in (KUKA.fitted, KUKA.judged)
+    ]
+    estimate = identify(model, recordings[:1], recordings[1:])
+    return unusable_because(estimate, [(one, recording_quality(one, model)) for one in recordings])
+
+
+def nothing(position: np.ndarray, torque: np.ndarray) -> None:
+    pass
+
+
+def degrees(position: np.ndarray, torque: np.ndarray) -> None:
+    position *= 180.0 / np.pi
+
+
+def swapped(position: np.ndarray, torque: np.ndarray) -> None:
+    position[:], torque[:] = torque.copy(), position.copy()
+
+
+def two_joints(position: np.ndarray, torque: np.ndarray) -> None:
+    torque[:, [1, 2]] = torque[:, [2, 1]]
+
+
+def negated(position: np.ndarray, torque: np.ndarray) -> None:
+    torque *= -1.0
+
+
+def one_negated(position: np.ndarray, torque: np.ndarray) -> None:
+    torque[:, 5] *= -1.0
+
+
+def thousandfold(position: np.ndarray, torque: np.ndarray) -> None:
+    torque *= 1000.0
+
+
+def spike(position: np.ndarray, torque: np.ndarray) -> None:
+    position[2000:2005, 3] += 0.3
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (degrees, "lwr_0_joint is recorded from -56.73 to 56.73 rad, .* degrees"),
+        (swapped, "lwr_1_joint is recorded from -38.05"),
+        (two_joints, "its torque error is 6. % where joints move on recording_2"),
+        (negated, "the torque, or the position, may have the wrong sign at lwr_0_joint"),
+        (one_negated, "the torque, or the position, may have the wrong sign at lwr_5_joint"),
+        (thousandfold, "the torque of lwr_1_joint reaches 3.936e.04, 224 times its limit of 176"),
+        (spike, "lwr_3_joint moves 0.3.* rad between two samples, .* mend the samples 10.* s after the first"),
+    ],
+)
+def test_wrong_columns(change: Change, words: str) -> None:
+    assert re.search(words, "\n".join(judged(change)))
+
+
+def test_a_spike_and_wrong_units_of_an_arm_without_limits() -> None:
+    bare = kuka(joints={})
+    (first, *_) = judged(spike, bare)
+    assert "lwr_3_joint jumps by 0.3" in first
+    (first, *_) = judged(thousandfold, bare)
+    assert "a torque of 3.94e+04 N m would hold" in first
+    (first, *_) = judged(degrees, bare)
+    assert "its torque error is" in first or "are the positions in degrees?" in first
+
+
+def test_gravity_upside_down() -> None:
+    (reason,) = judged(nothing, kuka(gravity=(0.0, 0.0, 9.81)))
+    assert "without the conditions of a real body: gravity, signs, order or units" in reason
+
+
+def test_sound_recordings_are_not_objected_to() -> None:
+    for case in CASES:
+        model = arm_model(load_arm(case.arm).model_copy(update={"identification": Identification()}))
+        config = model.config
+        paths = [DATA / case.folder / name for name in (case.fitted, case.judged) if name]
+        recordings = [
+            open_recording(path, model.chain.names, fmt=config.recording, transmission=config.transmission)
+            for path in paths
+        ]
+        estimate = identify(model, recordings[:1], recordings[1:])
+        assert unusable_because(estimate, [(one, recording_quality(one, model)) for one in recordings]) == ()
+
+
+def test_the_command_says_no_where_people_look(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = [",".join(["t", *(f"q{k}" for k in range(1, 8)), *(f"tau{k}" for k in range(1, 8))])]
+    model = arm_model(load_arm("kuka_lwr4"))
+    whole = Changed(open_recording(DATA / KUKA.folder / KUKA.fitted, model.chain.names), negated)
+    for block in whole.blocks():
+        table = np.column_stack([block.stamp_ns * 1e-9, block.position, block.torque])
+        lines += [",".join(f"{value:.9g}" for value in row) for row in table]
+    (tmp_path / "run.csv").write_text("\n".join(lines) + "\n")
+    tree = {"identification": {"method": "wls"}}
+    arm = yaml.safe_load(Path("configs/kuka_lwr4.yaml").read_text()) | tree
+    arm["kinematics"]["urdf"] = str(Path("configs/kuka_lwr4.urdf").resolve())
+    (tmp_path / "arm.yaml").write_text(yaml.safe_dump(arm))
+    words = ["identify", str(tmp_path / "run.csv"), "--arm", str(tmp_path / "arm.yaml"), "--out", str(tmp_path / "out")]
+    assert main(words) == 3
+    said = capsys.readouterr().out
+    assert said.startswith("DO NOT USE these parameters:\n  - the torque, or the position, may have the wrong sign")
+    assert (tmp_path / "out" / "report.txt").read_text().startswith("DO NOT USE")
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "Do not use these parameters: the torque, or the position" in page
+    content = json.loads((tmp_path / "out" / "parameters.json").read_text())
+    assert "wrong sign" in content["unusable"][0]
+    assert main([*words, "--json"]) == 3
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["usable"] is False
+    assert answer["unusable"] == content["unusable"]
+    state = tmp_path / "state"
+    assert main(["accept", str(tmp_path / "out"), "--note", "x", "--by", "me", "--state", str(state)]) != 0
+    assert "must not be used" in capsys.readouterr().err
+
+
+DH = {"joint": {"a": 0.3, "alpha": "90 deg"}}
+
+
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [
+        ({"a": 300.0}, "a: 300 m is longer than the link of any arm; in mm"),
+        ({"d": -450.0}, "d: -450 m is longer"),
+        ({"alpha": 90.0}, "alpha: 90 rad is more than a turn; numbers are rad, degrees are written '90 deg'"),
+        ({"theta": -180}, "theta: -180 rad is more than a turn"),
+    ],
+)
+def test_a_table_in_other_units(row: dict[str, Any], words: str, tmp_path: Path) -> None:
+    tree = {"name": "arm", "kinematics": {"dh": {"convention": "standard", "joints": {"one": row}}}}
+    (tmp_path / "arm.yaml").write_text(yaml.safe_dump(tree))
+    with pytest.raises(ConfigError, match=words):
+        load_arm(tmp_path / "arm.yaml")
+
+
+def test_a_urdf_in_millimetres() -> None:
+    config = load_arm("kuka_lwr4")
+    urdf = config.kinematics.urdf
+    assert urdf is not None
+    text = urdf.text.replace('xyz="0 0 0.2"', 'xyz="0 0 200"')
+    assert text != urdf.text
+    kinematics = config.kinematics.model_copy(update={"urdf": TextFile(name="kuka.urdf", text=text)})
+    with pytest.raises(ModelError, match="more than 20 m from the joint before it; lengths are metres"):
+        arm_model(config.model_copy(update={"kinematics": kinematics}))
