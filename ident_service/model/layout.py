@@ -16,11 +16,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from ident_service.certificate_verifier import INERTIAL as INERTIAL
 from ident_service.config.quantities import ParameterTable
 from ident_service.config.schema import JointTerm
 from ident_service.errors import ParameterError
 
-INERTIAL = ("Lxx", "Lxy", "Lxz", "Lyy", "Lyz", "Lzz", "lx", "ly", "lz", "m")
 TERM_SYMBOLS: dict[JointTerm, str] = {
     "drive_inertia": "Ia",
     "viscous": "fv",

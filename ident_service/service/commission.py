@@ -112,6 +112,7 @@ def simulate(
     *,
     motion: Excitation | None = None,
     set_name: SetName | None = None,
+    described: ArmConfig | None = None,
     clock: Clock | None = None,
     tell: Tell = lambda _: None,
     stop_requested: Callable[[], bool] = lambda: False,
@@ -123,6 +124,7 @@ def simulate(
         folder: the run folder; it appears when everything is in it, and must not exist.
         motion: to identify from, a designed one for example; the description's when None.
         set_name: feasible set, the configuration's when None.
+        described: the configuration as it was read, where it was changed since; `config` when None.
         clock: the loop's, what the driver section asks for when None.
         tell: called with a line at each step.
         stop_requested: asked every cycle.
@@ -161,7 +163,7 @@ def simulate(
         recordings = [KeptRecording(open_recording(path, model.chain.names)) for path in paths]
         estimate = identify(model, recordings[:1], recordings[1:], set_name=set_name)
         scored = score(estimate, truth, observed, equations(recordings[1], model, estimate.base))
-        write_results(staging, estimate)
+        write_results(staging, estimate, described=config if described is None else described)
         write_atomically(staging / "score.json", json.dumps(score_document(scored), indent=1) + "\n")
         seen = [(one.path.name, recording_quality(one, model).warnings()) for one in recordings]
         warnings = [f"{name}: {line}" for name, lines in seen for line in lines]

@@ -1,6 +1,6 @@
 """Proofs small enough to be written by hand: each condition of the verifier holds by itself, and so does each bound.
 
-One body of 1 kg whose mass distribution is a ball's, in the plane `lz = Lxz = 0`.
+One body of 1 kg whose mass distribution is a ball's, in the plane `lz = Lxz = Lyz = 0`.
 """
 
 from __future__ import annotations
@@ -14,16 +14,26 @@ from typing import Any
 
 import pytest
 
-from ident_service.errors import ParameterError, UsageError
-from ident_service.estimation.proof import certificate_reader, exact
-from ident_service.estimation.proof.certificate_exact import Verification, verify
-from ident_service.estimation.proof.certificate_reader import MAX_BLOCKS, MAX_LINKS, MAX_SIZE
-from ident_service.estimation.proof.exact import is_positive_definite, is_positive_semidefinite, rational, symmetric
+from ident_service import certificate_verifier
+from ident_service.certificate_verifier import (
+    MAX_BLOCKS,
+    MAX_LINKS,
+    MAX_SIZE,
+    Verification,
+    VerificationError,
+    is_positive_definite,
+    is_positive_semidefinite,
+    rational,
+    symmetric,
+    verify,
+)
+from ident_service.errors import UsageError
 from ident_service.service import verify as service
 
 Document = dict[str, Any]
 BODY = {"Lxx1": 0.5, "Lxy1": 0.0, "Lxz1": 0.0, "Lyy1": 0.5, "Lyz1": 0.0, "Lzz1": 0.5}
 BODY |= {"lx1": 0.0, "ly1": 0.0, "lz1": 0.0, "m1": 1.0}
+OWN = "consistent with its own conditions: infeasible"
 SET = "link 1: a mass distribution exists"
 
 
@@ -32,9 +42,10 @@ def number(name: str, coefficients: dict[str, str], constant: str = "0") -> Docu
     return {"name": name, "size": 0, "entries": [{"coefficients": coefficients, "constant": constant}]}
 
 
-PLANE = number("plane", {"lz1": "1"})
-PLANE["entries"].append({"coefficients": {"Lxz1": "1"}, "constant": "0"})
-LIGHT = number("light", {"m1": "-1"}, "3")
+PLANE_NAME = "link 1: symmetric about its xy plane"
+PLANE = number(PLANE_NAME, {"lz1": "1"})
+PLANE["entries"] += [{"coefficients": {name: "1"}, "constant": "0"} for name in ("Lxz1", "Lyz1")]
+LIGHT = number("total mass at most 3 kg", {"m1": "-1"}, "3")
 
 
 def feasible() -> Document:
@@ -56,6 +67,7 @@ def infeasible(
 ) -> Document:
     certificate = {"kind": "dual", "set": "pseudo_inertia", "links": [1], "blocks": list(blocks), "equalities": []}
     certificate |= {"base": base, "multipliers": multipliers}
+    certificate["body"] = {name: repr(value) for name, value in BODY.items()}
     return {
         "format": "ident-parameters",
         "version": 1,
@@ -76,11 +88,14 @@ def fails(document: Document, message: str) -> None:
 def test_a_witness_is_told_with_all_that_it_meets() -> None:
     result = verified(feasible())
     assert result.verdict == "feasible", result.message
-    assert result.message == "proven: a body with these base parameters exists in the set pseudo_inertia"
+    assert result.message == (
+        "consistent with its own conditions: feasible: link parameters with these base parameters meet the set "
+        "pseudo_inertia and all conditions listed in the file; if these are an arm's, only its description can tell"
+    )
     assert result.checked == (
         SET,
-        "light (3 - m1 > 0)",
-        "plane (lz1 = 0, Lxz1 = 0)",
+        "total mass at most 3 kg (3 - m1 > 0)",
+        f"{PLANE_NAME} (lz1 = 0, Lxz1 = 0, Lyz1 = 0)",
         "link_parameters: as printed they meet all of these conditions and belong to the base parameters",
     )
 
@@ -90,8 +105,8 @@ def test_a_witness_is_told_with_all_that_it_meets() -> None:
     [
         ("m1", "1.1", "base parameter 1 is not what its expression gives for the witness"),
         ("Lzz1", "0.51", "base parameter 3 is not what its expression gives for the witness"),
-        ("Lxz1", "1e-30", "not zero at the witness: plane"),
-        ("Lxz1", "-1e-30", "not zero at the witness: plane"),
+        ("Lxz1", "1e-30", f"not zero at the witness: {PLANE_NAME}"),
+        ("Lxz1", "-1e-30", f"not zero at the witness: {PLANE_NAME}"),
         ("lx1", "0.6", f"not positive at the witness: {SET}"),
     ],
 )
@@ -103,8 +118,8 @@ def test_a_witness_meets_every_equation_and_condition(name: str, value: str, mes
 
 def test_a_witness_meets_what_is_listed_beside_the_set() -> None:
     document = feasible()
-    document["feasibility"]["certificate"]["blocks"][0]["entries"][0]["constant"] = "1"
-    fails(document, "not positive at the witness: light")
+    document["feasibility"]["certificate"]["blocks"] = [number("total mass at most 1 kg", {"m1": "-1"}, "1")]
+    fails(document, "not positive at the witness: total mass at most 1 kg")
 
 
 @pytest.mark.parametrize("name", ["lx1", "m1"])
@@ -122,8 +137,8 @@ def test_a_witness_has_neither_more_nor_fewer_values(name: str) -> None:
         # A millionth of the sizes of all terms together: of 1 kg that was printed and 1 kg that it should be.
         ("m1", 1.0 + 1.9e-6, 1.0 + 2.1e-6, "base parameter 1 is another one"),
         ("m1", 1.0 - 1.9e-6, 1.0 - 2.1e-6, "base parameter 1 is another one"),
-        ("Lxz1", 0.9e-6, 1.1e-6, "not zero as printed: plane"),
-        ("Lxz1", -0.9e-6, -1.1e-6, "not zero as printed: plane"),
+        ("Lxz1", 0.9e-6, 1.1e-6, f"not zero as printed: {PLANE_NAME}"),
+        ("Lxz1", -0.9e-6, -1.1e-6, f"not zero as printed: {PLANE_NAME}"),
         ("Lzz1", 0.5 + 0.9e-6, 0.5 + 1.1e-6, "base parameter 3 is another one"),
         ("lx1", 0.4999, 0.5001, f"not positive as printed: {SET}"),
     ],
@@ -143,7 +158,7 @@ def test_a_table_of_link_parameters_is_whole() -> None:
     document = feasible()
     document["link_parameters"]["names"][0] = "Lxy1"
     fails(document, "link_parameters: names and values do not match")
-    document["link_parameters"]["names"][0] = "other1"
+    document["link_parameters"]["names"][0] = "fo1"
     fails(document, "link_parameters: no value for Lxx1")
     document["link_parameters"]["values"].append(1.0)
     fails(document, "link_parameters: names and values do not match")
@@ -153,7 +168,7 @@ def test_a_negative_mass_is_disproven_by_the_mass_alone() -> None:
     document = infeasible(["m1"], [-1.0], ["1"], {SET: ["0"] * 9 + ["1"]})
     result = verified(document)
     assert result.verdict == "infeasible", result.message
-    message = f"proven: no body in the set pseudo_inertia has these base parameters; most of all {SET}"
+    message = f"{OWN}: no body in the set pseudo_inertia has these base parameters; most of all {SET}"
     assert (result.message, result.checked) == (message, (f"100 %: {SET}",))
     document["base_parameters"]["values"] = [0.0]
     assert "has these base parameters, unless one on the set's boundary; most" in verified(document).message
@@ -173,32 +188,42 @@ def test_a_centre_of_mass_too_far_out_is_disproven_by_what_stands_beside_the_dia
     fails(document, f"the multiplier is not positive semidefinite: {SET}")
 
 
+def assumed(bound: str) -> Document:
+    """A bound that a disproof assumes of link 1."""
+    condition = number(f"assumed: link 1 below {bound} kg and {bound} kg m^2", {"m1": "-1"}, bound)
+    condition["entries"].append({"coefficients": dict.fromkeys(("Lxx1", "Lyy1", "Lzz1"), "-1"), "constant": bound})
+    return condition
+
+
 def test_shares_are_those_of_the_weights() -> None:
-    lighter, assumed = number("lighter", {"m1": "-1"}, "4"), number("assumed: mass", {"m1": "-1"}, "3")
-    document = infeasible(["m1"], [5.0], ["-4"], {"lighter": ["1"], "assumed: mass": ["3"]}, lighter, assumed)
+    total, bound = number("total mass at most 4 kg", {"m1": "-1"}, "4"), assumed("100")
+    document = infeasible(["m1"], [80.0], ["-4"], {total["name"]: ["1"], bound["name"]: ["3", "0"]}, total, bound)
     result = verified(document)
-    assert result.checked == ("75 %: assumed: mass (3 - m1 > 0)", "25 %: lighter (4 - m1 > 0)")
-    assert result.message == (
-        "proven: no body in the set pseudo_inertia that also meets 2 listed conditions (1 of them assumed) "
-        "has these base parameters; most of all assumed: mass"
+    assert result.checked == (
+        f"75 %: {bound['name']} (100 - m1 > 0, 100 - Lxx1 - Lyy1 - Lzz1 > 0)",
+        "25 %: total mass at most 4 kg (4 - m1 > 0)",
     )
-    document["base_parameters"]["values"] = [3.25]
+    assert result.message == (
+        f"{OWN}: no body in the set pseudo_inertia that also meets 2 listed conditions (1 of them assumed) "
+        f"has these base parameters; most of all {bound['name']}"
+    )
+    document["base_parameters"]["values"] = [76.0]
     assert "unless one on the set's boundary" in verified(document).message
-    document["base_parameters"]["values"] = [3.2]
+    document["base_parameters"]["values"] = [75.9]
     fails(document, "the dual matrices prove nothing: their value is positive")
-    document["feasibility"]["certificate"]["multipliers"] = {"lighter": ["-1"], "assumed: mass": ["5"]}
-    fails(document, "the multiplier is not positive semidefinite: lighter")
+    document["feasibility"]["certificate"]["multipliers"] = {total["name"]: ["-1"], bound["name"]: ["5", "0"]}
+    fails(document, "the multiplier is not positive semidefinite: total mass at most 4 kg")
 
 
 def test_equalities_alone_can_contradict_and_may_have_any_sign() -> None:
     for value, factor in ((0.1, "-1"), (-0.1, "1")):
-        document = infeasible(["m1", "lz1"], [1.0, value], ["0", factor], {"plane": [factor, "0"]})
+        document = infeasible(["m1", "lz1"], [1.0, value], ["0", factor], {PLANE_NAME: [factor, "0", "0"]})
         document["feasibility"]["certificate"]["equalities"] = [PLANE]
         result = verified(document)
         assert result.verdict == "infeasible", result.message
-        assert result.checked == ("plane (lz1 = 0, Lxz1 = 0)",)
+        assert result.checked == (f"{PLANE_NAME} (lz1 = 0, Lxz1 = 0, Lyz1 = 0)",)
         assert result.message == (
-            "proven: no body in the set pseudo_inertia that also meets 1 listed conditions has these base parameters"
+            f"{OWN}: no body in the set pseudo_inertia that also meets 1 listed conditions has these base parameters"
         )
         document["base_parameters"]["values"] = [1.0, 0.0]
         fails(document, "the dual matrices prove nothing: all are zero")
@@ -261,8 +286,10 @@ def test_other_numbers_of_links_are_refused(link: float) -> None:
 
 
 def matrix(size: int) -> Document:
-    """The unit matrix as a condition."""
-    entries = [{"coefficients": {}, "constant": str(int(i == j))} for j in range(size) for i in range(j + 1)]
+    """A matrix as a condition; no description has one beside its set."""
+    entries = [
+        {"coefficients": {"m1": str(int(i == j) or 2)}, "constant": "0"} for j in range(size) for i in range(j + 1)
+    ]
     return {"name": "unit", "size": size, "entries": entries}
 
 
@@ -270,7 +297,7 @@ def test_conditions_are_bounded_in_size_and_number() -> None:
     document = feasible()
     certificate = document["feasibility"]["certificate"]
     certificate["blocks"] = [matrix(MAX_SIZE)]
-    assert verified(document).verdict == "feasible"
+    fails(document, "'unit': no condition that a description can hold has this name")
     certificate["blocks"] = [matrix(MAX_SIZE + 1)]
     fails(document, "unit: a size between 0 and 20 was expected")
     certificate["blocks"] = [matrix(2) | {"size": 1}]
@@ -278,34 +305,39 @@ def test_conditions_are_bounded_in_size_and_number() -> None:
     for size in (0.5, -1):
         certificate["blocks"] = [matrix(1) | {"size": size}]
         fails(document, "unit: a size between 0 and 20 was expected")
-    certificate["blocks"] = [number(f"b{k}", {}, "1") for k in range(MAX_BLOCKS)]
+    certificate["blocks"] = [
+        number(f"total mass at most {k} kg", {"m1": "-1"}, str(k)) for k in range(2, MAX_BLOCKS + 2)
+    ]
     assert verified(document).verdict == "feasible"
-    certificate["blocks"].append(number("last", {}, "1"))
+    certificate["blocks"].append(LIGHT)
     fails(document, "certificate.blocks: more than 5000")
 
 
 def test_names_of_conditions_are_printable_short_and_told_apart() -> None:
     document = feasible()
     certificate = document["feasibility"]["certificate"]
-    certificate["blocks"] = [number("n" * 200, {}, "1")]
-    assert verified(document).verdict == "feasible"
+    certificate["blocks"] = [number("n" * 200, {"m1": "1"})]
+    fails(document, f"{'n' * 200!r}: no condition that a description can hold has this name")
     for bad in ("n" * 201, "a\nb"):
-        certificate["blocks"] = [number(bad, {}, "1")]
+        certificate["blocks"] = [number(bad, {"m1": "1"})]
         fails(document, "certificate.blocks: a name that cannot be printed")
-    for same in (SET, "plane"):
-        certificate["blocks"] = [number(same, {}, "1")]
+    for same in (SET, PLANE_NAME):
+        certificate["blocks"] = [number(same, {"m1": "1"})]
         fails(document, "the certificate has two conditions of one name")
     certificate["blocks"], certificate["equalities"] = [], [matrix(1)]
-    fails(document, "certificate.equalities: one that is a matrix")
+    fails(document, "'unit': no condition that a description can hold has this name")
 
 
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("m2", "the certificate says nothing about link 2"),
-        ("m", "'m' is not a link parameter's name"),
-        ("m10000", "the certificate says nothing about link"),
-        ("_" * 41 + "1", "is not a link parameter's name"),
+        ("m2", "the certificate says nothing about link 2, of which there is m2"),
+        ("m", "'m' is not the name of a link parameter: allowed are Lxx Lxy Lxz Lyy Lyz Lzz lx ly lz m and the joint"),
+        ("m10000", "'m10000' is not the name of a link parameter"),
+        ("m201", "'m201' is not the name of a link parameter"),
+        ("m01", "'m01' is not the name of a link parameter"),
+        ("ZZR1", "'ZZR1' is not the name of a link parameter"),
+        ("_" * 41 + "1", "is not the name of a link parameter"),
     ],
 )
 def test_parameters_belong_to_a_link(name: str, message: str) -> None:
@@ -333,14 +365,13 @@ def test_the_file_and_its_certificate_are_about_one_set(claimed: str, fits: bool
 
 def test_the_bounds_of_what_is_read_are_the_ones_decided_on() -> None:
     # Every other test takes them from the code.
-    assert (certificate_reader.MAX_CHARACTERS, MAX_LINKS, MAX_BLOCKS, MAX_SIZE) == (67_108_864, 200, 5000, 20)
-    assert (exact.MAX_CHARACTERS, exact._MAX_BITS) == (2000, 100_000)
+    assert (certificate_verifier.MAX_FILE_CHARACTERS, MAX_LINKS, MAX_BLOCKS, MAX_SIZE) == (67_108_864, 200, 5000, 20)
+    assert (certificate_verifier.MAX_NUMBER_CHARACTERS, certificate_verifier._MAX_BITS) == (2000, 100_000)
 
 
 def test_a_file_is_read_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     content, path = json.dumps(feasible()), tmp_path / "parameters.json"
-    for module in (certificate_reader, service):
-        monkeypatch.setattr(module, "MAX_CHARACTERS", len(content))
+    monkeypatch.setattr(certificate_verifier, "MAX_FILE_CHARACTERS", len(content))
     path.write_text(content, encoding="utf-8")
     assert service.verify_file(path).verdict == "feasible"
     # Without the character that is too many it would be a good file.
@@ -350,7 +381,7 @@ def test_a_file_is_read_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.
 
 def test_numbers_are_bounded_in_length() -> None:
     assert rational("0" * 1999 + "7") == 7
-    with pytest.raises(ParameterError, match="a number of 2001 characters; at most 2000 are read"):
+    with pytest.raises(VerificationError, match="a number of 2001 characters; at most 2000 are read"):
         rational("0" * 2000 + "7")
 
 
@@ -372,10 +403,10 @@ def test_definiteness_is_decided_by_the_last_pivot_after_all_eliminations(
 def test_a_matrix_whose_numbers_grow_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     third = Fraction(1, 3)
     matrix = symmetric([Fraction(1), third, Fraction(1)], 2)
-    monkeypatch.setattr(exact, "_MAX_BITS", 4)  # 1 - 1/9 has a denominator of four bits
+    monkeypatch.setattr(certificate_verifier, "_MAX_BITS", 4)  # 1 - 1/9 has a denominator of four bits
     assert is_positive_definite(matrix)
-    monkeypatch.setattr(exact, "_MAX_BITS", 3)
-    with pytest.raises(ParameterError, match="more digits than a proof may have"):
+    monkeypatch.setattr(certificate_verifier, "_MAX_BITS", 3)
+    with pytest.raises(VerificationError, match="more digits than a proof may have"):
         is_positive_definite(matrix)
 
 
@@ -397,7 +428,7 @@ def test_what_is_told_of_a_file_is_one_line_of_bounded_length() -> None:
     document["feasibility"]["certificate"] = {"kind": "undecided", "reason": "why\n" + 1000 * "x"}
     result = verified(document)
     assert result.verdict == "undecided"
-    assert result.message == "no proof either way: why?" + 475 * "x"
+    assert result.message == "no proof either way; the file gives the reason 'why\\n" + 296 * "x" + "'"
 
 
 def test_a_file_that_is_not_there_is_named_once(tmp_path: Path) -> None:

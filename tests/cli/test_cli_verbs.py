@@ -27,6 +27,7 @@ RUN_FILES = [
     "score.json",
     "validation.excitation.json",
     "validation.mcap",
+    "verify.py",
 ]
 FEASIBLE = {"expressions": ["m1", "Lzz1"], "values": [1.0, 0.2]}
 INFEASIBLE = {"expressions": ["m1", "Lzz1"], "values": [-1.0, 0.2]}
@@ -98,9 +99,17 @@ def test_identify_in_words(quick: Commissioned, ident: Ident, tmp_path: Path) ->
     ended = ident("identify", recording, "--arm", quick.arm, "--validate", unseen, "--out", out)
     assert ended.code == 0
     assert ended.err == ""
-    assert f"files: {out}\n  parameters.json\n  arm.json\n  identified.urdf\n  report.txt\n" in ended.out
+    assert f"files: {out}\n  parameters.json\n  arm.json\n  identified.urdf\n  report.txt\n  verify.py\n" in ended.out
     assert "  evidence.json\n  report.html\n" in ended.out
-    made = ["evidence.json", "identified.urdf", "manifest.json", "parameters.json", "report.html", "report.txt"]
+    made = [
+        "evidence.json",
+        "identified.urdf",
+        "manifest.json",
+        "parameters.json",
+        "report.html",
+        "report.txt",
+        "verify.py",
+    ]
     assert left_over(out) == ["arm.json", *made]
     # The same recordings give the same numbers as the whole job did.
     one, other = (read_parameters(folder / "parameters.json").values for folder in (out, quick.folder))

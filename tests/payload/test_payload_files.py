@@ -14,7 +14,7 @@ import pytest
 from compare.conftest import Ident
 from helpers.changed_arms import COARSE, changed, identified_folder, recorded_arm
 
-from ident_service.estimation.proof.certificate_exact import verify
+from ident_service.certificate_verifier import verify
 from ident_service.results.run_folder import read_results
 from ident_service.service.verify import verify_file
 
