@@ -906,7 +906,7 @@ def _require_arm(document: dict[str, object], claim: Claim, printed: Row, arm: A
 
 def _require_units(document: dict[str, object], arm: Arm) -> None:
     table = document.get("link_parameters")
-    if not isinstance(table, dict) or "units" not in table:
+    if not arm.units or not isinstance(table, dict) or "units" not in table:
         return
     units = dict(zip(arm.names, arm.units, strict=True))
     if table["units"] != [units[name] for name in table["names"]]:
@@ -993,6 +993,7 @@ def _dual(certificate: dict[str, object], claim: Claim, arm: str | None) -> Veri
     body = _as_numbers_by_name(certificate["body"], "certificate.body")
     _require_names(frozenset(body), claim.names, "certificate.body")
     _require_met(body, claim, "the certificate's body, so the conditions may contradict each other")
+    _require_far_bounds(claim)
     y = _as_numbers(certificate.get("base"), "certificate.base")
     if len(y) != len(claim.K):
         raise VerificationError(f"certificate.base: {len(y)} multipliers for {len(claim.K)} base parameters")
@@ -1034,6 +1035,14 @@ def _dual(certificate: dict[str, object], claim: Claim, arm: str | None) -> Veri
     if arm is None:
         return Verification("infeasible", f"consistent with its own conditions: infeasible: {message}", tuple(checked))
     return Verification("infeasible", f"proven for {arm}: {message}", tuple(checked), arm)
+
+
+def _require_far_bounds(claim: Claim) -> None:
+    """Refuse assumed bounds that an arm with these base parameters could come near to."""
+    least = _LEAST_ASSUMED * max(1, *map(abs, claim.beta))
+    for block in claim.blocks:
+        if is_assumed(block.name) and block.entries[0].constant < least:
+            raise VerificationError(f"{block.name}: is less than {_LEAST_ASSUMED} times the largest base parameter")
 
 
 def _disproof(claim: Claim, value: Fraction, names: Sequence[str], equalities: int) -> str:

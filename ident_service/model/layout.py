@@ -117,7 +117,9 @@ class Layout:
         """
         index = {name: column for column, name in enumerate(self.names)}
         if unknown := [name for name in table.names if name not in index]:
-            raise ParameterError(f"parameters this arm does not have: {', '.join(unknown)}")
+            raise ParameterError(
+                f"parameters this arm does not have: {', '.join(unknown)}; it has {self.names[0]} ... {self.names[-1]}"
+            )
         delta = np.zeros(self.size)
         for name, value in zip(table.names, table.values, strict=True):
             delta[index[name]] = value

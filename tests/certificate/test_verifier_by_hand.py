@@ -197,7 +197,8 @@ def assumed(bound: str) -> Document:
 
 def test_shares_are_those_of_the_weights() -> None:
     total, bound = number("total mass at most 4 kg", {"m1": "-1"}, "4"), assumed("100")
-    document = infeasible(["m1"], [80.0], ["-4"], {total["name"]: ["1"], bound["name"]: ["3", "0"]}, total, bound)
+    weights = {total["name"]: ["1"], bound["name"]: ["3", "0"]}
+    document = infeasible(["0.001*m1"], [0.08], ["-4000"], weights, total, bound)
     result = verified(document)
     assert result.checked == (
         f"75 %: {bound['name']} (100 - m1 > 0, 100 - Lxx1 - Lyy1 - Lzz1 > 0)",
@@ -207,12 +208,28 @@ def test_shares_are_those_of_the_weights() -> None:
         f"{OWN}: no body in the set pseudo_inertia that also meets 2 listed conditions (1 of them assumed) "
         f"has these base parameters; most of all {bound['name']}"
     )
-    document["base_parameters"]["values"] = [76.0]
+    document["base_parameters"]["values"] = [0.076]
     assert "unless one on the set's boundary" in verified(document).message
-    document["base_parameters"]["values"] = [75.9]
+    document["base_parameters"]["values"] = [0.0759]
     fails(document, "the dual matrices prove nothing: their value is positive")
     document["feasibility"]["certificate"]["multipliers"] = {total["name"]: ["-1"], bound["name"]: ["5", "0"]}
     fails(document, "the multiplier is not positive semidefinite: total mass at most 4 kg")
+
+
+def test_what_is_assumed_lies_far_beyond_the_base_parameters() -> None:
+    for bound, value, kept in (
+        ("100", 1.0, True),
+        ("1000", -10.0, True),
+        ("1000", 10.1, False),
+        ("1000", -11.0, False),
+    ):
+        condition = assumed(bound)
+        document = infeasible(["lx1"], [value], ["0"], {}, condition)
+        why = f"{condition['name']}: is less than 100 times the largest base parameter"
+        fails(document, "the dual matrices prove nothing: all are zero" if kept else why)
+    light = assumed("99")
+    document = infeasible(["lx1"], [0.1], ["0"], {}, light)
+    fails(document, f"{light['name']}: is named as something it is not: 99 - m1, 99 - Lxx1 - Lyy1 - Lzz1")
 
 
 def test_equalities_alone_can_contradict_and_may_have_any_sign() -> None:
