@@ -1039,7 +1039,7 @@ def _dual(certificate: dict[str, object], claim: Claim, arm: str | None) -> Veri
 
 def _require_far_bounds(claim: Claim) -> None:
     """Refuse assumed bounds that an arm with these base parameters could come near to."""
-    least = _LEAST_ASSUMED * max(1, *map(abs, claim.beta))
+    least = _LEAST_ASSUMED * max([Fraction(1), *map(abs, claim.beta)])
     for block in claim.blocks:
         if is_assumed(block.name) and block.entries[0].constant < least:
             raise VerificationError(f"{block.name}: is less than {_LEAST_ASSUMED} times the largest base parameter")

@@ -9,7 +9,8 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -614,3 +615,21 @@ def test_options_of_the_identification_leave_the_arm_the_same(
         code, words = verified(changes=changes)
         assert code == 3, changes
         assert "made for another description" in words
+
+
+@pytest.mark.parametrize(("change", "good"), [(1e-10, True), (-1e-10, True), (1.1e-10, False), (-1.1e-10, False)])
+def test_expressions_of_an_arm_may_differ_in_their_last_decimal(made: Made, change: float, good: bool) -> None:
+    """Coefficients are rounded to eleven decimals, and processors differ in the last."""
+    arm = replace(made.arm, K=({**made.arm.K[0], "Ia1": 1 + Fraction(repr(change))}, *made.arm.K[1:]))
+    assert (verify(json.dumps(made.witness), arm).verdict == "feasible") is good
+
+
+def test_expressions_of_an_arm_may_stand_in_another_order(made: Made) -> None:
+    document = copy.deepcopy(made.witness)
+    for values in document["base_parameters"].values():
+        values.reverse()
+    assert verify(json.dumps(document), made.arm).verdict == "feasible"
+    # Each once.
+    table = document["base_parameters"]
+    table["expressions"][0], table["values"][0] = table["expressions"][1], table["values"][1]
+    assert verify(json.dumps(document), made.arm).verdict == "failed"

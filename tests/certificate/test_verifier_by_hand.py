@@ -21,9 +21,12 @@ from ident_service.certificate_verifier import (
     MAX_SIZE,
     Verification,
     VerificationError,
+    dependent_row,
     is_positive_definite,
     is_positive_semidefinite,
+    parse_expression,
     rational,
+    rational_text,
     symmetric,
     verify,
 )
@@ -384,6 +387,39 @@ def test_the_bounds_of_what_is_read_are_the_ones_decided_on() -> None:
     # Every other test takes them from the code.
     assert (certificate_verifier.MAX_FILE_CHARACTERS, MAX_LINKS, MAX_BLOCKS, MAX_SIZE) == (67_108_864, 200, 5000, 20)
     assert (certificate_verifier.MAX_NUMBER_CHARACTERS, certificate_verifier._MAX_BITS) == (2000, 100_000)
+    assert certificate_verifier._MAX_STEPS == 20_000_000
+
+
+def test_numbers_are_written_up_to_a_length() -> None:
+    assert rational(rational_text(Fraction(2**5999))) == 2**5999
+    assert rational(rational_text(Fraction(1, 3 * 2**5990))) == Fraction(1, 3 * 2**5990)
+    for long in (Fraction(2**6000), Fraction(1, 2**6000)):
+        with pytest.raises(VerificationError, match="a number needs more than 2000 characters"):
+            rational_text(long)
+
+
+def test_dependent_expressions_are_found() -> None:
+    rows = [parse_expression(text) for text in ("m1 + 3*lx1", "lx1 - 0.1*ly1", "ly1 + lz1", "m1 - 0.7*lz1")]
+    assert dependent_row(rows) is None
+    assert dependent_row([*rows, parse_expression("m1 + 3.1*lx1 + 2*ly1")]) == 4
+    assert dependent_row([rows[0], rows[1], parse_expression("2*m1 + 5*lx1 + 0.1*ly1")]) == 2
+    assert dependent_row([{}]) == 0
+
+
+def test_hostile_expressions_end_in_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Independent, but not modulo the prime; and one that the prime divides.
+    prime = Fraction(2**61 - 1)
+    assert dependent_row([{"m1": Fraction(1)}, {"m1": Fraction(1), "lx1": prime}]) == 1
+    with pytest.raises(VerificationError, match="base parameter 1: a coefficient that no real table has"):
+        dependent_row([{"m1": 1 / prime}])
+    dense = [{f"m{k}": Fraction(1, k + row) for k in range(1, 5)} for row in range(4)]
+    assert dependent_row(dense) is None
+    # The second row takes four steps, the third four and three, the fourth four, three and two.
+    monkeypatch.setattr(certificate_verifier, "_MAX_STEPS", 20)
+    assert dependent_row(dense) is None
+    monkeypatch.setattr(certificate_verifier, "_MAX_STEPS", 19)
+    with pytest.raises(VerificationError, match="more arithmetic than those of a real table"):
+        dependent_row(dense)
 
 
 def test_a_file_is_read_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -453,3 +489,67 @@ def test_a_file_that_is_not_there_is_named_once(tmp_path: Path) -> None:
     with pytest.raises(UsageError) as caught:
         service.verify_file(path)
     assert str(caught.value) == f"{path}: No such file or directory"
+
+
+def rows(*entries: tuple[dict[str, str], str]) -> list[Document]:
+    return [{"coefficients": coefficients, "constant": constant} for coefficients, constant in entries]
+
+
+def box(lower: str, upper: str) -> list[Document]:
+    """A box around the origin, its first side between two numbers."""
+    sides = [({"lx1": "1", "m1": lower}, "0"), ({"lx1": "-1", "m1": upper}, "0")]
+    for name in ("ly1", "lz1"):
+        sides += [({name: "1", "m1": "1"}, "0"), ({name: "-1", "m1": "1"}, "0")]
+    return rows(*sides)
+
+
+def ellipsoid(xx: str, mass: str) -> list[Document]:
+    """With xx = -5/2 and mass = 1/2: W = diag(2, 4, 3) around c = (0.5, 0, 0), so 2 W c = (2, 0, 0) and c W c = 0.5."""
+    coefficients = {"Lxx1": xx, "Lyy1": "-1/2", "Lzz1": "-3/2", "lx1": "2", "m1": mass}
+    return rows((coefficients, "0"))
+
+
+PLANES = [({"lx1": sign, "m1": "1"}, "0") for sign in ("1", "-1")] + [({"ly1": sign, "m1": "1"}, "0") for sign in "12"]
+
+
+@pytest.mark.parametrize(
+    ("name", "entries", "good"),
+    [
+        ("link 1: mass within 0.5..2 kg", rows(({"m1": "1"}, "-0.5"), ({"m1": "-1"}, "2")), True),
+        ("link 1: mass within 0..2.33333 kg", rows(({"m1": "1"}, "0"), ({"m1": "-1"}, "7/3")), True),
+        ("link 1: mass within 1..1 kg", rows(({"m1": "1"}, "-1"), ({"m1": "-1"}, "1")), False),
+        ("link 1: mass within 0.5..2 kg", rows(({"m1": "1"}, "-0.6"), ({"m1": "-1"}, "2")), False),
+        ("link 1: mass within 0.5..2 kg", rows(({"m1": "1"}, "-0.5"), ({"m1": "-1"}, "1.9")), False),
+        ("link 1: mass within 0.5..2 kg", rows(({"m1": "1"}, "-0.5"), ({"m1": "-1"}, "2"), ({"m1": "1"}, "1")), False),
+        ("total mass at least 0.5 kg", rows(({"m1": "1"}, "-0.5")), True),
+        ("total mass at most 3 kg", rows(({"m1": "-1"}, "3")), True),
+        ("total mass at least 3 kg", rows(({"m1": "-1"}, "3")), False),
+        ("total mass at least 0 kg", rows(({"m1": "1"}, "0")), False),
+        ("total mass at most 1e+400 kg", rows(({"m1": "-1"}, "1e400")), False),
+        ("link 1: centre of mass inside its box", box("0.1", "0.2"), True),
+        ("link 1: centre of mass inside its box", box("0.2", "-0.1"), True),
+        ("link 1: centre of mass inside its box", box("0.2", "-0.2"), False),
+        ("link 1: centre of mass inside its hull", rows(*PLANES), True),
+        ("link 1: centre of mass inside its hull", rows(*PLANES[:3]), False),
+        ("link 1: all mass inside its ellipsoid", ellipsoid("-5/2", "1/2"), True),
+        ("link 1: all mass inside its ellipsoid", ellipsoid("-5/2", "0.5000000014"), True),
+        ("link 1: all mass inside its ellipsoid", ellipsoid("-5/2", "0.5000000016"), False),
+        ("link 1: all mass inside its ellipsoid", ellipsoid("-5/2", "0.4999999984"), False),
+        ("link 1: all mass inside its ellipsoid", ellipsoid("2", "1/2"), False),
+        ("joint 1: drive inertia positive", rows(({"Ia1": "1"}, "0")), True),
+        ("joint 1: drive inertia positive", rows(({"Ia1": "1"}, "1")), False),
+        ("joint 1: viscous positive", rows(({"fv1": "1"}, "0")), True),
+        ("joint 1: viscous positive", rows(({"fc1": "1"}, "0")), False),
+        ("joint 1: offset positive", rows(({"fo1": "1"}, "0")), False),
+    ],
+)
+def test_a_condition_is_what_its_name_says(name: str, entries: list[Document], good: bool) -> None:
+    document = infeasible(["lx1"], [0.1], ["0"], {}, {"name": name, "size": 0, "entries": entries})
+    names = {key for entry in entries for key in entry["coefficients"]}
+    document["feasibility"]["certificate"]["body"] |= dict.fromkeys(names - BODY.keys(), "1")
+    document["feasibility"]["certificate"]["body"]["m1"] = "1"
+    result = verified(document)
+    assert result.verdict == "failed"
+    # What is a condition gets as far as the body, or to multipliers that are all zero.
+    named = "is named as something it is not" in result.message or "no condition that a description" in result.message
+    assert named is not good, result.message
