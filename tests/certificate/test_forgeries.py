@@ -19,11 +19,13 @@ import pytest
 import yaml
 from certificate_samples import random_bodies
 
-from ident_service.certificate_verifier import Arm, verify
+from ident_service.certificate_verifier import INERTIAL, Arm, rational_text, verify
 from ident_service.cli import main
 from ident_service.config.load import load_arm, shipped_arms
+from ident_service.config.schema import Ellipsoid
 from ident_service.estimation.feasible.feasible_set import feasible_set
 from ident_service.estimation.proof.certificate import certify, stated_arm
+from ident_service.estimation.proof.certificate_rounding import exact_block
 from ident_service.model.arm_model import arm_model
 from ident_service.model.base import base_parameters
 
@@ -633,3 +635,35 @@ def test_expressions_of_an_arm_may_stand_in_another_order(made: Made) -> None:
     table = document["base_parameters"]
     table["expressions"][0], table["values"][0] = table["expressions"][1], table["values"][1]
     assert verify(json.dumps(document), made.arm).verdict == "failed"
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_an_ellipsoid_of_any_direction_is_one(made: Made, seed: int) -> None:
+    """What a description's ellipsoid becomes is recognised, and nothing that differs in one of its numbers."""
+    rng = np.random.default_rng(seed)
+    axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    config = load_arm(made.description)
+    joint = next(iter(config.joints.values()))
+    ellipsoid = {"center": rng.uniform(-0.05, 0.05, 3).tolist(), "axes": axes.tolist(), "semi_axes": [0.9, 0.8, 0.7]}
+    body = joint.body.model_copy(update={"ellipsoid": Ellipsoid.model_validate(_tuples(ellipsoid)), "symmetry": ()})
+    joints = dict.fromkeys(config.joints, joint.model_copy(update={"body": body}))
+    names = made.arm.names
+    conditions = feasible_set("pseudo_inertia", names, config.model_copy(update={"joints": joints}))
+    document = copy.deepcopy(made.witness)
+    (found,) = (block for block in conditions.blocks if block.name == ELLIPSOID)
+    (entry,) = exact_block(found, names).entries
+    numbers = {name: rational_text(value) for name, value in entry.coefficients.items()}
+    assert len(numbers) == len(INERTIAL)
+    listed(ELLIPSOID, {"coefficients": numbers, "constant": "0"})(document)
+    assert verify(json.dumps(document)).verdict == "feasible", verify(json.dumps(document)).message
+    for name in numbers:
+        document = copy.deepcopy(made.witness)
+        changed = numbers | {name: repr(float(numbers[name]) + 1.0)}
+        listed(ELLIPSOID, {"coefficients": changed, "constant": "0"})(document)
+        assert IS_NOT in verify(json.dumps(document)).message, name
+
+
+def _tuples(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _tuples(one) for key, one in value.items()}
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value

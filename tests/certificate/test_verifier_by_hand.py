@@ -21,6 +21,7 @@ from ident_service.certificate_verifier import (
     MAX_SIZE,
     Verification,
     VerificationError,
+    clean,
     dependent_row,
     is_positive_definite,
     is_positive_semidefinite,
@@ -476,6 +477,10 @@ def test_what_must_be_a_text_is_one(bad: object) -> None:
     fails(document, "link_parameters.names: a text was expected")
 
 
+def test_a_line_for_a_terminal_has_at_most_500_characters() -> None:
+    assert clean("a\x1b" + 600 * "x") == "a?" + 498 * "x"
+
+
 def test_what_is_told_of_a_file_is_one_line_of_bounded_length() -> None:
     document = feasible()
     document["feasibility"]["certificate"] = {"kind": "undecided", "reason": "why\n" + 1000 * "x"}
@@ -530,6 +535,7 @@ PLANES = [({"lx1": sign, "m1": "1"}, "0") for sign in ("1", "-1")] + [({"ly1": s
         ("link 1: centre of mass inside its box", box("0.2", "-0.1"), True),
         ("link 1: centre of mass inside its box", box("0.2", "-0.2"), False),
         ("link 1: centre of mass inside its hull", rows(*PLANES), True),
+        ("link 1: centre of mass inside its hull", rows(*PLANES, ({"lz1": "1", "m1": "1"}, "0")), True),
         ("link 1: centre of mass inside its hull", rows(*PLANES[:3]), False),
         ("link 1: all mass inside its ellipsoid", ellipsoid("-5/2", "1/2"), True),
         ("link 1: all mass inside its ellipsoid", ellipsoid("-5/2", "0.5000000014"), True),
