@@ -19,6 +19,7 @@ from ident_service.certificate_verifier import (
     MAX_BLOCKS,
     MAX_LINKS,
     MAX_SIZE,
+    Affine,
     Verification,
     VerificationError,
     clean,
@@ -475,6 +476,13 @@ def test_what_must_be_a_text_is_one(bad: object) -> None:
     document = feasible()
     document["link_parameters"]["names"][0] = bad
     fails(document, "link_parameters.names: a text was expected")
+
+
+def test_inequalities_are_shown_with_their_signs() -> None:
+    half = Fraction(1, 2)
+    assert str(Affine({"m1": Fraction(-1), "lx1": -half, "ly1": half})) == "-m1 - 0.5*lx1 + 0.5*ly1"
+    assert str(Affine({"m1": Fraction(1)}, -half)) == "-0.5 + m1"
+    assert str(Affine({})) == "0"
 
 
 def test_a_line_for_a_terminal_has_at_most_500_characters() -> None:
