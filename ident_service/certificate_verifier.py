@@ -456,11 +456,7 @@ def _ellipsoid(words: Mapping[str, str], entries: Entries, _: Sequence[int]) -> 
     row = {name: entries[0].coefficients.get(name, Fraction(0)) for name in names}
     xx, xy, xz, yy, yz, zz, *first, mass = row.values()
     trace = -2 * (xx + yy + zz)
-    W = [
-        [xx + trace / 2, xy / 2, xz / 2],
-        [xy / 2, yy + trace / 2, yz / 2],
-        [xz / 2, yz / 2, zz + trace / 2],
-    ]
+    W = symmetric([xx + trace / 2, xy / 2, yy + trace / 2, xz / 2, yz / 2, zz + trace / 2], 3)
     if not is_positive_definite(W):
         return None
     # c W c from 2 W c, as the Schur complement of W in [[W, Wc], [c^T W, 0]].
