@@ -6,6 +6,9 @@ LOCK   ?= constraints.txt
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
+# Set, it has each of a thousand child processes of the tests compile the whole package anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test unit coverage lint types bench bench-design bench-canopen bench-serve bench-viewers campaign mutants \
 	test-socketcan test-foreign test-latest lock clean
 

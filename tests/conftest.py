@@ -25,7 +25,7 @@ _SHARED = Path(__file__).resolve().parents[2] / "shared"
 # The only reasons to skip with CI=true: what no package gives a machine, and what CI runs by a command of its own.
 _ALLOWED = (
     "this machine grants no real time",
-    "this processor has no AVX-512",
+    "this processor has no AVX2",
     "only root can become somebody else",
     "`make test-socketcan` runs it",
     "`make test-foreign` runs it",

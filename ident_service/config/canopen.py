@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import configparser
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -188,6 +189,7 @@ class CanopenDriver(Section):
         return self
 
 
+@lru_cache(maxsize=8)
 def maps_dummies(eds: str) -> bool:
     """Whether a drive lets 16 bits of a torque frame be another drive's: `Dummy0003=1` of its EDS (CiA 306-1).
 
@@ -203,6 +205,7 @@ def maps_dummies(eds: str) -> bool:
         return False
 
 
+@lru_cache(maxsize=8)
 def eds_mistake(eds: str) -> str | None:
     """Why a text is no EDS (CiA 306-1: an ini file with the section DeviceInfo); None where it may be one."""
     parser = configparser.ConfigParser(strict=False, interpolation=None)

@@ -8,14 +8,16 @@ blocks are few.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from ident_service.estimation.equations import Equations
 from ident_service.estimation.least_squares import LeastSquares
 from ident_service.model.chain import Array
 from ident_service.model.threads import one_blas_thread
+
+if TYPE_CHECKING:
+    from ident_service.estimation.equations import Equations
 
 Verdict = Literal["identified", "weak", "unidentified"]
 

@@ -32,7 +32,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-import scipy.stats
+import scipy.special
 
 from ident_service.errors import ParameterError
 from ident_service.model.chain import Array
@@ -342,9 +342,9 @@ def difference_test(first: Identified, second: Identified, places: Sequence[int]
 def probability(statistic: float, directions: int, degrees: float) -> float:
     """How often a larger T^2 comes about by chance, with `degrees` of freedom of its covariances."""
     if np.isinf(degrees):
-        return float(scipy.stats.chi2.sf(statistic, directions))
+        return float(scipy.special.chdtrc(directions, statistic))
     below = max(degrees - directions + 1.0, 1.0)
-    return float(scipy.stats.f.sf(statistic * below / (degrees * directions), directions, below))
+    return float(scipy.special.fdtrc(directions, below, statistic * below / (degrees * directions)))
 
 
 def _degrees(parts: Sequence[Array], blocks: Sequence[int | None]) -> float:

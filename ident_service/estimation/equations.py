@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import cached_property, reduce
 
 import numpy as np
-import scipy.signal
 from numpy.typing import NDArray
 
 from ident_service.config.schema import Identification
@@ -24,6 +23,7 @@ from ident_service.model.chain import Array
 from ident_service.model.information import Information, information_of, supports
 from ident_service.model.regressor import joint_regressor
 from ident_service.model.threads import one_blas_thread
+from ident_service.model.zero_phase import low_pass
 from ident_service.record.recording import Recording
 
 MAX_BLOCKS = 256
@@ -192,14 +192,14 @@ def _filtered_rows(recording: Recording, model: ArmModel, base: BaseParameters, 
     for window in windows(recording, options, model.chain.coupling, model.config.recording, memory):
         motion = window.motion
         rate = 1.0 / float(np.median(np.diff(motion.time)))
-        sos = scipy.signal.butter(options.smoothing.order, cutoff, fs=rate, output="sos")
         inner = np.arange(len(motion.time))[window.inner][(-offset) % step :: step]
         offset += len(range(len(motion.time))[window.inner])
         H = _regressor(motion, model, base)
         filtered = np.zeros((*H.shape[:2], len(inner)))
         for joint, support in enumerate(supports(model.chain, model.layout, base.base)):
-            filtered[joint, support] = scipy.signal.sosfiltfilt(sos, H[joint, support], axis=-1)[:, inner]
-        torque = scipy.signal.sosfiltfilt(sos, motion.torque, axis=0)
+            columns = low_pass(H[joint, support].T, options.smoothing.order, cutoff, rate)
+            filtered[joint, support] = columns[inner].T
+        torque = low_pass(motion.torque, options.smoothing.order, cutoff, rate)
         motion = motion[inner]
         yield Rows(motion.time, filtered, torque[inner], motion.keep, motion.position, motion.velocity)
 

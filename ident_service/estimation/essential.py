@@ -24,7 +24,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.stats
+import scipy.special
 from numpy.typing import NDArray
 
 from ident_service.errors import ModelError
@@ -121,7 +121,7 @@ def essential_parameters(
         new_values, new_deviations = _refit(fit, spread, rest)
         removed = len(done) + 1
         lost = float(np.sum((fit.rho1 - fit.R1[:, rest] @ new_values) ** 2)) / removed
-        F, critical = lost / noise, float(scipy.stats.f.isf(level, removed, samples - size))
+        F, critical = lost / noise, float(scipy.special.fdtri(removed, samples - size, 1.0 - level))
         step = Elimination(int(kept[weakest]), float(ratio[weakest]), F, critical)
         if critical < F:
             refused = step

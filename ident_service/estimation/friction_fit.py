@@ -16,10 +16,12 @@ from functools import reduce
 from itertools import product
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 
 from ident_service.config.schema import FrictionShape
-from ident_service.estimation.equations import Equations, equations
+from ident_service.estimation.equations import Equations
+from ident_service.estimation.friction_trials import FOLDS, FrictionTrials
 from ident_service.estimation.least_squares import weighted_least_squares
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters
@@ -35,7 +37,6 @@ _GRIDS: dict[str, Array] = {
 }
 _FINER = np.array([0.6, 0.8, 1.0, 1.25, 1.6])
 _ROUNDS = 2
-_FOLDS = 3
 _RATE = 125.0  # Hz; friction changes slowly enough to be fitted on fewer rows
 
 
@@ -74,7 +75,7 @@ def fit_friction(recordings: Sequence[Recording], model: ArmModel, base: BasePar
         for key in _GRIDS
     }
     if wanted:
-        search = _Search(recordings, _thinned(model, recordings), base)
+        search = _Search(FrictionTrials(recordings, _thinned(model, recordings), base), model, base)
         found = [
             search.finer(start, wanted) for start in (search.in_turn(values, wanted), search.pairs(values, wanted))
         ]
@@ -87,7 +88,7 @@ _Numbers = dict[str, Array]
 
 @dataclass(frozen=True)
 class _Search:
-    recordings: Sequence[Recording]
+    trials: FrictionTrials
     model: ArmModel
     base: BaseParameters
 
@@ -116,17 +117,30 @@ class _Search:
 
     def best(self, values: _Numbers, trials: Sequence[_Numbers], *, predicting: bool = False) -> _Numbers:
         """Per drive, the trial that leaves its joint the smallest residual, or predicts its torque best."""
+        # Joints weigh alike in all trials, as the values that were best so far have it.
+        weights = weighted_least_squares(self._equations(values).total).weights
         left = []
         for trial in trials:
-            tried = with_friction(self.model, _shape(values | trial))
-            gathered = reduce(Equations.joined, (equations(one, tried, self.base) for one in self.recordings))
-            beta = weighted_least_squares(gathered.total).beta
+            gathered = self._equations(values | trial)
+            beta = _solved(gathered.total, weights)
             terms = _own_terms(self.model, self.base)
             left.append(_unpredicted(gathered, beta, terms) if predicting else gathered.total.squared_residuals(beta))
         choice = np.argmin(np.array(left), axis=0)
         return values | {
             key: np.array([trials[index][key][drive] for drive, index in enumerate(choice)]) for key in trials[0]
         }
+
+    def _equations(self, values: _Numbers) -> Equations:
+        return self.trials.equations(values["presliding"], values["stribeck_velocity"])
+
+
+def _solved(information: Information, weights: Array) -> Array:
+    """Solve eq. 60 alone, without what `least_squares` says about its quality."""
+    R = information.stacked(weights)
+    norms = np.linalg.norm(R[:, :-1], axis=0)
+    unit = np.where(norms > 0.0, norms, 1.0)
+    # By columns of unit length, with pivots: a shape may make two columns of a drive alike.
+    return np.asarray(scipy.linalg.lstsq(R[:, :-1] / unit, R[:, -1], cond=1e-10, lapack_driver="gelsy")[0] / unit)
 
 
 def _own_terms(model: ArmModel, base: BaseParameters) -> NDArray[np.bool_]:
@@ -136,8 +150,8 @@ def _own_terms(model: ArmModel, base: BaseParameters) -> NDArray[np.bool_]:
 
 def _unpredicted(gathered: Equations, beta: Array, terms: NDArray[np.bool_]) -> Array:
     """Per joint, the squared errors of each third as predicted from the other two, shape (joints,)."""
-    thirds = [part for part in np.array_split(np.arange(len(gathered.blocks)), _FOLDS) if len(part)]
-    if len(thirds) < _FOLDS:
+    thirds = [part for part in np.array_split(np.arange(len(gathered.blocks)), FOLDS) if len(part)]
+    if len(thirds) < FOLDS:
         return gathered.total.squared_residuals(beta)
     merged = [reduce(Information.merged, [gathered.blocks[index] for index in part]) for part in thirds]
     total = np.zeros(gathered.total.joints)

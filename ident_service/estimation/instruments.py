@@ -30,7 +30,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-import scipy.signal
 from numpy.typing import NDArray
 
 from ident_service.errors import ModelError
@@ -42,6 +41,7 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.information import supports
+from ident_service.model.zero_phase import low_pass
 from ident_service.record.grid import grid
 from ident_service.record.recording import BLOCK_SAMPLES, Block, Recording, Stamps, join
 from ident_service.record.segments import uniform
@@ -280,7 +280,6 @@ def simulated(
     stamps = grid(reference, fmt)
     if not 0.0 < cutoff < 0.5 / stamps.period_s:
         raise ModelError(f"a cut-off of {cutoff:g} Hz at {1.0 / stamps.period_s:.4g} Hz is not possible")
-    sos = scipy.signal.butter(_ORDER, cutoff, fs=1.0 / stamps.period_s, output="sos")
     loop = _Loop(model, delta, stamps.period_s, commanded)
     held: list[Block] = []
     stretches = []
@@ -291,8 +290,8 @@ def simulated(
             held = []
             if len(whole.stamp_ns) > 1:
                 pad = min(3 * int(1.0 / (cutoff * stamps.period_s)), len(whole.stamp_ns) - 1)
-                position = scipy.signal.sosfiltfilt(sos, whole.position, axis=0, padlen=pad)
-                stretches.append((whole.stamp_ns, loop.follow(np.asarray(position))))
+                position = low_pass(whole.position, _ORDER, cutoff, 1.0 / stamps.period_s, pad)
+                stretches.append((whole.stamp_ns, loop.follow(position)))
     return SimulatedRecording(recording, stretches)
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.ndimage
 from numpy.typing import NDArray
 
 from ident_service.config.recording import RecordingFormat
@@ -18,6 +17,7 @@ from ident_service.config.schema import Identification
 from ident_service.errors import RecordingError
 from ident_service.estimation.direction import direction
 from ident_service.estimation.smoothing import Motion
+from ident_service.model.zero_phase import widened
 from ident_service.record.grid import grid
 from ident_service.record.recording import Recording
 from ident_service.record.segments import uniform
@@ -123,9 +123,7 @@ def _motion(
     near |= np.signbit(rate) != np.signbit(np.roll(rate, 1, axis=0))
     reach = round(options.reversal.window / step)
     if reach:
-        near = scipy.ndimage.binary_dilation(
-            np.concatenate([near[-reach:], near, near[:reach]]), np.ones((2 * reach + 1, 1), dtype=bool)
-        )[reach:-reach]
+        near = widened(np.concatenate([near[-reach:], near, near[:reach]]), reach)[reach:-reach]
     shape = options.friction.presliding
     presliding = np.broadcast_to(np.asarray(0.0 if shape == "fit" else shape, dtype=float), (joints,))
     # Once round to find the direction that the period begins with.

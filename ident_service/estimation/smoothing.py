@@ -15,14 +15,13 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.ndimage
-import scipy.signal
 from numpy.typing import NDArray
 
 from ident_service.config.recording import RecordingFormat
 from ident_service.config.schema import Identification
 from ident_service.errors import RecordingError
 from ident_service.estimation.direction import direction
+from ident_service.model.zero_phase import local_polynomial, low_pass, widened
 from ident_service.record.grid import grid
 from ident_service.record.recording import Block, Recording
 from ident_service.record.segments import Piece, uniform
@@ -30,7 +29,6 @@ from ident_service.record.segments import Piece, uniform
 Array = NDArray[np.float64]
 _WINDOW = 16384
 _DECAY = 28.0  # -ln(1e-12)
-_DIFFERENCE = np.array([1.0, -8.0, 0.0, 8.0, -1.0]) / 12.0
 
 
 @dataclass(frozen=True)
@@ -149,7 +147,6 @@ class _Smoother:
         self._presliding = np.broadcast_to(np.asarray(presliding, dtype=float), (recording.joints,))
         self._direction = np.zeros((0, recording.joints))
         self._delay = 0.0 if options.delay == "estimate" else float(options.delay)
-        self._sos = scipy.signal.butter(smoothing.order, smoothing.cutoff, fs=1.0 / period, output="sos")
         slowest = 2.0 * np.pi * smoothing.cutoff * np.sin(np.pi / (2 * smoothing.order))
         memory = _DECAY / slowest
         if smoothing.method == "savitzky_golay":
@@ -168,6 +165,8 @@ class _Smoother:
         if self._held:
             torque = np.vstack([torque[:1], 0.5 * (torque[:-1] + torque[1:])])
         if self._delay:
+            import scipy.ndimage  # loads for 0.2 s, and few arms have a delay
+
             steps = self._delay / self._period
             torque = np.column_stack(
                 [scipy.ndimage.shift(column, -steps, order=3, mode="nearest") for column in torque.T]
@@ -178,9 +177,7 @@ class _Smoother:
         near = np.abs(rate) <= options.reversal.speed
         near[1:] |= np.diff(np.signbit(rate), axis=0)
         reach = round(options.reversal.window / self._period)
-        if reach:
-            near = scipy.ndimage.binary_dilation(near, np.ones((2 * reach + 1, 1), dtype=bool))
-        keep = ~(near @ (self._coupling != 0.0))
+        keep = ~(widened(near, reach) @ (self._coupling != 0.0))
         # What the window before knew better, because it had both sides to look at, stands.
         known = self._direction[:0] if opens else self._direction
         start = known[-1] if len(known) else None
@@ -192,22 +189,22 @@ class _Smoother:
     def _derivatives(self, values: Array) -> tuple[Array, Array, Array]:
         if self._options.smoothing.method == "savitzky_golay":
             length, degree = min(self._length, len(values) - (len(values) + 1) % 2), self._options.smoothing.order
-            results = [
-                scipy.signal.savgol_filter(values, length, degree, deriv=d, delta=self._period, axis=0)
-                for d in range(3)
-            ]
-            return results[0], results[1], results[2]
+            position, velocity, acceleration = (
+                local_polynomial(values, length, degree, derivative, self._period) for derivative in range(3)
+            )
+            return position, velocity, acceleration
         position = self._low_pass(values)
         velocity = self._differenced(position)
         return position, velocity, self._differenced(velocity)
 
     def _low_pass(self, values: Array) -> Array:
-        # Odd extension as scipy's default, as long as the data allow.
-        pad = min(3 * int(1.0 / (self._options.smoothing.cutoff * self._period)), len(values) - 1)
-        return np.asarray(scipy.signal.sosfiltfilt(self._sos, values, axis=0, padlen=pad))
+        smoothing = self._options.smoothing
+        pad = min(3 * int(1.0 / (smoothing.cutoff * self._period)), len(values) - 1)
+        return low_pass(values, smoothing.order, smoothing.cutoff, 1.0 / self._period, pad)
 
     def _differenced(self, values: Array) -> Array:
-        return np.asarray(scipy.ndimage.correlate1d(values, _DIFFERENCE / self._period, axis=0, mode="nearest"))
+        padded = np.pad(values, ((2, 2), (0, 0)), mode="edge")
+        return np.asarray((8.0 * (padded[3:-1] - padded[1:-3]) - (padded[4:] - padded[:-4])) / (12.0 * self._period))
 
 
 def _overlapping(pieces: Iterable[Piece], margin: int) -> Iterator[tuple[Block, int, int, bool, bool]]:

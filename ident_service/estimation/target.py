@@ -13,14 +13,17 @@ Boundary: pure computation.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ident_service.errors import UsageError
 from ident_service.estimation.doubt import shares
-from ident_service.estimation.growing import Doubt
-from ident_service.model.base import BaseParameters
+
+if TYPE_CHECKING:  # a run whose target another process watches loads no estimator
+    from ident_service.estimation.growing import Doubt
+    from ident_service.model.base import BaseParameters
 
 LEAST_BLOCKS = 10
 

@@ -31,7 +31,7 @@ from ident_service.motion.preflight.ticket import Ticket, subject_of
 from ident_service.record.files import require_writable
 from ident_service.record.recorder_process import RecorderProcess
 from ident_service.results.files import require_place, write_atomically
-from ident_service.results.run_folder import write_manifest
+from ident_service.results.manifest import write_manifest
 from ident_service.service.arm_state import arm_folder, fault_file
 from ident_service.service.preflight import write_ticket
 from ident_service.service.reaching import Reaching, least_seconds, require_target

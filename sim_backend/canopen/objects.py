@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import io
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes, eds
 
@@ -102,19 +103,8 @@ class Objects:
         Raises:
             DriverError: not an EDS, or types that the emulator does not have.
         """
-        try:
-            dictionary: ObjectDictionary = eds.import_eds(io.StringIO(text), node)
-        except Exception as error:  # noqa: BLE001 the library lets whatever its parser meets through
-            raise DriverError(f"not an EDS: {error}") from None
-        self.entries: dict[int, Entry] = {}
-        self.dummies: dict[int, int] = {}
-        for index in dictionary:
-            item = dictionary[index]
-            for variable in [item] if isinstance(item, ODVariable) else item.values():
-                if index <= _LAST_DUMMY:
-                    self.dummies[index] = struct.calcsize(_FORMATS[index])
-                else:
-                    self.entries[index << 8 | variable.subindex] = _entry(variable)
+        entries, dummies = _read(text, node)
+        self.entries, self.dummies = dict(entries), dict(dummies)
         self._indices = {key >> 8 for key in self.entries}
         self.values: dict[int, Value] = {}
         self.before_read: Callable[[int], None] = lambda key: None
@@ -183,6 +173,25 @@ class Objects:
         if entry is None:
             raise SdoAbort(NO_SUBINDEX if index in self._indices else NO_OBJECT)
         return entry
+
+
+@lru_cache(maxsize=32)
+def _read(text: str, node: int) -> tuple[Mapping[int, Entry], Mapping[int, int]]:
+    """Read entries by key and sizes of dummy objects by index, once for the many times that a node is made."""
+    try:
+        dictionary: ObjectDictionary = eds.import_eds(io.StringIO(text), node)
+    except Exception as error:  # noqa: BLE001 the library lets whatever its parser meets through
+        raise DriverError(f"not an EDS: {error}") from None
+    entries: dict[int, Entry] = {}
+    dummies: dict[int, int] = {}
+    for index in dictionary:
+        item = dictionary[index]
+        for variable in [item] if isinstance(item, ODVariable) else item.values():
+            if index <= _LAST_DUMMY:
+                dummies[index] = struct.calcsize(_FORMATS[index])
+            else:
+                entries[index << 8 | variable.subindex] = _entry(variable)
+    return entries, dummies
 
 
 def _entry(variable: ODVariable) -> Entry:

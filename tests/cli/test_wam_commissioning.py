@@ -97,9 +97,8 @@ def test_mass_matrix_is_positive_at_random_postures(wam_run: WamRun) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("motion", ["identification", "validation"])
-def test_recordings_are_readable_by_a_ros_2_reader(wam_run: WamRun, motion: str) -> None:
-    path = wam_run.folder / f"{motion}.mcap"
+def test_a_recording_is_readable_by_a_ros_2_reader(wam_run: WamRun) -> None:
+    path = wam_run.folder / "identification.mcap"
     blocks = list(open_recording(path, wam_run.model.chain.names).blocks())
     position, torque, stamp_ns = (
         np.concatenate([getattr(block, name) for block in blocks]) for name in ("position", "torque", "stamp_ns")
@@ -147,12 +146,6 @@ def worst_deviation(seed: int, folder: Path) -> float:
     identified = np.array([verdict == "identified" for verdict in estimate.verdicts])
     assert identified.sum() > 60
     return float(deviations[identified].max())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [4, pytest.param(9, marks=pytest.mark.campaign)])
-def test_no_identified_parameter_is_off_by_more_than_four_deviations(seed: int, tmp_path: Path) -> None:
-    assert worst_deviation(seed, tmp_path) <= 4.0
 
 
 @pytest.mark.campaign

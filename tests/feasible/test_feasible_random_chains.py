@@ -43,15 +43,18 @@ def check_all_answers(seed: int) -> None:
         assert near.objective <= distance * (1.0 + 1e-5) + 3e-4 * np.linalg.norm(fit.beta)
 
 
+# Those that were hard for the solver with the rounding of one processor or another.
+HARD = (22, 25, 42, 54, 61)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("first", range(0, 64, 8))
-def test_random_chains_are_solved(first: int) -> None:
-    for seed in range(first, first + 8):
-        check_all_answers(seed)
+@pytest.mark.parametrize("seed", [*range(4), *HARD])
+def test_random_chains_are_solved(seed: int) -> None:
+    check_all_answers(seed)
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize("seed", range(1000, 1300))
+@pytest.mark.parametrize("seed", [*range(64), *range(1000, 1300)])
 def test_many_random_chains_are_solved(seed: int) -> None:
     check_all_answers(seed)
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import can
@@ -17,18 +18,32 @@ from sim_backend.pucks.process import Emulated, emulate
 CHANNEL = "pucks-foreign"
 
 
+class Bus:
+    """The library's network, and the drives in a thread that boot once it knows them."""
+
+    def __init__(self, network: canopen.Network, power_up: Callable[[], None]) -> None:
+        self.network, self._power_up = network, power_up
+
+    def boot(self, node: canopen.RemoteNode) -> None:
+        self.network.add_node(node)
+        self._power_up()
+        deadline = time.monotonic() + 20.0
+        while node.nmt.timestamp is None:  # `wait_for_bootup` misses a message that came before it listened
+            assert time.monotonic() < deadline, "no boot-up message"
+            time.sleep(0.005)
+        assert node.nmt.state == "PRE-OPERATIONAL"
+
+
 @pytest.fixture
-def network(tmp_path: Path) -> Iterator[canopen.Network]:
-    """The library's network on the bus of two emulated drives in a thread."""
+def bus(tmp_path: Path) -> Iterator[Bus]:
     config = pucks_config(tmp_path, buses=[{"interface": "virtual", "channel": CHANNEL}])
     end = threading.Event()
     done: list[Emulated] = []
     network = canopen.Network()
     network.connect(interface="virtual", channel=CHANNEL)
     thread = threading.Thread(target=lambda: done.append(emulate(config, stop_requested=end.is_set)))
-    thread.start()
     try:
-        yield network
+        yield Bus(network, thread.start)
     finally:
         network.disconnect()
         end.set()
@@ -37,9 +52,9 @@ def network(tmp_path: Path) -> Iterator[canopen.Network]:
     assert done[0].unsent == 0
 
 
-def test_sdo_reads_writes_and_refuses(network: canopen.Network) -> None:
-    node = network.add_node(1, str(EDS))
-    node.nmt.wait_for_bootup(2.0)
+def test_sdo_reads_writes_and_refuses(bus: Bus) -> None:
+    node = canopen.RemoteNode(1, str(EDS))
+    bus.boot(node)
     assert node.sdo["Manufacturer device name"].raw == "Emulated torque drive"
     assert node.sdo[0x1018][1].raw == 0
     assert node.sdo[0x1018][2].raw == 1
@@ -61,10 +76,9 @@ def test_sdo_reads_writes_and_refuses(network: canopen.Network) -> None:
         assert refused.value.code == code
 
 
-def test_pdos_states_and_torque(network: canopen.Network) -> None:
+def test_pdos_states_and_torque(bus: Bus) -> None:
     node = BaseNode402(1, str(EDS))
-    network.add_node(node)
-    node.nmt.wait_for_bootup(2.0)
+    bus.boot(node)
     node.rpdo.read()
     node.tpdo.read()
     node.rpdo[3].clear()
@@ -92,7 +106,7 @@ def test_pdos_states_and_torque(network: canopen.Network) -> None:
     node.rpdo[3].transmit()
     torques = []
     for _ in range(3):
-        network.sync.transmit()
+        bus.network.sync.transmit()
         assert node.tpdo[3].wait_for_reception(1.0)
         torques.append(node.tpdo[3][0x6077].raw)
     assert torques == [0, -321, -321]
@@ -102,22 +116,21 @@ def test_pdos_states_and_torque(network: canopen.Network) -> None:
         assert node.state == state
 
 
-def test_heartbeat_emergency_and_fault_reset(network: canopen.Network) -> None:
+def test_heartbeat_emergency_and_fault_reset(bus: Bus) -> None:
     node = BaseNode402(2, str(EDS))
-    network.add_node(node)
-    node.nmt.wait_for_bootup(2.0)
+    bus.boot(node)
     node.sdo[0x1017].raw = 20
     assert node.nmt.wait_for_heartbeat(2.0) == "PRE-OPERATIONAL"
     node.sdo[0x6007].raw = 1
     node.sdo[0x1016][1].raw = 127 << 16 | 100
-    network.send_message(0x700 + 127, b"\x05")
+    bus.network.send_message(0x700 + 127, b"\x05")
     assert node.emcy.wait(0x8130, 2.0).register == 0x11
     assert node.sdo[0x603F].raw == 0x8130
     assert node.sdo[0x1003][1].raw == 0x8130
     assert node.sdo[0x6041].raw & 0x4F == 0x08
     node.sdo[0x6040].raw = 0x80
     assert node.sdo[0x6041].raw & 0x4F == 0x40
-    network.send_message(0x700 + 127, b"\x05")
+    bus.network.send_message(0x700 + 127, b"\x05")
     assert node.emcy.wait(0x0000, 2.0).register == 0
 
 

@@ -14,7 +14,6 @@ from collections.abc import Iterator, Sequence
 from fractions import Fraction
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
 from ident_service.config.quantities import Vector3
 from ident_service.config.schema import ArmConfig, Body, Box, Ellipsoid, JointTerm
@@ -104,6 +103,8 @@ def _box(link: int, box: Box, index: Index) -> Block:
 
 def _hull(link: int, points: Sequence[Vector3], index: Index) -> Block:
     """Half-spaces n . r + d <= 0 of the hull, times the mass: -(n . l) - d m > 0."""
+    from scipy.spatial import ConvexHull, QhullError  # loads for 0.1 s, and few arms have a hull
+
     try:
         planes = ConvexHull(np.array(points)).equations
     except QhullError as error:

@@ -6,17 +6,19 @@ second-order cones: the Schur complements of eqs. 54 and 73 say the same with ma
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ident_service.errors import SolverError
 from ident_service.estimation.feasible.conic import ConicProblem, Solution
 from ident_service.estimation.feasible.consistency import ConditionsError
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.feasible.metric import whitening
-from ident_service.estimation.feasible.nearest import FeasibleEstimate, nearest
+from ident_service.estimation.feasible.nearest import HARD, FeasibleEstimate, nearest
 from ident_service.estimation.feasible.posing import (
     EPSILON,
+    OF_ESTIMATES,
     OF_TABLES,
     OF_TESTS,
     Lift,
@@ -24,6 +26,7 @@ from ident_service.estimation.feasible.posing import (
     constrain,
     minimise,
     pressing,
+    traces,
 )
 from ident_service.estimation.feasible.priors import Prior, towards_prior
 from ident_service.estimation.feasible.torque_scales import constrained_least_squares_with_scales
@@ -164,7 +167,8 @@ def feasibility_correction(
     metric = np.eye(base.size) if covariance is None else whitening(covariance, base)
     # A bound on masses depends on the size of beta, so on the base columns, which this metric must not.
     reaches = OF_TABLES if covariance is None else OF_TESTS
-    return nearest(metric, metric @ beta, beta, base, conditions, "feasibility correction", reaches)
+    found = nearest(metric, metric @ beta, beta, base, conditions, "feasibility correction", reaches)
+    return _unless_feasible(found, beta, base, conditions, reaches[0])
 
 
 def constrained_least_squares(
@@ -182,5 +186,22 @@ def constrained_least_squares(
     """
     check(fit.beta, base, conditions)
     if prior is None or prior.weight == 0.0:
-        return nearest(fit.R1, fit.rho1, fit.beta, base, conditions, "constrained least squares")
+        found = nearest(fit.R1, fit.rho1, fit.beta, base, conditions, "constrained least squares")
+        return _unless_feasible(found, fit.beta, base, conditions, OF_ESTIMATES[0])
     return towards_prior(fit, base, conditions, prior)
+
+
+def _unless_feasible(
+    found: FeasibleEstimate, beta: Array, base: BaseParameters, conditions: FeasibleSet, reach: float
+) -> FeasibleEstimate:
+    """Return `beta` itself where a hard solve missed that a body within reach has these base parameters."""
+    if found.iterations <= HARD or conditions.equalities:
+        return found
+    try:
+        tested = feasibility_test(beta, base, conditions)
+    except SolverError:
+        return found
+    size = max(1.0, float(np.max(np.abs(beta), initial=0.0)))
+    if tested.margin < EPSILON or np.max(traces(conditions) @ tested.delta, initial=0.0) > reach * size:
+        return found
+    return replace(found, beta=beta, delta=tested.delta, objective=0.0, margin=tested.margin, tight=())

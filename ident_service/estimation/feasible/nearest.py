@@ -28,7 +28,7 @@ _AT_TARGET = 1e-8  # of the target's size: a distance that is none
 # Weights of the distance (in units of the largest column) in the objective, in turn. A solve that was hard may have
 # ended far from the optimum although the solver calls it one: then the others are tried, and the nearest point counts.
 _WEIGHTS = (8.0, 30.0, 1.0)
-_HARD = 45  # iterations; an easy problem takes 10 to 30
+HARD = 45  # iterations; an easy problem takes 10 to 30
 
 
 @dataclass(frozen=True)
@@ -162,13 +162,15 @@ def nearest(
     hold(problem, conditions, to_delta)
     size = float(np.max(np.abs(beta), initial=0.0))
     best: FeasibleEstimate | None = None
+    failure: SolverError | None = None
     for weight in _WEIGHTS:
         objective = np.append(np.zeros(variables - 1), weight)
         try:
             delta, solution = solve_inside(problem, objective, name, to_delta, conditions, size, reaches=reaches)
-        except SolverError:
-            if best is None:
-                raise
+        except ConditionsError:
+            raise
+        except SolverError as error:
+            failure = failure or error
             continue
         found = columns * solution.x[:n] if not conditions.equalities else base.K @ delta
         distance_found = float(np.linalg.norm(metric @ found - target))
@@ -184,7 +186,8 @@ def nearest(
                 iterations=solution.iterations,
                 solver_seconds=solution.seconds,
             )
-        if solution.attempts == 1 and solution.iterations <= _HARD:
+        if solution.attempts == 1 and solution.iterations <= HARD:
             break
-    assert best is not None  # noqa: S101 - the first weight gives an estimate or an error
+    if best is None:
+        raise failure or SolverError(name, "no weight was tried")
     return best

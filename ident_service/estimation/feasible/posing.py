@@ -80,7 +80,7 @@ def minimise(
         SolverError: no optimum within any reach, or none that is acceptable.
     """
     T, d = to_delta
-    trace = _traces(conditions)
+    trace = traces(conditions)
     numbers = (np.abs(block.f).max(initial=0.0) for block in conditions.blocks)
     largest = max(1.0, size, *map(float, numbers))
     status = ""
@@ -103,7 +103,7 @@ def minimise(
     raise SolverError(name, status)
 
 
-def _traces(conditions: FeasibleSet) -> Array:
+def traces(conditions: FeasibleSet) -> Array:
     """Rows tr(P_k) = m + tr(L)/2 per link, shape (links, parameters)."""
     index = {name: column for column, name in enumerate(conditions.names)}
     links = [name[1:] for name in conditions.names if name.startswith("m") and name[1:].isdigit()]

@@ -15,7 +15,6 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 import scipy.linalg
-import scipy.optimize
 import scipy.sparse
 
 from ident_service.errors import SolverError
@@ -76,6 +75,8 @@ def _part(blocks: Sequence[Block], block: int, rows: tuple[int, ...]) -> Part:
 
 def _reduce(blocks: Sequence[Block], null: Array) -> list[Part]:
     """Drop rows on which a direction of the null space is diagonal and not negative, until there are none."""
+    from scipy.optimize import linprog  # loads for 0.1 s, and most parameters are feasible
+
     rows = [tuple(range(block.size or len(block.f))) for block in blocks]
     while True:
         parts = [_part(blocks, k, kept) for k, kept in enumerate(rows) if kept]
@@ -92,7 +93,7 @@ def _reduce(blocks: Sequence[Block], null: Array) -> list[Part]:
             owners += [(part.block, row) for row in part.rows]
         D, B = np.vstack(diagonal), np.vstack(beside)
         count = len(owners)
-        answer = scipy.optimize.linprog(
+        answer = linprog(
             np.append(np.zeros(null.shape[1]), -np.ones(count)),
             A_ub=scipy.sparse.csr_array(np.hstack([-D, np.eye(count)])),
             b_ub=np.zeros(count),

@@ -15,12 +15,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.signal import savgol_filter
 
 from ident_service.config.limits import MotionLimits, Vector
 from ident_service.errors import MotionRefused
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
+from ident_service.model.zero_phase import local_polynomial
 from ident_service.motion.preflight.check import Check, Measure, failed, judged, measures
 from ident_service.motion.preflight.session import BAND, Rows, Session, Trace
 from ident_service.motion.preflight.stability import INERTIA
@@ -142,10 +142,10 @@ def _answer_to_torque(trace: Trace, joint: int, session: Session) -> tuple[float
     if len(rate) < 2 * window:
         return nothing
     largest = np.abs(rate).max()
-    measured = savgol_filter(trace.position[:, joint], window, 2, deriv=2, delta=trace.period)
-    speed = savgol_filter(trace.position[:, joint], window, 2, deriv=1, delta=trace.period)
+    measured = local_polynomial(trace.position[:, joint], window, 2, 2, trace.period)
+    speed = local_polynomial(trace.position[:, joint], window, 2, 1, trace.period)
     # The same filter on the way that the model expects, so that what it distorts it distorts on both sides.
-    expected = savgol_filter(_expected_way(trace, session)[:, joint], window, 2, deriv=2, delta=trace.period)
+    expected = local_polynomial(_expected_way(trace, session)[:, joint], window, 2, 2, trace.period)
     sliding = (np.minimum(np.abs(rate), np.abs(speed)) > _MOVING * largest) & (np.sign(speed) == np.sign(rate))
     if int(sliding.sum()) < 2 * window:
         return nothing

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from ident_service.config.schema import JointTerm
 from ident_service.estimation.drift import ALPHA, Drift
@@ -72,7 +72,7 @@ def z_figure(found: Drift, place: int) -> Figure:
     shown = _squeezed(np.clip(found.z, -_LARGEST_Z, _LARGEST_Z))
     canvas = Canvas(WIDTH, _TOP + _HEIGHT + _BOTTOM)
     # Holm's first step: a single parameter beyond these lines is not chance.
-    line = float(norm.isf(0.5 * ALPHA / size))
+    line = float(-ndtri(0.5 * ALPHA / size))
     limit = max(float(np.max(np.abs(shown), initial=0.0)), float(_squeezed(np.array([line]))[0])) * 1.1
     axes = Axes(LEFT, _TOP, WIDTH - LEFT - RIGHT, _HEIGHT, 0.0, size + 1.0, -limit, limit)
     draw_key(canvas, WIDTH - RIGHT, 16, [("dot", "good", "within chance"), ("area", "bad", "beyond")])
