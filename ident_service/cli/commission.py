@@ -60,7 +60,7 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
     from ident_service.results.summary import summary
     from ident_service.service.commission import new_run_folder, score_document, simulate
 
-    config = load_arm(arguments.arm)
+    config = described = load_arm(arguments.arm)
     if arguments.seed is not None and config.driver is not None:
         config = config.model_copy(update={"driver": config.driver.model_copy(update={"seed": arguments.seed})})
     folder = arguments.out or new_run_folder(state_folder(arguments), config.name)
@@ -71,6 +71,7 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
             folder,
             motion=None if arguments.motion is None else read_excitation(arguments.motion),
             set_name=arguments.feasible_set,
+            described=described,
             tell=lambda line: tell(arguments, line),
             stop_requested=stopping.requested,
         )

@@ -154,7 +154,7 @@ CARRIED: dict[str, frozenset[str]] = {
     **dict.fromkeys(("export", "figures"), frozenset({"run", "format", "out"})),
     "payload": frozenset({"run", "recordings", "refit_offsets", "out"}),
     "compare": frozenset({"reference", "others"}),
-    "verify": frozenset({"file"}),
+    "verify": frozenset({"file", "arm"}),
     "feasible": _FILE,
     "correct": _FILE | {"metric", "out"},
     "accept": frozenset({"run", "note"}),

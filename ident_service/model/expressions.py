@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ident_service import certificate_verifier
 from ident_service.errors import ParameterError
-from ident_service.model.grammar import parse_exactly
 
 
 def format_number(value: float) -> str:
@@ -40,11 +41,23 @@ def format_expression(terms: Sequence[tuple[float, str]]) -> str:
     return text
 
 
-def parse_expression(text: str) -> dict[str, float]:
-    """Coefficients by name.
+def parse_exactly(text: str) -> dict[str, Fraction]:
+    """Read the coefficients of a sum by name, decimals as they are written.
 
     Raises:
-        ParameterError: not a sum as in `grammar.py`, the message says where; or a coefficient too large for a float.
+        ParameterError: not a sum as in `certificate_verifier.parse_expression`; the message says where.
+    """
+    try:
+        return certificate_verifier.parse_expression(text)
+    except certificate_verifier.VerificationError as error:
+        raise ParameterError(str(error)) from None
+
+
+def parse_expression(text: str) -> dict[str, float]:
+    """Read the coefficients of a sum by name.
+
+    Raises:
+        ParameterError: as `parse_exactly`, or a coefficient too large for a float.
     """
     try:
         return {name: float(coefficient) for name, coefficient in parse_exactly(text).items()}

@@ -16,11 +16,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from ident_service.certificate_verifier import INERTIAL as INERTIAL
 from ident_service.config.quantities import ParameterTable
 from ident_service.config.schema import JointTerm
 from ident_service.errors import ParameterError
 
-INERTIAL = ("Lxx", "Lxy", "Lxz", "Lyy", "Lyz", "Lzz", "lx", "ly", "lz", "m")
 TERM_SYMBOLS: dict[JointTerm, str] = {
     "drive_inertia": "Ia",
     "viscous": "fv",
@@ -117,7 +117,9 @@ class Layout:
         """
         index = {name: column for column, name in enumerate(self.names)}
         if unknown := [name for name in table.names if name not in index]:
-            raise ParameterError(f"parameters this arm does not have: {', '.join(unknown)}")
+            raise ParameterError(
+                f"parameters this arm does not have: {', '.join(unknown)}; it has {self.names[0]} ... {self.names[-1]}"
+            )
         delta = np.zeros(self.size)
         for name, value in zip(table.names, table.values, strict=True):
             delta[index[name]] = value

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import subprocess
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,6 +16,8 @@ from typing import Any
 import numpy as np
 
 from ident_service import __version__
+from ident_service.certificate_verifier import INERTIAL, JOINT_TERMS, VerificationError, split_name
+from ident_service.config.schema import ArmConfig
 from ident_service.errors import ParameterError, UsageError
 from ident_service.estimation.feasible.feasible_set import SetName
 from ident_service.estimation.identify import Estimate
@@ -23,7 +26,7 @@ from ident_service.estimation.proof.certificate import certify
 from ident_service.model.base import BaseParameters, base_from_expressions
 from ident_service.model.chain import Array
 from ident_service.model.expressions import parse_expression
-from ident_service.model.layout import INERTIAL, TERM_SYMBOLS
+from ident_service.model.notation import NOTATIONS, Notation, regrouped, translate
 from ident_service.results.files import write_atomically
 from ident_service.results.information_document import information_document
 from ident_service.results.schemas import require_schema
@@ -44,26 +47,32 @@ class ParameterFile:
         base: the grouping its expressions define; link parameters that no expression names are free.
         values: base parameters in SI units, shape (base,).
         feasible_set: the set it claims, or None.
-        content: everything in it.
+        content: everything in it, names in our notation.
+        notes: what a reader should know of names that were translated.
     """
 
     base: BaseParameters
     values: Array
     feasible_set: SetName | None
     content: dict[str, Any]
+    notes: tuple[str, ...] = ()
 
 
-def read_parameters(path: Path, names: tuple[str, ...] | None = None) -> ParameterFile:
+def read_parameters(
+    path: Path, names: tuple[str, ...] | None = None, notation: Notation | None = None
+) -> ParameterFile:
     """Read a parameter file.
 
     Args:
         path: the file.
         names: the link parameters of an arm; without them, the ten of every link up to the highest number that the
             expressions mention, and the joint terms that they mention.
+        notation: of the file's names, where it is not ours.
 
     Raises:
         UsageError: no such file.
-        ParameterError: not JSON, not of the schema, or expressions that do not parse or depend on each other.
+        ParameterError: not JSON, not of the schema, a name that is no link parameter, or expressions that do not parse
+            or depend on each other.
     """
     if not path.is_file():
         raise UsageError(f"no such file: {path}")
@@ -79,11 +88,30 @@ def read_parameters(path: Path, names: tuple[str, ...] | None = None) -> Paramet
     for key, column in table.items():
         if len(column) != len(expressions):
             raise ParameterError(f"{path}: {len(expressions)} expressions but {len(column)} {key}")
+    notes: tuple[str, ...] = ()
     try:
-        base = base_from_expressions(expressions, names if names is not None else _names_in(expressions))
+        if notation is not None:
+            notes = _notes(expressions, notation)
+            expressions = tuple(translate(text, notation) for text in expressions)
+            table["expressions"] = list(expressions)
+            if "link_parameters" in content:
+                printed = content["link_parameters"]
+                printed["names"] = [translate(name, notation) for name in printed["names"]]
+        mentioned = _names_in(expressions, content.get("link_parameters", {}).get("names", ()))
+        base = base_from_expressions(expressions, mentioned if names is None else names)
     except ParameterError as error:
         raise ParameterError(f"{path}: {error}") from None
-    return ParameterFile(base, values, content.get("feasible_set"), content)
+    return ParameterFile(base, values, content.get("feasible_set"), content, notes)
+
+
+def _notes(expressions: tuple[str, ...], notation: Notation) -> tuple[str, ...]:
+    found = dict.fromkeys(name for text in expressions for name in regrouped(text, notation))
+    if not found:
+        return ()
+    return (
+        f"{', '.join(list(found)[:5])}{' ...' if len(found) > 5 else ''}: an R was read as the link parameter alone; "
+        "the answer is about the expressions as they stand, so that each regrouping must be written in its expression",
+    )
 
 
 def _require_document(content: Any, path: Path) -> None:
@@ -95,8 +123,13 @@ def _require_document(content: Any, path: Path) -> None:
         raise ParameterError(f"{error}; {_TABLE}") from None
 
 
-def parameters_document(estimate: Estimate) -> dict[str, Any]:
-    """The content of `parameters.json` for an estimate, its feasibility certified in exact arithmetic.
+def parameters_document(estimate: Estimate, described: ArmConfig | None = None) -> dict[str, Any]:
+    """Make the content of `parameters.json` for an estimate, its feasibility certified in exact arithmetic.
+
+    Args:
+        estimate: what was identified.
+        described: the arm's description as it was read, where options or recordings changed it; sections that differ
+            are named in the file, so that its hash can be compared with that of the description.
 
     Raises:
         SolverError: no proof was found where the solver should have led to one.
@@ -108,7 +141,12 @@ def parameters_document(estimate: Estimate) -> dict[str, Any]:
     document: dict[str, Any] = {
         "format": "ident-parameters",
         "version": 1,
-        "arm": {"name": model.config.name, "joints": list(model.chain.names), "sha256": model.config.sha256},
+        "arm": {
+            "name": model.config.name,
+            "joints": list(model.chain.names),
+            "sha256": model.config.sha256,
+            **_changes(model.config, described),
+        },
         "method": estimate.method,
         "feasible_set": estimate.conditions.kind if estimate.constrained else "none",
     }
@@ -165,6 +203,14 @@ def parameters_document(estimate: Estimate) -> dict[str, Any]:
     return document
 
 
+def _changes(config: ArmConfig, described: ArmConfig | None) -> dict[str, Any]:
+    if described is None:
+        return {}
+    used, before = (json.loads(one.model_dump_json()) for one in (config, described))
+    changes = {key: section for key, section in used.items() if section != before[key]}
+    return {"changes": changes} if changes else {}
+
+
 def write_parameters(path: Path, document: dict[str, Any]) -> None:
     """Write a parameter document after holding it against the schema; floats round-trip.
 
@@ -176,29 +222,23 @@ def write_parameters(path: Path, document: dict[str, Any]) -> None:
     write_atomically(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
-def _names_in(expressions: tuple[str, ...]) -> tuple[str, ...]:
+def _names_in(expressions: tuple[str, ...], printed: Sequence[str]) -> tuple[str, ...]:
+    """List the ten of every link up to the highest number, with the joint terms that expressions mention."""
     mentioned = {name for expression in expressions for name in parse_expression(expression)}
-    links, extra = 0, set()
-    for name in mentioned:
-        symbol = name.rstrip("0123456789")
-        number = name[len(symbol) :]
-        if not number or int(number) < 1 or int(number) > 1000:
-            raise ParameterError(f"{name!r} has no link number; parameters are called Lxx1 ... m1, Ia1, fv1, fc1, fo1")
-        links = max(links, int(number))
-        if symbol not in INERTIAL:
-            extra.add((int(number), symbol))
+    try:
+        found = {split_name(name) for name in sorted(mentioned)}
+        for name in printed:
+            split_name(name)
+    except VerificationError as error:
+        raise ParameterError(
+            f"{error}; a table in another notation is read with --notation {' or '.join(NOTATIONS)}"
+        ) from None
+    links = max((link for _, link in found), default=0)
     names: list[str] = []
     for link in range(1, links + 1):
         names += [f"{symbol}{link}" for symbol in INERTIAL]
-        own = [symbol for number, symbol in extra if number == link]
-        names += [f"{symbol}{link}" for symbol in sorted(own, key=_place)]
+        names += [f"{symbol}{link}" for symbol in JOINT_TERMS if (symbol, link) in found]
     return tuple(names)
-
-
-def _place(symbol: str) -> tuple[int, str]:
-    """Joint terms stand in the order of the conventions, unknown ones after them."""
-    known = tuple(TERM_SYMBOLS.values())
-    return (known.index(symbol) if symbol in known else len(known)), symbol
 
 
 def _numbers(value: Any, joints: int) -> list[float]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ident_service import certificate_verifier
 from ident_service.config.load import arm_from_json
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import ParameterError, UsageError
@@ -29,7 +30,7 @@ from ident_service.results.parameter_file import (
 from ident_service.results.summary import parameter_table, summary
 
 PARAMETERS, URDF, REPORT = "parameters.json", "identified.urdf", "report.txt"
-ARM = "arm.json"
+ARM, VERIFIER = "arm.json", "verify.py"
 
 
 @dataclass(frozen=True)
@@ -70,20 +71,25 @@ def read_results(folder: Path) -> Results:
 
 
 def write_results(
-    folder: Path, estimate: Estimate, more: dict[str, Any] | None = None, unusable: Sequence[str] = ()
+    folder: Path,
+    estimate: Estimate,
+    more: dict[str, Any] | None = None,
+    unusable: Sequence[str] = (),
+    described: ArmConfig | None = None,
 ) -> list[str]:
-    """Write an estimate's files into an existing folder.
+    """Write an estimate's files into an existing folder, with the program that checks its certificate.
 
     Args:
         folder: where to.
         estimate: what to write.
         more: further entries of `parameters.json`.
         unusable: why the estimate must not be used.
+        described: the arm's description as it was read, where options or recordings changed it.
 
     Returns:
         The names of the files. An estimate that no body has comes without a URDF, because URDF cannot express it.
     """
-    document = parameters_document(estimate) | {"unusable": list(unusable)} | (more or {})
+    document = parameters_document(estimate, described) | {"unusable": list(unusable)} | (more or {})
     write_parameters(folder / PARAMETERS, document)
     write_atomically(folder / ARM, estimate.model.config.model_dump_json(indent=1) + "\n")
     names = [PARAMETERS, ARM]
@@ -91,4 +97,10 @@ def write_results(
         write_urdf(folder / URDF, estimate.model, estimate.delta)
         names.append(URDF)
     write_atomically(folder / REPORT, summary(estimate, unusable) + "\n" + parameter_table(estimate))
-    return [*names, REPORT]
+    write_verifier(folder)
+    return [*names, REPORT, VERIFIER]
+
+
+def write_verifier(folder: Path) -> None:
+    """Write the verifier into a folder of results: one file of the standard library alone."""
+    write_atomically(folder / VERIFIER, Path(certificate_verifier.__file__).read_text(encoding="utf-8"))

@@ -114,6 +114,7 @@ def simulate(
     *,
     motion: Excitation | None = None,
     set_name: SetName | None = None,
+    described: ArmConfig | None = None,
     clock: Clock | None = None,
     tell: Tell = lambda _: None,
     stop_requested: Callable[[], bool] = lambda: False,
@@ -125,6 +126,7 @@ def simulate(
         folder: the run folder; it appears when everything is in it, and must not exist.
         motion: to identify from, a designed one for example; the description's when None.
         set_name: feasible set, the configuration's when None.
+        described: the configuration as it was read, where it was changed since; `config` when None.
         clock: the loop's, what the driver section asks for when None.
         tell: called with a line at each step.
         stop_requested: asked every cycle.
@@ -165,7 +167,7 @@ def simulate(
         scored = score(estimate, truth, observed, equations(recordings[1], model, estimate.base))
         found = [(one, recording_quality(one, model)) for one in recordings]
         unusable = unusable_because(estimate, found)
-        write_results(staging, estimate, unusable=unusable)
+        write_results(staging, estimate, unusable=unusable, described=config if described is None else described)
         write_atomically(staging / "score.json", json.dumps(score_document(scored), indent=1) + "\n")
         warnings = [f"{one.path.name}: {line}" for one, seen in found for line in seen.warnings()]
         write_report(staging, estimate, recordings[:1], recordings[1:], warnings)

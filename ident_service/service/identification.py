@@ -98,7 +98,8 @@ def identify_files(request: Request, folder: Path, tell: Callable[[str], None] =
     """
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"{folder}: is a file, not a folder")
-    model = arm_model(_config(request))
+    described = load_arm(request.arm)
+    model = arm_model(_config(described, request))
     recordings = [open_for(path, model) for path in request.recordings]
     validation = [open_for(path, model) for path in request.validation]
     found = [(recording, recording_quality(recording, model)) for recording in [*recordings, *validation]]
@@ -120,7 +121,7 @@ def identify_files(request: Request, folder: Path, tell: Callable[[str], None] =
         tell("essential parameters")
         more["essential"] = _essential(estimate)
     with appearing_folder(folder) as staging:
-        files = write_results(staging, estimate, more, unusable)
+        files = write_results(staging, estimate, more, unusable, described)
         if request.sdpa:
             files += _write_sdpa(staging, estimate)
         files += write_report(staging, estimate, recordings, validation, warnings)
@@ -135,8 +136,7 @@ def unusable_because(estimate: Estimate, found: Sequence[tuple[Recording, Qualit
     return (*(reason for reasons in seen for reason in reasons), *reasons_against(estimate))
 
 
-def _config(request: Request) -> ArmConfig:
-    config = load_arm(request.arm)
+def _config(config: ArmConfig, request: Request) -> ArmConfig:
     if request.columns is not None:
         config = config.model_copy(update={"recording": load_recording_format(request.columns)})
     options = config.identification

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident_service.config.load import load_arm
-from ident_service.config.schema import FeasibleSetName
+from ident_service.config.schema import Constraints, FeasibleSetName
 from ident_service.errors import ParameterError
 from ident_service.estimation.feasible.feasibility import (
     FeasibilityTest,
@@ -22,6 +22,7 @@ from ident_service.estimation.feasible.feasibility import (
 from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
 from ident_service.estimation.proof.certificate import certify
 from ident_service.model.arm_model import arm_model
+from ident_service.model.notation import Notation
 from ident_service.results.parameter_file import ParameterFile, read_parameters, write_parameters
 
 
@@ -31,6 +32,7 @@ class CheckedFile:
 
     kind: FeasibleSetName
     result: FeasibilityTest
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -39,22 +41,27 @@ class CorrectedFile:
 
     kind: FeasibleSetName
     result: FeasibleEstimate
+    notes: tuple[str, ...] = ()
 
 
-def check_file(path: Path, kind: FeasibleSetName | None = None, arm: str | None = None) -> CheckedFile:
+def check_file(
+    path: Path, kind: FeasibleSetName | None = None, arm: str | None = None, notation: Notation | None = None
+) -> CheckedFile:
     """Feasibility test of a parameter file (BPFT, eq. 51).
 
     Args:
         path: the file.
         kind: feasible set; the file's own when None, or else `pseudo_inertia`.
-        arm: a description whose physical constraints are added.
+        arm: a description whose physical constraints are added; without one, drive inertia, viscous and Coulomb
+            friction are positive.
+        notation: of the file's names, where it is not ours.
 
     Raises:
         UsageError, ConfigError, ParameterError: the file or the arm cannot be used.
         SolverError: the solver stopped without an optimum.
     """
-    file, conditions = _read(path, kind, arm)
-    return CheckedFile(conditions.kind, feasibility_test(file.values, file.base, conditions))
+    file, conditions = _read(path, kind, arm, notation)
+    return CheckedFile(conditions.kind, feasibility_test(file.values, file.base, conditions), file.notes)
 
 
 def correct_file(
@@ -63,6 +70,7 @@ def correct_file(
     kind: FeasibleSetName | None = None,
     arm: str | None = None,
     metric: Literal["euclidean", "covariance"] = "euclidean",
+    notation: Notation | None = None,
 ) -> CorrectedFile:
     """Write the nearest feasible parameters of a file (BPFC, eq. 55) into another; everything else stays as it was.
 
@@ -72,15 +80,16 @@ def correct_file(
         path: the file.
         out: where the corrected one goes.
         kind: feasible set; the file's own when None, or else `pseudo_inertia`.
-        arm: a description whose physical constraints are added.
+        arm: a description whose physical constraints are added, as for `check_file`.
         metric: what nearest means: the paper's, in the units of the parameters, or that of the file's covariance, which
             does not depend on the choice of base columns.
+        notation: of the file's names, where it is not ours; the corrected file has ours.
 
     Raises:
         UsageError, ConfigError, ParameterError: the file or the arm cannot be used, or `out` not written.
         SolverError: the solver stopped without an optimum.
     """
-    file, conditions = _read(path, kind, arm)
+    file, conditions = _read(path, kind, arm, notation)
     result = feasibility_correction(
         file.values, file.base, conditions, _covariance(path, file) if metric == "covariance" else None
     ).centred(file.base, conditions)
@@ -101,7 +110,7 @@ def correct_file(
         "certificate": proof.document,
     }
     write_parameters(out, content)
-    return CorrectedFile(conditions.kind, result)
+    return CorrectedFile(conditions.kind, result, file.notes)
 
 
 def _covariance(path: Path, file: ParameterFile) -> NDArray[np.float64]:
@@ -113,15 +122,17 @@ def _covariance(path: Path, file: ParameterFile) -> NDArray[np.float64]:
     return np.array([[np.inf if value is None else value for value in row] for row in rows], dtype=float)
 
 
-def _read(path: Path, kind: FeasibleSetName | None, arm: str | None) -> tuple[ParameterFile, FeasibleSet]:
+def _read(
+    path: Path, kind: FeasibleSetName | None, arm: str | None, notation: Notation | None
+) -> tuple[ParameterFile, FeasibleSet]:
     config, names = None, None
     if arm is not None:
         model = arm_model(load_arm(arm))
         config, names = model.config, model.layout.names
-    file = read_parameters(path, names)
+    file = read_parameters(path, names, notation)
     if config is not None and (claimed := file.content.get("arm")) is not None and claimed["name"] != config.name:
         joints = list(model.chain.names)
         if claimed["joints"] != joints:
             raise ParameterError(f"{path}: is about the arm {claimed['name']} with other joints than {config.name}")
     claimed_set: FeasibleSetName = "inertia" if file.feasible_set == "inertia" else "pseudo_inertia"
-    return file, feasible_set(kind or claimed_set, file.base.names, config)
+    return file, feasible_set(kind or claimed_set, file.base.names, config, positive=Constraints().positive)

@@ -25,7 +25,7 @@ from ident_service.results.payload_document import (
     payload_text,
     write_payload,
 )
-from ident_service.results.run_folder import ARM, MANIFEST, PARAMETERS, URDF, write_manifest
+from ident_service.results.run_folder import ARM, MANIFEST, PARAMETERS, URDF, VERIFIER, write_manifest, write_verifier
 from ident_service.service.comparison import write_comparison_files
 from ident_service.service.identification import open_for
 
@@ -89,8 +89,9 @@ def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_off
         if payload.body is not None:
             content, delta = loaded_parameters(side.content, arm, payload, recorded, sources)
             write_parameters(staging / PARAMETERS, content)
+            write_verifier(staging)
             write_atomically(staging / ARM, loaded_config(arm.model.config).model_dump_json(indent=1) + "\n")
-            names += [PARAMETERS, ARM]
+            names += [PARAMETERS, VERIFIER, ARM]
             if delta is not None:
                 write_urdf(staging / URDF, arm.model, delta)
                 names.append(URDF)

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from certificate_samples import parameter_file, table_1, text
 
+from ident_service.certificate_verifier import verify
 from ident_service.errors import UsageError
 from ident_service.estimation.feasible.feasible_set import feasible_set
 from ident_service.estimation.proof.certificate import certify
-from ident_service.estimation.proof.certificate_exact import verify
 from ident_service.model.base import base_from_expressions
 from ident_service.model.layout import INERTIAL
 from ident_service.service.verify import verify_file

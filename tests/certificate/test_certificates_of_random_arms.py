@@ -8,9 +8,9 @@ from certificate_samples import parameter_file, random_bodies, random_config, te
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ident_service.certificate_verifier import verify
 from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
 from ident_service.estimation.proof.certificate import certify
-from ident_service.estimation.proof.certificate_exact import verify
 from ident_service.model.arm_model import arm_model
 from ident_service.model.base import base_from_expressions, base_parameters
 from ident_service.model.layout import INERTIAL
@@ -99,9 +99,9 @@ def test_equalities_are_part_of_the_proof(moment: float, verdict: str) -> None:
     names = tuple(f"{symbol}1" for symbol in INERTIAL)
     base = base_from_expressions(("m1", "lz1", "Lzz1"), names)
     plain = feasible_set("pseudo_inertia", names)
-    F = np.zeros((2, len(names)))
-    F[0, names.index("lz1")] = F[1, names.index("Lxz1")] = 1.0
-    plane = type(plain.blocks[0])("link 1: symmetric about its xy plane", 0, F, np.zeros(2))
+    F = np.zeros((3, len(names)))
+    F[0, names.index("lz1")] = F[1, names.index("Lxz1")] = F[2, names.index("Lyz1")] = 1.0
+    plane = type(plain.blocks[0])("link 1: symmetric about its xy plane", 0, F, np.zeros(3))
     conditions = FeasibleSet(plain.kind, plain.names, plain.blocks, (plane,))
     beta = np.array([1.0, moment, 0.5])
     certificate = certify(beta, base, conditions)

@@ -9,18 +9,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ident_service.errors import ParameterError
-from ident_service.estimation.feasible.feasible_set import feasible_set
-from ident_service.estimation.proof.certificate_rounding import exact_block
-from ident_service.estimation.proof.exact import (
+from ident_service.certificate_verifier import (
+    Affine,
+    Kind,
     Matrix,
+    VerificationError,
     is_positive_definite,
     is_positive_semidefinite,
     rational,
     rational_text,
-    repair,
+    set_blocks,
 )
-from ident_service.estimation.proof.exact_blocks import Affine, Kind, set_blocks
+from ident_service.estimation.feasible.feasible_set import feasible_set
+from ident_service.estimation.proof.certificate_rounding import exact_block, repair
 from ident_service.model.layout import INERTIAL
 
 small = st.fractions(min_value=-3, max_value=3, max_denominator=7)
@@ -99,7 +100,7 @@ def test_numbers_are_written_and_read_without_loss(value: Fraction) -> None:
     "bad", ["", "1/0", "1e9999", "nan", "inf", "1_0", " 1", "1/2/3", "0x1", "٣", "9" * 3000, "--1"]
 )
 def test_what_is_no_number_is_refused(bad: str) -> None:
-    with pytest.raises(ParameterError):
+    with pytest.raises(VerificationError):
         rational(bad)
 
 

@@ -246,7 +246,7 @@ def test_identify_adds_to_an_existing_folder(place: Path, quick: Commissioned, i
     words = identify(place, quick, quick.folder / "identification.mcap")
     assert ident(*words).code == 0
     names = ["arm.json", "evidence.json", "identified.urdf", "manifest.json", "mine", "parameters.json"]
-    names += ["report.html", "report.txt"]
+    names += ["report.html", "report.txt", "verify.py"]
     assert left_over(place) == ["out", *(f"out/{name}" for name in names)]
     assert (folder / "mine").read_text() == "keep"
     assert (folder / "report.txt").read_text() != "old"

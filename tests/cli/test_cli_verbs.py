@@ -27,6 +27,7 @@ RUN_FILES = [
     "score.json",
     "validation.excitation.json",
     "validation.mcap",
+    "verify.py",
 ]
 FEASIBLE = {"expressions": ["m1", "Lzz1"], "values": [1.0, 0.2]}
 INFEASIBLE = {"expressions": ["m1", "Lzz1"], "values": [-1.0, 0.2]}
@@ -98,9 +99,17 @@ def test_identify_in_words(quick: Commissioned, ident: Ident, tmp_path: Path) ->
     ended = ident("identify", recording, "--arm", quick.arm, "--validate", unseen, "--out", out)
     assert ended.code == 0
     assert ended.err == ""
-    assert f"files: {out}\n  parameters.json\n  arm.json\n  identified.urdf\n  report.txt\n" in ended.out
+    assert f"files: {out}\n  parameters.json\n  arm.json\n  identified.urdf\n  report.txt\n  verify.py\n" in ended.out
     assert "  evidence.json\n  report.html\n" in ended.out
-    made = ["evidence.json", "identified.urdf", "manifest.json", "parameters.json", "report.html", "report.txt"]
+    made = [
+        "evidence.json",
+        "identified.urdf",
+        "manifest.json",
+        "parameters.json",
+        "report.html",
+        "report.txt",
+        "verify.py",
+    ]
     assert left_over(out) == ["arm.json", *made]
     # The same recordings give the same numbers as the whole job did.
     one, other = (read_parameters(folder / "parameters.json").values for folder in (out, quick.folder))
@@ -307,3 +316,49 @@ def test_correction_in_the_metric_of_the_covariance(quick: Commissioned, ident: 
         assert refused.code == 1
         assert reason in refused.err
         assert not (tmp_path / "none.json").exists()
+
+
+IMPOSSIBLE = {"expressions": ["ZZR1 + 0.25*M2", "MXR2"], "values": [-9.0, 0.4]}
+
+
+@pytest.mark.parametrize("verb", ["feasible", "correct", "verify"])
+@pytest.mark.parametrize("name", ["ZZR1", "Lzz01", "Lzz0", "M2", "mass1", "Lzz1001"])
+def test_a_name_that_is_no_link_parameter_is_no_free_variable(
+    ident: Ident, tmp_path: Path, verb: str, name: str
+) -> None:
+    """Each was a parameter without any condition, with which anything is feasible."""
+    content = {"expressions": [f"{name} + 0.25*m2", "lx2"], "values": [-9.0, 0.4]}
+    witness = {"kind": "witness", "set": "inertia", "links": [1, 2], "blocks": [], "equalities": [], "delta": {}}
+    path = table(tmp_path, content, feasibility={"feasible": True, "margin": 1.0, "certificate": witness})
+    more = ("--out", tmp_path / "corrected.json") if verb == "correct" else ()
+    ended = ident(verb, path, *more)
+    assert ended.code == (3 if verb == "verify" else 1)
+    said = ended.out if verb == "verify" else ended.err
+    assert f"'{name}' is not the name of a link parameter: allowed are Lxx Lxy " in said
+    assert not (tmp_path / "corrected.json").exists()
+
+
+def test_tables_in_other_notations(ident: Ident, tmp_path: Path) -> None:
+    path = table(tmp_path, IMPOSSIBLE)
+    assert "--notation khalil or sympybotics" in ident("feasible", path).err
+    ended = ident("feasible", path, "--notation", "khalil")
+    assert ended.code == 3
+    assert (
+        "note: ZZR1, MXR2: an R was read as the link parameter alone; the answer is about the expressions" in ended.out
+    )
+    assert ident("feasible", path, "--notation", "khalil", "--json").json["margin"] < 0.0
+    assert "notation sympybotics" in ident("feasible", path, "--notation", "sympybotics").err
+    corrected = tmp_path / "corrected.json"
+    assert ident("correct", path, "--notation", "khalil", "--out", corrected).code == 0
+    content = json.loads(corrected.read_text(encoding="utf-8"))
+    assert content["base_parameters"]["expressions"] == ["Lzz1 + 0.25*m2", "lx2"]
+    assert ident("verify", corrected).code == 0
+    sympybotics = {"expressions": ["L_1zz + 0.25*m_2", "l_2x"], "values": [0.9, 0.4]}
+    assert ident("feasible", table(tmp_path, sympybotics), "--notation", "sympybotics").code == 0
+
+
+def test_drive_inertia_and_friction_of_a_bare_table_are_positive(ident: Ident, tmp_path: Path) -> None:
+    """A drive inertia of -100 kg m^2 hid an inertia that no body has."""
+    assert ident("feasible", table(tmp_path, {"expressions": ["Lzz1 + Ia1"], "values": [-5.0]})).code == 3
+    assert ident("feasible", table(tmp_path, {"expressions": ["Lzz1", "fv1"], "values": [1.0, -5.0]})).code == 3
+    assert ident("feasible", table(tmp_path, {"expressions": ["Lzz1", "fo1"], "values": [1.0, -5.0]})).code == 0

@@ -164,15 +164,17 @@ def test_the_parameter_file_is_valid_and_the_estimate_s(everything: tuple[Identi
 
 
 def test_verify_proves_it(
-    everything: tuple[Identified, Path, list[str]], capsys: pytest.CaptureFixture[str], tmp_path: Path
+    everything: tuple[Identified, Path, list[str]], setting: Setting, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     path = everything[1] / "parameters.json"
     assert main(["verify", str(path)]) == 0
-    assert ": feasible: " in capsys.readouterr().out
+    assert ": consistent with its own conditions: feasible: " in capsys.readouterr().out
     assert main(["verify", str(path), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert (document["verdict"], document["exit_code"]) == ("feasible", 0)
     assert document["checked"]
+    assert main(["verify", str(path.parent), "--arm", str(setting.arm)]) == 0
+    assert ": feasible: proven for " in capsys.readouterr().out
     values = parameters_of(everything[1])["base_parameters"]["values"]
     text = path.read_text()
     for index, value in enumerate(values):
@@ -311,7 +313,8 @@ def test_a_prior_by_the_command(setting: Setting, capsys: pytest.CaptureFixture[
     assert setting.model.prior is not None
     at = first["names"].index("m1")
     assert first["values"][at] == pytest.approx(setting.model.prior[at], rel=0.02)
-    assert main(["verify", str(tmp_path / "out" / "parameters.json")]) == 0
+    # With other options than the description's the arm is still the same.
+    assert main(["verify", str(tmp_path / "out" / "parameters.json"), "--arm", str(setting.arm)]) == 0
     assert ident_json(capsys, *words, "--prior-weight", "1")["exit_code"] == 2
 
 

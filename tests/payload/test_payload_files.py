@@ -14,7 +14,7 @@ import pytest
 from compare.conftest import Ident
 from helpers.changed_arms import COARSE, changed, identified_folder, recorded_arm
 
-from ident_service.estimation.proof.certificate_exact import verify
+from ident_service.certificate_verifier import verify
 from ident_service.results.run_folder import read_results
 from ident_service.service.verify import verify_file
 
@@ -59,7 +59,7 @@ def test_a_tool_is_found_and_written(arms: Path, ident: Ident, tmp_path: Path) -
     assert "\nCHANGED\n  body of link 2: " in text
     assert "about +0.2 kg\n    may mean: another tool or payload" in text
     wanted = ["arm.json", "comparison.html", "comparison.json", "comparison.txt", "identified.urdf", "manifest.json"]
-    wanted += ["parameters.json", "payload.json", "payload.txt"]
+    wanted += ["parameters.json", "payload.json", "payload.txt", "verify.py"]
     assert sorted(path.name for path in out.iterdir()) == wanted
     document = json.loads((out / "payload.json").read_text())
     jsonschema.validate(

@@ -13,6 +13,8 @@ from ident_service.results.parameter_file import ParameterFile
 from ident_service.results.report.reservations import reservations, unidentified
 from ident_service.results.report.verdict import verdict
 
+CERTIFIED = "has a certificate of that: `ident verify --arm` checks it in exact arithmetic"
+
 
 def said(made: Made, evidence: Evidence | None = None, **changes: Any) -> str:
     content = json.loads(json.dumps(made.parameters.content))
@@ -30,7 +32,8 @@ def own(made: Made, **changes: Any) -> Evidence:
 def test_a_good_estimate(good: Made) -> None:
     words = said(good)
     assert "A real body could have these parameters" in words
-    assert "proven in exact arithmetic" in words
+    assert CERTIFIED in words
+    assert "proven" not in words
     assert "held in the feasible set pseudo_inertia" in words
     chosen = good.estimate.candidates[good.estimate.chosen]
     assert f"{chosen.validation[0].error.relative_percent:.3g} %" in words
@@ -50,10 +53,10 @@ def test_nothing_stands_against_it_only_where_nothing_does(good: Made) -> None:
     assert "design a motion that teaches them" in words
 
 
-def test_feasible_but_not_proven(good: Made) -> None:
+def test_feasible_without_a_certificate(good: Made) -> None:
     words = said(good, feasibility={"feasible": False, "certificate": {"kind": "undecided"}})
-    assert "proven in exact arithmetic." not in words.replace("not proven in exact arithmetic", "")
-    assert "not proven in exact arithmetic" in words
+    assert CERTIFIED not in words
+    assert "too close to the boundary for a certificate in exact arithmetic" in words
 
 
 def test_much_worse_on_what_it_never_saw(good: Made) -> None:
@@ -142,7 +145,8 @@ def test_the_comparison_says_which_rows_it_is_of(good: Made) -> None:
 def test_an_infeasible_estimate(bare: Made) -> None:
     words = said(bare)
     assert "No real body has these parameters" in words
-    assert "proven in exact arithmetic" in words
+    assert CERTIFIED in words
+    assert "proven" not in words
     assert "not held in any feasible set" in words
     assert f"What contradicts them: {bare.estimate.tight[0]}" in words
     assert "record a second motion and give it with --validate" in words

@@ -146,8 +146,17 @@ def spoiled(change: Any) -> dict[str, Any]:
         (lambda c: c["base_parameters"].update(expressions=["m1", "m1"]), "is a combination of the others"),
         (lambda c: c["base_parameters"].update(expressions=["m1", "2*"]), "p.json: "),
         (lambda c: c["base_parameters"].update(expressions=["m1", "__import__('os')"]), "p.json: "),
-        (lambda c: c["base_parameters"].update(expressions=["m1", "mass"]), "'mass' has no link number"),
-        (lambda c: c["base_parameters"].update(expressions=["m1", "m99999"]), "'m99999' has no link number"),
+        (
+            lambda c: c["base_parameters"].update(expressions=["m1", "mass"]),
+            "'mass' is not the name of a link parameter: allowed are Lxx .* Ia fv ",
+        ),
+        (
+            lambda c: c["base_parameters"].update(expressions=["m1", "m99999"]),
+            "'m99999' is not the name of a link parameter",
+        ),
+        (lambda c: c["base_parameters"].update(expressions=["m1", "Lzz01"]), "'Lzz01' is not the name of"),
+        (lambda c: c["base_parameters"].update(expressions=["m1", "ZZR1 + 0.25*M2"]), "--notation khalil or"),
+        (lambda c: c.update(link_parameters={"names": ["M1"], "values": [1]}), "'M1' is not the name of"),
     ],
 )
 def test_files_that_do_not_fit_are_refused(tmp_path: Path, change: Any, message: str) -> None:
@@ -177,9 +186,9 @@ def test_numbers_too_large_for_a_double_are_refused(tmp_path: Path, number: str)
 
 
 def test_joint_terms_stand_in_the_order_of_the_conventions(tmp_path: Path) -> None:
-    expressions = ["fo1", "fc1", "new1", "Ia1", "fv1"]
+    expressions = ["fo1", "fc1", "fa1", "Ia1", "fv1"]
     content = spoiled(lambda c: c["base_parameters"].update(expressions=expressions, values=[1, 2, 3, 4, 5]))
-    assert read_parameters(written(tmp_path, content)).base.names[10:] == ("Ia1", "fv1", "fc1", "fo1", "new1")
+    assert read_parameters(written(tmp_path, content)).base.names[10:] == ("Ia1", "fv1", "fc1", "fo1", "fa1")
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '"text"', "[" * 100_000, "\x00"])

@@ -24,14 +24,19 @@ from ident_service.results.summary import parameter_table, summary
 def test_a_feasible_estimate_s_files(tmp_path: Path, feasible_estimate: Estimate) -> None:
     names = write_results(tmp_path, feasible_estimate)
     assert sorted(names) == sorted(path.name for path in tmp_path.iterdir())
-    assert sorted(names) == ["arm.json", "identified.urdf", "parameters.json", "report.txt"]
+    assert sorted(names) == ["arm.json", "identified.urdf", "parameters.json", "report.txt", "verify.py"]
     read = read_parameters(tmp_path / "parameters.json", feasible_estimate.model.layout.names)
     np.testing.assert_array_equal(read.values, feasible_estimate.beta)
 
 
 def test_an_estimate_no_body_has_comes_without_a_urdf(tmp_path: Path, free_estimate: Estimate) -> None:
-    assert sorted(write_results(tmp_path, free_estimate)) == ["arm.json", "parameters.json", "report.txt"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["arm.json", "parameters.json", "report.txt"]
+    assert sorted(write_results(tmp_path, free_estimate)) == ["arm.json", "parameters.json", "report.txt", "verify.py"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "arm.json",
+        "parameters.json",
+        "report.txt",
+        "verify.py",
+    ]
     assert "INFEASIBLE" in (tmp_path / "report.txt").read_text()
 
 
@@ -92,7 +97,7 @@ def test_the_manifest_names_every_file_with_its_hash(tmp_path: Path, feasible_es
     manifest = json.loads((tmp_path / "manifest.json").read_text())
     wanted = {
         name: hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
-        for name in ("arm.json", "identified.urdf", "parameters.json", "report.txt")
+        for name in ("arm.json", "identified.urdf", "parameters.json", "report.txt", "verify.py")
     }
     assert manifest["files"] == wanted
     assert (manifest["format"], manifest["version"]) == ("ident-run", 1)
@@ -145,7 +150,7 @@ def test_a_folder_is_read_as_it_was_written(folder: Path, feasible_estimate: Est
     read = read_results(folder)
     assert read.config == feasible_estimate.model.config
     np.testing.assert_array_equal(read.parameters.values, feasible_estimate.beta)
-    assert set(read.sha256) == {"arm.json", "identified.urdf", "parameters.json", "report.txt"}
+    assert set(read.sha256) == {"arm.json", "identified.urdf", "parameters.json", "report.txt", "verify.py"}
 
 
 def test_a_folder_that_was_torn_or_changed_is_refused(folder: Path) -> None:

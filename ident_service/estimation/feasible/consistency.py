@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from ident_service.errors import ParameterError, SolverError
-from ident_service.estimation.feasible.conic import ConicProblem
+from ident_service.estimation.feasible.conic import ConicProblem, Solution
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
-from ident_service.estimation.feasible.posing import EPSILON, constrain, minimise
+from ident_service.estimation.feasible.posing import EPSILON, constrain, minimise, project
+from ident_service.model.chain import Array
 
 _LARGEST_MARGIN = 1.0
 _SHARE = 1e-3
@@ -23,24 +24,14 @@ class ConditionsError(ParameterError, SolverError):
 
 
 def contradiction(conditions: FeasibleSet) -> tuple[str, ...]:
-    """The conditions that contradict each other whatever the data; empty where some delta fulfils all of them.
+    """Name the conditions that contradict each other whatever the data; none where some delta fulfils all of them.
 
-    The largest t with D(delta) - t 1 >= 0 over all delta. Below the inset that every problem keeps, the multipliers
-    name the blocks of the proof.
+    Below the inset that every problem keeps, the multipliers of the largest margin name the blocks of the proof.
 
     Raises:
         SolverError: the solver stopped without an optimum.
     """
-    n = len(conditions.names)
-    problem = ConicProblem(n + 1)
-    for block in conditions.blocks:
-        constrain(problem, block, np.column_stack([block.F, -block.identity()]), block.f)
-    problem.nonnegative(np.append(np.zeros(n), -1.0)[None], np.array([_LARGEST_MARGIN]))
-    for block in conditions.equalities:
-        problem.zero(np.column_stack([block.F, np.zeros(len(block.f))]), block.f)
-    objective = np.append(np.zeros(n), -1.0)
-    to_delta = (np.eye(n, n + 1), np.zeros(n))
-    solution = minimise(problem, objective, "consistency of the conditions", to_delta, conditions)
+    solution = _largest_margin(conditions)
     if -solution.objective > EPSILON:
         return ()
     bound = len(conditions.blocks)
@@ -50,3 +41,26 @@ def contradiction(conditions: FeasibleSet) -> tuple[str, ...]:
     weights = [float(np.abs(dual).max(initial=0.0)) for _, dual in named]
     order = sorted(range(len(named)), key=lambda i: -weights[i])
     return tuple(named[i][0].name for i in order if weights[i] > _SHARE * max(weights))
+
+
+def interior_point(conditions: FeasibleSet) -> Array | None:
+    """Find link parameters well inside a set, shape (parameters,); None where the conditions contradict each other.
+
+    Raises:
+        SolverError: the solver stopped without an optimum.
+    """
+    solution = _largest_margin(conditions)
+    return project(solution.x[:-1], conditions) if -solution.objective > 0.0 else None
+
+
+def _largest_margin(conditions: FeasibleSet) -> Solution:
+    """Solve for the largest t with D(delta) - t 1 >= 0 over all delta; x is (delta, t)."""
+    n = len(conditions.names)
+    problem = ConicProblem(n + 1)
+    for block in conditions.blocks:
+        constrain(problem, block, np.column_stack([block.F, -block.identity()]), block.f)
+    problem.nonnegative(np.append(np.zeros(n), -1.0)[None], np.array([_LARGEST_MARGIN]))
+    for block in conditions.equalities:
+        problem.zero(np.column_stack([block.F, np.zeros(len(block.f))]), block.f)
+    objective = np.append(np.zeros(n), -1.0)
+    return minimise(problem, objective, "consistency of the conditions", (np.eye(n, n + 1), np.zeros(n)), conditions)

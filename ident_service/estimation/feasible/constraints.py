@@ -11,11 +11,12 @@ a link, which a density inside it can only satisfy if
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from fractions import Fraction
 
 import numpy as np
 
 from ident_service.config.quantities import Vector3
-from ident_service.config.schema import ArmConfig, Body, Box, Ellipsoid
+from ident_service.config.schema import ArmConfig, Body, Box, Ellipsoid, JointTerm
 from ident_service.errors import ParameterError
 from ident_service.estimation.feasible.blocks import (
     REFERENCE_MASS,
@@ -51,7 +52,7 @@ def configured(config: ArmConfig, links: Sequence[int], index: Index) -> list[Bl
             blocks.append(_hull(link, body.hull, index))
         if body.ellipsoid is not None:
             blocks.append(_ellipsoid(link, body.ellipsoid, index))
-    return blocks + _signs(config, links, index)
+    return blocks + signs(config.constraints.positive, links, index)
 
 
 def symmetries(config: ArmConfig, links: Sequence[int], index: Index) -> list[Block]:
@@ -117,22 +118,35 @@ def _hull(link: int, points: Sequence[Vector3], index: Index) -> Block:
 
 
 def _ellipsoid(link: int, body: Ellipsoid, index: Index) -> Block:
-    axes = np.eye(3) if body.axes is None else np.array(body.axes)
-    W = axes.T @ np.diag(1.0 / np.array(body.semi_axes) ** 2) @ axes
-    c = np.array(body.center)
-    trace, first = np.trace(W), 2.0 * W @ c
-    row = {f"l{axis}{link}": float(first[i]) for i, axis in enumerate("xyz")}
-    row[f"m{link}"] = float(1.0 - c @ W @ c)
+    # In fractions and rounded once, so that every machine has the same digits: files are compared with them.
+    axes = [[Fraction(value) for value in row] for row in (np.eye(3).tolist() if body.axes is None else body.axes)]
+    weights = [1 / Fraction(length) ** 2 for length in body.semi_axes]
+    W = [
+        [sum((w * row[i] * row[j] for w, row in zip(weights, axes, strict=True)), Fraction(0)) for j in range(3)]
+        for i in range(3)
+    ]
+    c = [Fraction(value) for value in body.center]
+    trace = W[0][0] + W[1][1] + W[2][2]
+    Wc = [sum((W[i][j] * c[j] for j in range(3)), Fraction(0)) for i in range(3)]
+    row = {f"l{axis}{link}": float(2 * Wc[i]) for i, axis in enumerate("xyz")}
+    row[f"m{link}"] = float(1 - sum((c[i] * Wc[i] for i in range(3)), Fraction(0)))
     for i, a in enumerate("xyz"):
-        row[f"L{a}{a}{link}"] = float(W[i, i] - 0.5 * trace)
+        row[f"L{a}{a}{link}"] = float(W[i][i] - trace / 2)
         for j in range(i + 1, 3):
-            row[f"L{a}{'xyz'[j]}{link}"] = float(2.0 * W[i, j])
+            row[f"L{a}{'xyz'[j]}{link}"] = float(2 * W[i][j])
     return linear_block(f"link {link}: all mass inside its ellipsoid", [(row, 0.0)], REFERENCE_MASS, index)
 
 
-def _signs(config: ArmConfig, links: Sequence[int], index: Index) -> list[Block]:
+def signs(positive: Sequence[JointTerm], links: Sequence[int], index: Index) -> list[Block]:
+    """Joint terms that must be positive (eq. 28), where the model has them.
+
+    Args:
+        positive: the terms.
+        links: numbers of the links, from 1.
+        index: column of each link parameter.
+    """
     blocks = []
-    for term in config.constraints.positive:
+    for term in positive:
         for link in links:
             name = f"{TERM_SYMBOLS[term]}{link}"
             if name in index:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ident_service.config.schema import ArmConfig, FeasibleSetName
+from ident_service.config.schema import ArmConfig, FeasibleSetName, JointTerm
 from ident_service.estimation.feasible.blocks import (
     REFERENCE_INERTIA,
     REFERENCE_MASS,
@@ -26,7 +26,7 @@ from ident_service.estimation.feasible.blocks import (
     matrix_block,
     symmetric,
 )
-from ident_service.estimation.feasible.constraints import configured, symmetries
+from ident_service.estimation.feasible.constraints import configured, signs, symmetries
 from ident_service.model.chain import Array
 from ident_service.model.layout import INERTIAL
 
@@ -68,13 +68,20 @@ class FeasibleSet:
         return np.vstack([np.zeros((0, len(self.names))), *E]), np.concatenate([np.zeros(0), *e])
 
 
-def feasible_set(kind: FeasibleSetName, names: Sequence[str], config: ArmConfig | None = None) -> FeasibleSet:
+def feasible_set(
+    kind: FeasibleSetName,
+    names: Sequence[str],
+    config: ArmConfig | None = None,
+    *,
+    positive: Sequence[JointTerm] = (),
+) -> FeasibleSet:
     """The feasible set of an arm, or of a bare table of parameters.
 
     Args:
         kind: which condition on inertias.
         names: link parameters in the order of delta; every link has all ten of eq. 13.
         config: where mass, centre-of-mass and sign conditions come from; none of them without it.
+        positive: joint terms that must be positive where there is no configuration.
 
     Raises:
         ParameterError: a hull whose points lie in one plane.
@@ -84,7 +91,9 @@ def feasible_set(kind: FeasibleSetName, names: Sequence[str], config: ArmConfig 
     build = _inertia if kind == "inertia" else _pseudo_inertia
     blocks = [build(link, index) for link in links]
     equalities: list[Block] = []
-    if config is not None:
+    if config is None:
+        blocks += signs(positive, links, index)
+    else:
         blocks += configured(config, links, index)
         equalities += symmetries(config, links, index)
     return FeasibleSet(kind, tuple(names), tuple(blocks), tuple(equalities))

@@ -4,16 +4,18 @@ Floating-point solvers only suggest; what they suggest is rounded, repaired so t
 checked with `fractions` before it is called a proof:
 
 - `witness`: delta with `K delta = beta` exactly and every block positive definite;
-- `dual`: multipliers that no such delta can have, with bounds of masses and inertias where only these make them exist;
-- `undecided`: neither was found, which happens where the margin is zero up to rounding.
+- `dual`: multipliers that no such delta can have, with bounds of masses and inertias where only these make them exist,
+  and a body that meets the conditions alone;
+- `undecided`: neither was found, which happens where the margin is zero up to rounding, or where the conditions
+  contradict each other.
 
-Boundary: pure computation, no I/O. `certificate_exact.py` reads the document this makes.
+`certificate_verifier.py` reads the document this makes.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any, Literal
@@ -21,17 +23,24 @@ from typing import Any, Literal
 import numpy as np
 import scipy.linalg
 
+from ident_service.certificate_verifier import Arm, ExactBlock, VerificationError, rational_text, set_blocks, verify
 from ident_service.errors import ParameterError, SolverError
+from ident_service.estimation.feasible.consistency import interior_point
 from ident_service.estimation.feasible.feasibility import feasibility_test
 from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet
 from ident_service.estimation.proof.certificate_dual import dual_candidates
-from ident_service.estimation.proof.certificate_exact import verify
-from ident_service.estimation.proof.certificate_rounding import Statement, counts, exact_block, printed, prove, trace
-from ident_service.estimation.proof.exact import rational_text, repair
-from ident_service.estimation.proof.exact_blocks import ExactBlock, set_blocks
+from ident_service.estimation.proof.certificate_rounding import (
+    Statement,
+    counts,
+    exact_block,
+    printed,
+    prove,
+    repair,
+    trace,
+)
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
-from ident_service.model.grammar import parse_exactly
+from ident_service.model.expressions import parse_exactly
 
 # Bounds of masses [kg] and moments of inertia [kg m^2], times the size of the base parameters, where only
 # bounded bodies can be excluded; the smaller one proves more verdicts close to the boundary.
@@ -82,18 +91,56 @@ def certify(
     if conditions.names != base.names:
         raise ParameterError("the feasible set and the base parameters are about different link parameters")
     texts = base.expressions if expressions is None else expressions
+    arm = stated_arm("the arm", None, base, conditions, expressions=texts)
     statement = Statement(
         base.names,
-        tuple(parse_exactly(text) for text in texts),
+        arm.K,
         tuple(printed(value) for value in beta),
-        *_named(conditions),
+        tuple(exact_block(block, base.names) for block in conditions.blocks),
+        arm.equalities,
     )
     found = _certify(statement, beta, base, conditions, delta)
     # The verifier has the last word here too, over the same decimals that the file will hold.
-    checked = verify(_smallest_file(found, texts, beta))
+    checked = verify(_smallest_file(found, texts, beta), arm)
     if checked.verdict == found.verdict:
         return found
     return _undecided(conditions, found.margin, f"the proof did not verify: {checked.message}")
+
+
+def stated_arm(
+    name: str,
+    sha256: str | None,
+    base: BaseParameters,
+    conditions: FeasibleSet,
+    *,
+    units: Sequence[str] = (),
+    expressions: Sequence[str] | None = None,
+) -> Arm:
+    """State what a certificate of an arm has to be about, in the decimals that a file holds.
+
+    Args:
+        name: of the arm.
+        sha256: of its description; None where no file names it.
+        base: grouping of its link parameters.
+        conditions: from its description, of either set.
+        units: of its link parameters, shape (parameters,).
+        expressions: as they are printed, where these are not `base.expressions` letter by letter.
+
+    Raises:
+        ParameterError: an expression does not parse.
+    """
+    texts = base.expressions if expressions is None else expressions
+    implied = _implied(conditions)
+    blocks = tuple(exact_block(block, conditions.names) for block in conditions.blocks)
+    return Arm(
+        name,
+        sha256,
+        base.names,
+        tuple(units),
+        tuple(parse_exactly(text) for text in texts),
+        tuple(block for block in blocks if block not in implied),
+        tuple(exact_block(block, conditions.names) for block in conditions.equalities),
+    )
 
 
 def _certify(
@@ -133,24 +180,6 @@ def _smallest_file(certificate: Certificate, expressions: Sequence[str], beta: A
     )
 
 
-def _named(conditions: FeasibleSet) -> tuple[tuple[ExactBlock, ...], tuple[ExactBlock, ...]]:
-    """Blocks and equalities with names that tell each from all others and from those that the set's name implies."""
-    taken = {block.name: block for block in _implied(conditions)}
-    seen: set[str] = set()
-
-    def renamed(blocks: Sequence[Block]) -> Iterator[ExactBlock]:
-        for block in blocks:
-            exact = exact_block(block, conditions.names)
-            name, number = exact.name, 1
-            while name in seen or (name in taken and taken[name] != exact):
-                number += 1
-                name = f"{exact.name} ({number})"
-            seen.add(name)
-            yield replace(exact, name=name)
-
-    return tuple(renamed(conditions.blocks)), tuple(renamed(conditions.equalities))
-
-
 def _links(names: Iterable[str]) -> list[int]:
     return sorted({int(name[1:]) for name in names if name.startswith("m") and name[1:].isdigit()})
 
@@ -161,17 +190,40 @@ def _implied(conditions: FeasibleSet) -> list[ExactBlock]:
 
 def _witness(statement: Statement, conditions: FeasibleSet, delta: Array) -> dict[str, Any] | None:
     rounded = {name: printed(value) for name, value in zip(statement.names, delta, strict=True)}
-    exact = repair(statement.rows, statement.right, rounded, lambda _: 1.0)
+    values = _meeting(statement, rounded, statement.rows, statement.right)
+    return None if values is None else {"kind": "witness", **_set_document(statement, conditions), "delta": values}
+
+
+def _body(statement: Statement, conditions: FeasibleSet) -> dict[str, str] | None:
+    """Find a body that meets all conditions, whatever the base parameters; None where they contradict each other."""
+    try:
+        delta = interior_point(conditions)
+    except SolverError:
+        return None
+    if delta is None:
+        return None
+    rounded = {name: printed(value) for name, value in zip(statement.names, delta, strict=True)}
+    base = len(statement.K)
+    return _meeting(statement, rounded, statement.rows[base:], statement.right[base:])
+
+
+def _meeting(
+    statement: Statement,
+    values: Mapping[str, Fraction],
+    equations: Sequence[Mapping[str, Fraction]],
+    right: Sequence[Fraction],
+) -> dict[str, str] | None:
+    """Write the values that meet equations and conditions exactly, as texts; None where rounding breaks that."""
+    exact = repair(equations, right, values, lambda _: 1.0)
     if exact is None or not all(block.is_positive(exact) for block in statement.blocks):
         return None
     used = {name for row in statement.K for name in row}
     every = (*statement.blocks, *statement.equalities)
     used |= {name for block in every for entry in block.entries for name in entry.coefficients}
     try:
-        values = {name: rational_text(value) for name, value in exact.items() if name in used}
-    except ParameterError:
+        return {name: rational_text(value) for name, value in exact.items() if name in used}
+    except VerificationError:
         return None
-    return {"kind": "witness", **_set_document(statement, conditions), "delta": values}
 
 
 def _dual(
@@ -179,6 +231,9 @@ def _dual(
 ) -> tuple[dict[str, Any], tuple[tuple[str, float], ...]] | None:
     blocks = (*conditions.blocks, *assumed)
     exact = replace(statement, blocks=statement.blocks + tuple(exact_block(block, base.names) for block in assumed))
+    body = _body(exact, replace(conditions, blocks=blocks))
+    if body is None:
+        return None
     rows = np.vstack([base.K, *(block.F for block in conditions.equalities)])
     right = np.concatenate([beta, *(-block.f for block in conditions.equalities)])
     delta = np.linalg.lstsq(rows, right, rcond=None)[0]
@@ -194,8 +249,8 @@ def _dual(
         if proof is None:
             continue
         try:
-            document = {"kind": "dual", **_set_document(exact, conditions), **_multipliers(exact, *proof)}
-        except ParameterError:
+            document = {"kind": "dual", **_set_document(exact, conditions), **_multipliers(exact, *proof), "body": body}
+        except VerificationError:
             continue
         traces = [trace(block, z) for block, z in zip(exact.blocks, proof[0], strict=True)]
         total = sum(traces, Fraction(0))

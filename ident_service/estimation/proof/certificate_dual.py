@@ -5,8 +5,8 @@ The alternative to BPFT (eq. 51) with `D > 0`: Z >= 0, not zero, with `<F_k d, Z
 path gives one far from the boundary of the cone, which survives rounding to decimals.
 
 An unbounded direction of the set (a mass that no expression names) forces Z to vanish on some rows; these are dropped
-before (facial reduction, where the direction is diagonal). Nothing here needs to be trusted, as `certificate_exact.py`
-checks what comes out. Pure computation, no I/O.
+before (facial reduction, where the direction is diagonal). Nothing here needs to be trusted, as
+`certificate_verifier.py` checks what comes out. Pure computation, no I/O.
 """
 
 from __future__ import annotations

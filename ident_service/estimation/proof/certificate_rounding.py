@@ -5,20 +5,21 @@ Boundary: pure computation, no I/O.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import TypeVar
 
 import numpy as np
 
+from ident_service.certificate_verifier import Affine, ExactBlock, is_positive_semidefinite, symmetric, triangle
 from ident_service.estimation.feasible.feasible_set import Block
-from ident_service.estimation.proof.exact import is_positive_semidefinite, repair, symmetric, triangle
-from ident_service.estimation.proof.exact_blocks import Affine, ExactBlock
 from ident_service.model.chain import Array
 
 _SPARE_DIGITS = 5
 _MOST_DIGITS = 28
 
+Unknown = TypeVar("Unknown", bound=Hashable)
 Key = tuple[int, int]  # block and entry of a multiplier; block -1 for the multipliers of base parameters
 
 
@@ -135,3 +136,51 @@ def _smallest(block: ExactBlock, z: Array) -> float:
 
 def _rounded(value: float, digits: int) -> Fraction:
     return Fraction(round(Fraction(float(value)) * 10**digits), 10**digits)
+
+
+def repair(
+    equations: Sequence[Mapping[Unknown, Fraction]],
+    right: Sequence[Fraction],
+    values: Mapping[Unknown, Fraction],
+    weight: Callable[[Unknown], float],
+) -> dict[Unknown, Fraction] | None:
+    """Change a few values so that linear equations hold exactly.
+
+    Elimination on the residuals; each equation changes the unknown that stands in the fewest equations, so that
+    decimals stay short, and of these the one with the largest weight times coefficient.
+
+    Args:
+        equations: coefficients by unknown.
+        right: right-hand sides.
+        values: what is nearly a solution.
+        weight: how readily an unknown may change.
+
+    Returns:
+        The values that solve the equations, or None where these contradict each other.
+    """
+    count: dict[Unknown, int] = {}
+    for equation in equations:
+        for unknown in equation:
+            count[unknown] = count.get(unknown, 0) + 1
+    solved: list[tuple[Unknown, dict[Unknown, Fraction], Fraction]] = []
+    for equation, target in zip(equations, right, strict=True):
+        row = {unknown: coefficient for unknown, coefficient in equation.items() if coefficient}
+        rest = target - sum((c * values[unknown] for unknown, c in row.items()), Fraction(0))
+        for pivot, pivot_row, pivot_rest in solved:
+            if factor := row.pop(pivot, Fraction(0)):
+                rest -= factor * pivot_rest
+                for unknown, coefficient in pivot_row.items():
+                    row[unknown] = row.get(unknown, Fraction(0)) - factor * coefficient
+                    if not row[unknown]:
+                        del row[unknown]
+        if not row:
+            if rest:
+                return None
+            continue
+        chosen = min(row, key=lambda unknown: (count[unknown], -weight(unknown) * abs(float(row[unknown]))))
+        scale = row.pop(chosen)
+        solved.append((chosen, {unknown: c / scale for unknown, c in row.items()}, rest / scale))
+    change: dict[Unknown, Fraction] = {}
+    for chosen, row, rest in reversed(solved):
+        change[chosen] = rest - sum((c * change.get(unknown, Fraction(0)) for unknown, c in row.items()), Fraction(0))
+    return {unknown: value + change.get(unknown, 0) for unknown, value in values.items()}

@@ -21,11 +21,12 @@ from ident_service.results.report.reservations import (
 
 _MUCH_WORSE = 1.5  # times the error on what was fitted to
 SIMULATED = "The arm's driver is a simulated one: this is about a simulation, not a commissioning of a real arm."
-_PROOFS = {"witness": True, "dual": True, "undecided": False}
+# The page repeats a file, which anybody may have written; only the verifier, with the arm, can tell.
+_CERTIFIED = "parameters.json has a certificate of that: `ident verify --arm` checks it in exact arithmetic."
 
 
 def verdict(evidence: Evidence, parameters: ParameterFile, *, simulated: bool = False) -> list[str]:
-    """Sentences: could a body have it, is that proven, how well it predicts, what is not known, what to do next.
+    """Sentences: could a body have it, is that certified, how well it predicts, what is not known, what to do next.
 
     Args:
         evidence: what was gathered while the estimate was at hand.
@@ -48,22 +49,23 @@ def _feasibility(evidence: Evidence, parameters: ParameterFile) -> list[str]:
     if found is None:
         return ["Whether a real body could have these parameters was not tested."]
     margin, kind = number(found["margin"]), found.get("certificate", {}).get("kind", "")
-    proven = _PROOFS.get(kind, False)
+    certified = kind in ("witness", "dual")
     tight = listed(found.get("tight", []))
     if parameters.feasible_set == "none":
         how = "They were not held in any feasible set."
     else:
         how = f"They were held in the feasible set {parameters.feasible_set}."
     if found["margin"] > 0.0:
-        words = f"A real body could have these parameters (margin {margin})"
-        sentences = [words + (", which is proven in exact arithmetic." if proven and found["feasible"] else ".")]
-        if not (proven and found["feasible"]):
-            sentences.append("That is not proven in exact arithmetic: they lie too close to the boundary.")
+        sentences = [f"A real body could have these parameters (margin {margin})."]
+        if certified and found["feasible"]:
+            sentences.append(_CERTIFIED)
+        else:
+            sentences.append("They lie too close to the boundary for a certificate in exact arithmetic.")
         if tight:
             sentences.append(f"{active_conditions(evidence, parameters)}, which the data pull against: {tight}.")
         return [*sentences, how]
-    words = f"No real body has these parameters (margin {margin})"
-    sentences = [words + (", which is proven in exact arithmetic." if proven else ", though this is not proven.")]
+    sentences = [f"No real body has these parameters (margin {margin})."]
+    sentences.append(_CERTIFIED if certified else "There is no certificate of that in exact arithmetic.")
     if tight:
         sentences.append(f"What contradicts them: {tight}.")
     return [*sentences, how]

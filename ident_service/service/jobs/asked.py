@@ -198,10 +198,11 @@ class Export(Ask):
 
 
 class Verify(Ask):
-    """The certificate in a run's parameters, in exact arithmetic."""
+    """Check the certificate in a run's parameters against its own conditions, or those of an arm's description."""
 
     kind: Literal["verify"]
     run: Id
+    arm: ArmName | None = None
 
 
 class Feasible(Ask):

@@ -170,7 +170,8 @@ def _about_a_run(
     made = new_id(arm) if asked.kind in TAKEN_AWAY else None
     place = state / (REPORTS if isinstance(asked, Report) else EXPORTS)
     if isinstance(asked, Verify):
-        words = ["verify", str(run_file(db, state, asked.run, PARAMETERS))]
+        described = None if asked.arm is None else str(known_arm(db, state, asked.arm).path)
+        words = ["verify", str(run_file(db, state, asked.run, PARAMETERS)), *_given({"arm": described})]
     elif isinstance(asked, Compare):
         words = ["compare", str(folder), str(run_folder(db, state, asked.other))]
     elif isinstance(asked, Feasible | Correct):
