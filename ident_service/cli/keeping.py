@@ -13,11 +13,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from ident_service.cli.answer import DONE, Answer, state_folder
+from ident_service.cli.answer import DONE, Answer, print_to_person, state_folder
 from ident_service.cli.words import Parser, Verbs, count
 from ident_service.errors import UsageError
 
 _LONGEST_NAME = 80
+_PATIENCE = 1.0  # s that an act, which is done, waits for its line in the audit trail
 
 
 def add_by(sub: Parser) -> None:
@@ -31,7 +32,7 @@ def at_terminal(arguments: argparse.Namespace) -> str:
     Raises:
         UsageError: no name.
     """
-    if arguments.by is not None:
+    if getattr(arguments, "by", None) is not None:
         name = arguments.by.strip()
     else:
         try:
@@ -41,6 +42,32 @@ def at_terminal(arguments: argparse.Namespace) -> str:
     if not name or len(name) > _LONGEST_NAME:
         raise UsageError(f"--by needs a name of 1 to {_LONGEST_NAME} characters")
     return f"terminal:{name}"
+
+
+def note_act(arguments: argparse.Namespace, what: str, about: str, **detail: Any) -> None:
+    """Enter what was done at a terminal in the audit trail, where the state folder has one.
+
+    It has been done already: a registry that is kept or full is told of, and changes nothing.
+
+    Args:
+        arguments: of the verb.
+        what: one word or two, as in the daemon's own lines.
+        about: name of the arm.
+        detail: JSON values.
+    """
+    import sqlite3
+
+    from ident_service.service.registry.audit import note
+    from ident_service.service.registry.database import FILE, Database
+
+    state = state_folder(arguments)
+    if not (state / FILE).is_file():
+        return
+    try:
+        with Database(state, busy=_PATIENCE) as db:
+            note(db, at_terminal(arguments), what, about, **detail)
+    except (UsageError, sqlite3.Error) as error:
+        print_to_person(f"ident: done, but not entered in the audit trail: {error}\n")
 
 
 def add(verbs: Verbs) -> None:

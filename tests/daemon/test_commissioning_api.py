@@ -234,7 +234,7 @@ def test_one_motion_at_a_time_and_a_lease_while_it_waits(state: Path) -> None:
         # Whoever waits and falls silent does not move an arm later.
         blocker = daemon.begin({"kind": "check", "arm": ARM}, confirmed=True)
         silent = daemon.begin({"kind": "home", "arm": ARM}, confirmed=True)
-        daemon.service.engine._factor = 0.1
+        daemon.service.engine.live.lease_factor = 0.1
         ended = daemon.follow(silent["id"])
         assert (ended["state"], ended["started"]) == ("cancelled", None)
         assert "nothing has moved" in ended["detail"]

@@ -177,7 +177,7 @@ def test_a_stop_in_the_middle(browser: Browser, reached: Reached, state: Path, h
             dead.keyboard.press(key)
         dead.get_by_role("heading", name="Stop asked").wait_for()
     else:
-        reached.service.engine._factor = 1.0
+        reached.service.engine.live.lease_factor = 1.0
         page.goto(f"{reached.url}/audit")
     job = rows.jobs(reached.service.db, arm=ARM, most=1)[0]["id"]
     until = time.monotonic() + 60.0

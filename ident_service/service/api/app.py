@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
+import logging
+import sqlite3
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -28,6 +31,8 @@ from ident_service.service.registry.database import Database
 from ident_service.service.registry.runs import rebuild_runs
 from ident_service.service.registry.tokens import first_token
 
+_REFRESH = 1.0  # s between looks for tokens that were made or revoked at a terminal
+_LOG = logging.getLogger("ident.serve")
 ROUTERS = (
     *(about.router, access.router, arms.router, descriptions.router, jobs.router, runs.router, pruning.router),
     *(exports.router, maintenance.router, *PAGES),
@@ -61,9 +66,11 @@ def create_app(settings: Settings) -> FastAPI:
         settle(db, settings.state)
         engine.start(lambda: rebuild_runs(db, settings.state))
         keeper.start()
+        refreshing = asyncio.create_task(_refresh(service.gate))
         try:
             yield
         finally:
+            refreshing.cancel()
             await run_in_threadpool(engine.close)
             app.state.live.close()
             await run_in_threadpool(keeper.close)
@@ -87,6 +94,15 @@ def create_app(settings: Settings) -> FastAPI:
     answer_mistakes(app)
     app.add_middleware(Doors, settings=settings, metrics=service.metrics)
     return app
+
+
+async def _refresh(gate: Gate) -> None:
+    while True:
+        await asyncio.sleep(_REFRESH)
+        try:
+            await run_in_threadpool(gate.refresh)
+        except sqlite3.Error as error:
+            _LOG.error("tokens cannot be read: %s", error)
 
 
 def _webhook(settings: Settings, db: Database) -> Webhook | None:
