@@ -16,6 +16,7 @@ from ident_service import __version__
 from ident_service.service.acceptance import settle
 from ident_service.service.api import about, access, arms, descriptions, exports, jobs, maintenance, pruning, runs
 from ident_service.service.api.asking import Service
+from ident_service.service.api.connections import Connections
 from ident_service.service.api.doors import Doors
 from ident_service.service.api.gate import Gate
 from ident_service.service.api.metrics import Metrics
@@ -40,11 +41,12 @@ ROUTERS = (
 """In this order."""
 
 
-def create_app(settings: Settings) -> FastAPI:
+def create_app(settings: Settings, connections: Connections | None = None) -> FastAPI:
     """The service as an ASGI application; its database is opened now, its queue runs while its lifespan does.
 
     Args:
         settings: how it runs.
+        connections: of the listener that it is served by; None where something else counts them.
 
     Raises:
         UsageError: the state folder cannot be used.
@@ -92,7 +94,7 @@ def create_app(settings: Settings) -> FastAPI:
     for router in ROUTERS:
         app.include_router(router)
     answer_mistakes(app)
-    app.add_middleware(Doors, settings=settings, metrics=service.metrics)
+    app.add_middleware(Doors, settings=settings, metrics=service.metrics, connections=connections or Connections())
     return app
 
 
