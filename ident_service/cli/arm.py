@@ -6,13 +6,23 @@ Boundary: words to requests, results to words; the work is `service/run.py`. `st
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import sys
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, interrupting, state_folder, tell
+from ident_service.cli.answer import (
+    DONE,
+    VERDICT_NO,
+    Answer,
+    StopOnSignal,
+    interrupting,
+    own_state_folder,
+    state_folder,
+    tell,
+)
 from ident_service.cli.keeping import add_by, note_act
 from ident_service.cli.lease import add_lease, asked_lease, until
 from ident_service.cli.moving import RELEASED, HeldKey, add_can_log, moved, require_terminal
@@ -133,7 +143,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
     if arguments.home and arguments.motion is not None:
         raise UsageError("give a motion or --home, not both")
     motion = None if arguments.home else _chosen(config, arguments.motion)
-    state = state_folder(arguments)
+    state = own_state_folder(arguments)
     path, faults = ticket_path(state, config.name), fault_file(state, config.name)
     faults.require_none(faults.latched())
     require_writable(path.parent)
@@ -255,7 +265,7 @@ def _ack(arguments: argparse.Namespace) -> Answer:
     from ident_service.service.arm_state import fault_file
 
     name = _name(arguments)
-    cause = fault_file(state_folder(arguments), name).acknowledge(arguments.fault)
+    cause = fault_file(own_state_folder(arguments), name).acknowledge(arguments.fault)
     note_act(arguments, "fault acknowledged", name, code=arguments.fault, cause=cause)
     return DONE, f"{name}: acknowledged {arguments.fault} ({cause})\n", {"arm": name, "acknowledged": arguments.fault}
 
@@ -263,6 +273,7 @@ def _ack(arguments: argparse.Namespace) -> Answer:
 def _control(arguments: argparse.Namespace) -> tuple[str, Path]:
     from ident_service.service.arm_state import control_path
 
+    os.umask(0o077)  # and no more: a stop is not refused for a folder that others can enter
     name = _name(arguments)
     return name, control_path(state_folder(arguments), name)
 

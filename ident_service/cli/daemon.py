@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from ident_service.cli.answer import DONE, Answer, print_to_person, state_folder
+from ident_service.cli.answer import DONE, Answer, own_state_folder, print_to_person, state_folder
 from ident_service.cli.keeping import add_by, at_terminal
 from ident_service.cli.words import Verbs
 
@@ -70,7 +70,7 @@ def _add(arguments: argparse.Namespace) -> Answer:
     from ident_service.service.registry.database import Database
     from ident_service.service.registry.tokens import add_token
 
-    with Database(state_folder(arguments)) as db:
+    with Database(own_state_folder(arguments)) as db:
         secret = add_token(db, arguments.name, arguments.role, at_terminal(arguments))
     return DONE, f"{secret}\n", {"name": arguments.name, "role": arguments.role, "token": secret}
 
@@ -79,7 +79,7 @@ def _list(arguments: argparse.Namespace) -> Answer:
     from ident_service.service.registry.database import Database
     from ident_service.service.registry.tokens import tokens
 
-    with Database(state_folder(arguments)) as db:
+    with Database(own_state_folder(arguments)) as db:
         rows = tokens(db)
     return (
         DONE,
@@ -98,7 +98,7 @@ def _revoke(arguments: argparse.Namespace) -> Answer:
     from ident_service.service.registry.database import Database
     from ident_service.service.registry.tokens import revoke_token
 
-    with Database(state_folder(arguments)) as db:
+    with Database(own_state_folder(arguments)) as db:
         revoke_token(db, arguments.name, at_terminal(arguments))
     return DONE, f"{arguments.name}: revoked\n", {"name": arguments.name, "revoked": True}
 

@@ -13,7 +13,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from ident_service.cli.answer import DONE, Answer, print_to_person, state_folder
+from ident_service.cli.answer import DONE, Answer, own_state_folder, print_to_person, state_folder
 from ident_service.cli.words import Parser, Verbs, count
 from ident_service.errors import UsageError
 
@@ -95,7 +95,7 @@ def _accept(arguments: argparse.Namespace) -> Answer:
     from ident_service.service.arm_state import arm_folder
     from ident_service.service.registry.database import Database
 
-    state = state_folder(arguments)
+    state = own_state_folder(arguments)
     with Database(state) as db:
         act = accept(db, state, arguments.run.resolve(), arguments.note, at_terminal(arguments))
     path = arm_folder(state, act.arm) / CURRENT / PARAMETERS
@@ -107,7 +107,7 @@ def _rollback(arguments: argparse.Namespace) -> Answer:
     from ident_service.service.arm_state import arm_folder
     from ident_service.service.registry.database import Database
 
-    state = state_folder(arguments)
+    state = own_state_folder(arguments)
     with Database(state) as db:
         act = rollback(db, state, arguments.arm, arguments.note, at_terminal(arguments), arguments.to)
     path = arm_folder(state, act.arm) / CURRENT / PARAMETERS
@@ -120,7 +120,7 @@ def _import(arguments: argparse.Namespace) -> Answer:
     from ident_service.service.registry.database import Database
     from ident_service.service.registry.runs import RUNS
 
-    state = state_folder(arguments)
+    state = own_state_folder(arguments)
     with Database(state) as db:
         row = import_run(db, state, arguments.run, at_terminal(arguments))
     folder = state / RUNS / row["id"]
@@ -139,7 +139,7 @@ def _prune(arguments: argparse.Namespace) -> Answer:
     from ident_service.service.registry.runs import rebuild_runs
     from ident_service.service.retention import expendable, let_go
 
-    state = state_folder(arguments)
+    state = own_state_folder(arguments)
     with Database(state) as db:
         untold = rebuild_runs(db, state)
         gone = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import time
 from pathlib import Path
@@ -254,6 +255,38 @@ def test_an_upload_leads_nowhere(daemon: Asked, state: Path, reach: str, door: s
         assert "root:" not in answer.text
         assert str(state) not in answer.text
     assert not any(row["name"] == "spy" for row in daemon.get("/api/v1/arms").json())
+
+
+@pytest.mark.parametrize("door", ["arms", "descriptions/check"])
+def test_an_upload_learns_nothing_of_other_files(daemon: Asked, state: Path, door: str) -> None:
+    def answer(key: str, value: str) -> str:
+        text = f"format: ident-arm\nversion: 1\nname: spy\n{key.format(json.dumps(value))}\n"
+        told = daemon.post(f"/api/v1/{door}", {"description": text, "files": {"own.urdf": "<robot name='x'/>"}})
+        assert str(state) not in told.text
+        return f"{told.status_code} {told.text.replace(value, 'FILE')}"
+
+    (state / "descriptions").mkdir(exist_ok=True)
+    for key in (
+        "kinematics: {{urdf: {}}}",
+        "kinematics: {{urdf: own.urdf}}\nprior: {}",
+        "description: {}",
+        "gravity: {}",
+    ):
+        # A text is a text, and a file that is there is told from one that is not by nobody.
+        for there, not_there in (("/etc/shadow", "/etc/shadov"), ("../../token", "../../tokem"), ("..", "...")):
+            assert answer(key, there) == answer(key, not_there), key
+        if "description" in key:
+            assert "FILE" not in answer(key, "/etc/shadow")
+    assert "no such file: FILE" in answer("kinematics: {{urdf: {}}}", "x" * 300)
+
+
+def test_a_file_of_an_upload_is_not_taken_for_a_shipped_arm(daemon: Asked, state: Path) -> None:
+    secret = state.parent / "secret.urdf"
+    secret.write_text("<robot name='secret'/>")
+    files = {"planar2": f"extends: {secret}\n"}
+    refusal(
+        daemon.post("/api/v1/arms", {"description": "extends: planar2\nname: spy\n", "files": files}), 400, "shipped"
+    )
 
 
 @pytest.mark.parametrize("name", ["../x", "arm.yaml", "a/b", "", ".x", "a" * 200])

@@ -27,6 +27,7 @@ from ident_service.service.api.app import create_app
 from ident_service.service.api.connections import Connections, Listener, most_connections
 from ident_service.service.api.notify import tell_manager, watchdog_seconds
 from ident_service.service.api.settings import Settings
+from ident_service.service.state_folder import keep_private
 
 LOCK: Final = "serve.lock"
 URL_FILE: Final = "serve.url"
@@ -45,8 +46,9 @@ def serve(settings: Settings, tell: Callable[[str], None] = lambda _: None) -> N
         tell: called with the address, when it answers.
 
     Raises:
-        UsageError: another service has the state folder, or the address cannot be had.
+        UsageError: another service has the state folder, others can enter it, or the address cannot be had.
     """
+    keep_private(settings.state)
     book = Connections(most_connections())
     with single_instance(settings.state), _listening(settings, book) as listening:
         host, port = listening.getsockname()[:2]
@@ -91,7 +93,7 @@ def single_instance(state: Path) -> Iterator[None]:
     """
     path = state / LOCK
     try:
-        state.mkdir(parents=True, exist_ok=True)
+        state.mkdir(mode=0o700, parents=True, exist_ok=True)
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
     except OSError as error:
         raise UsageError(f"{path}: cannot be made: {error.strerror}; give another state folder") from None
