@@ -70,7 +70,6 @@ def measure(folder: Path, rounds: int = ROUNDS, *, quiet: bool = False) -> Measu
         rounds: how often.
         quiet: whether nothing else goes on, for comparison.
     """
-    gc.disable()  # of the clients: a collection of theirs is not the daemon's
     state, log = folder / "state", folder / "serve.log"
     obeyed, answered = list[float](), list[float]()
     with _daemon(state, log) as address, _part("arms", str(state), str(rounds)) as arms, ExitStack() as load:
@@ -253,6 +252,7 @@ def _rows(name: str, seconds: list[float], target: str | None) -> list[Row]:
 
 
 def main() -> None:
+    gc.disable()  # of the clients: a collection of theirs is not the daemon's
     rows = []
     for quiet in (True, False):
         with tempfile.TemporaryDirectory() as folder:

@@ -19,7 +19,6 @@ from typing import Any, Final
 
 import uvicorn
 from fastapi import FastAPI
-from starlette.exceptions import HTTPException
 
 from ident_service.errors import UsageError
 from ident_service.record.files import write_atomically
@@ -176,8 +175,7 @@ async def _make_routes(app: FastAPI) -> None:
 
     scope = {"type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": "POST", "scheme": "http"}
     place = {"path": "/nothing", "raw_path": b"/nothing", "query_string": b"", "root_path": "", "headers": []}
-    with suppress(HTTPException):  # that nothing is there
-        await app.router({**scope, **place, "app": app, "fastapi_inner_astack": None}, receive, send)
+    await app.router({**scope, **place}, receive, send)
 
 
 @contextmanager
