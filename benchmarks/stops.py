@@ -47,7 +47,7 @@ _PATIENCE = 30.0  # s
 
 @dataclass(frozen=True)
 class Measured:
-    """What a measurement saw.
+    """Holds what a measurement saw.
 
     Attributes:
         obeyed: from request to the arm's word, of every stop [s].
@@ -94,7 +94,7 @@ def measure(folder: Path, rounds: int = ROUNDS, *, quiet: bool = False) -> Measu
 
 
 def _stops(address: tuple[str, str]) -> tuple[list[int], list[int]]:
-    """Ten stops at once: when each was sent and answered [ns of the monotonic clock]."""
+    """Stop ten arms at once; tell when each was sent and answered [ns of the monotonic clock]."""
     sent, done, together = [0] * CLIENTS, [0] * CLIENTS, threading.Barrier(CLIENTS)
 
     def stop(number: int) -> None:
@@ -121,7 +121,7 @@ def _name(number: int) -> str:
 
 @contextmanager
 def _daemon(state: Path, log: Path) -> Iterator[tuple[str, str]]:
-    """A daemon with few descriptors on a free port: host and port."""
+    """Serve with few descriptors on a free port; yield host and port."""
     words = ["serve", "--port", "0", "--state", str(state)]
 
     def few() -> None:
@@ -146,7 +146,7 @@ def _daemon(state: Path, log: Path) -> Iterator[tuple[str, str]]:
 
 @contextmanager
 def _part(*words: str) -> Iterator[subprocess.Popen[str]]:
-    """A process of this file that does one of the parts below; killed at the end if it lives still."""
+    """Start a process that does one of the parts below; it is killed at the end if it lives still."""
     with subprocess.Popen(
         [sys.executable, "-m", __name__ if __name__ != "__main__" else "benchmarks.stops", *words],
         stdin=subprocess.PIPE,
@@ -167,7 +167,7 @@ def _line(process: subprocess.Popen[str]) -> str:
 
 
 def _said(process: subprocess.Popen[str]) -> str:
-    """The last word of a part that is asked to end."""
+    """End the input of a part, and read its last word."""
     return process.communicate(timeout=_PATIENCE)[0].split()[-1]
 
 

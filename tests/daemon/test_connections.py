@@ -26,7 +26,7 @@ NEAR, FAR = "127.0.0.1", "203.0.113.9"
 
 
 class Book(Connections):
-    """Connections of a test: real sockets whose other ends the test holds, under addresses that it chooses."""
+    """Counts real sockets whose other ends the test holds, under addresses that it chooses."""
 
     def __init__(self, most: int) -> None:
         self.at = 0.0
@@ -35,7 +35,7 @@ class Book(Connections):
         self.ours: dict[tuple[str, int], Connection] = {}
 
     def come(self, host: str, port: int) -> bool:
-        """A newcomer; whether it was let in."""
+        """Let a newcomer come; tell whether it was let in."""
         ours, theirs = socket.socketpair()
         peer = (host, port)
         self.theirs[peer], self.ours[peer] = theirs, Connection.of(ours, peer, self)
@@ -46,7 +46,7 @@ class Book(Connections):
         return admitted
 
     def gone(self) -> list[tuple[str, int]]:
-        """Who has been told to go, or was."""
+        """List those whose connection was ended."""
         return [peer for peer, theirs in self.theirs.items() if _ended(theirs)]
 
     def end(self) -> None:

@@ -33,7 +33,7 @@ def usual_umask() -> Iterator[None]:
 
 @pytest.fixture
 def entered() -> Iterator[Path]:
-    """A folder that everybody on the machine can enter."""
+    """Make a folder that everybody on the machine can enter; the state folder is to be in it."""
     folder = Path(tempfile.mkdtemp(dir="/tmp"))
     folder.chmod(0o755)
     yield folder / "state"
@@ -41,7 +41,7 @@ def entered() -> Iterator[Path]:
 
 
 def readable(folder: Path) -> list[tuple[str, str]]:
-    """Whatever others may read, write or enter, with its mode."""
+    """List whatever others may read, write or enter, with its mode."""
     modes = [(path, path.lstat().st_mode) for path in (folder, *folder.rglob("*")) if not path.is_symlink()]
     return [(str(path.relative_to(folder)), oct(mode)) for path, mode in modes if mode & 0o077]
 

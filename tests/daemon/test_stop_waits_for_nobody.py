@@ -30,7 +30,7 @@ MAINTENANCE = ("/api/v1/arms/planar2/maintenance", {"what": "belt"})
 
 @contextmanager
 def locked(state: Path) -> Iterator[None]:
-    """Another connection keeps a write transaction open, as a backup does."""
+    """Keep a write transaction open on another connection, as a backup does."""
     other = sqlite3.connect(state / FILE, isolation_level=None)
     try:
         other.execute("BEGIN IMMEDIATE")

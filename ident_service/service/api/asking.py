@@ -53,7 +53,7 @@ def service_of(request: Request) -> Service:
 
 
 async def serving(request: Request) -> Service:
-    """The same for a route: what is no coroutine would wait for a thread, and a stop waits for none that is shared."""
+    """Find the service for a route; were this no coroutine, a stop would wait for a thread that others share."""
     return service_of(request)
 
 
@@ -131,7 +131,7 @@ async def anybody_near(request: Request, bearer: Bearer = None, cookie: Cookie =
 
 
 async def lease_keeper(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> Access:
-    """Who renews a lease: as `operator`, asked of memory, because a lease does not last as long as a registry may wait.
+    """Find who renews a lease, as `operator` but by memory: a lease does not last as long as a registry may wait.
 
     Raises:
         HTTPException: as `operator`.

@@ -40,7 +40,7 @@ def most_connections() -> int:
 
 
 class Connections:
-    """The connections that are open."""
+    """Knows the connections that are open, and which of them wait."""
 
     def __init__(self, most: int = _MOST, now: Callable[[], float] = time.monotonic) -> None:
         """Begin with none.
@@ -57,16 +57,16 @@ class Connections:
 
     @property
     def full(self) -> bool:
-        """Whether even those that are about to go have not gone yet."""
+        """Tell whether even those that are about to go have not gone yet."""
         return len(self._open) + self._leaving >= self._most + _LEAVING
 
     @property
     def busy(self) -> bool:
-        """Whether as many requests are being answered as may be."""
+        """Tell whether as many requests are being answered as may be."""
         return len(self._open) - len(self._waiting) >= 3 * self._most // 4
 
     def __len__(self) -> int:
-        """How many are open."""
+        """Count those that are open."""
         return len(self._open)
 
     def admit(self, connection: Connection) -> bool:
@@ -136,7 +136,7 @@ class Connections:
 
 
 class Connection(socket.socket):
-    """An accepted connection, which says when it is closed."""
+    """Tells its book when it is closed."""
 
     peer: Peer
     leaving = False
@@ -158,7 +158,7 @@ class Connection(socket.socket):
 
 
 class Listener(socket.socket):
-    """A listening socket whose connections are counted before anything is read from them."""
+    """Counts its connections before anything is read from them."""
 
     def __init__(self, family: int, book: Connections) -> None:
         """Make it; it is not bound yet.

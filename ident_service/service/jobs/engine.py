@@ -234,7 +234,7 @@ class Engine:
                 self._wait(live)
 
     def _stopped_at_terminal(self, live: LiveJob) -> bool:
-        """Whether a stop, which need not have come through us, was asked for after this motion was."""
+        """Tell whether a stop, which need not have come through us, was asked for after this motion was."""
         stamp = stop_asked_ns(control_path(self.state, str(live.order.arm)))
         # One that seems yet to come is from before the machine was started.
         return live.asked_ns < stamp <= time.monotonic_ns()
@@ -269,10 +269,14 @@ class Engine:
         LOG.info("job started", extra={"job": live.job, "arm": live.order.arm})
 
     def _watch(self, live: LiveJob, child: Child) -> None:
-        """One that runs: its end."""
-        if live.asked_to_end and not live.order.moves and not live.killed and self._now() - live.since > _POLITE:
-            live.killed = True
-            child.signal(signal.SIGKILL)
+        """Look at one that runs; a computation is asked to end politely, and then not."""
+        if live.asked_to_end and not live.order.moves:
+            if not live.told:
+                live.told = True
+                child.signal(signal.SIGTERM)
+            elif not live.killed and self._now() - live.since > _POLITE:
+                live.killed = True
+                child.signal(signal.SIGKILL)
         if child.ended() and not live.concluding:
             # Beside the queue: a long recording has a long hash.
             live.concluding = True

@@ -7,7 +7,6 @@ Boundary: no file and no registry here; processes are started, and their ends en
 
 from __future__ import annotations
 
-import signal
 import threading
 from collections import Counter
 from collections.abc import Callable
@@ -36,6 +35,7 @@ class LiveJob:
         child: its process, once it runs.
         asked_to_end: why it is to end; empty while it is not.
         since: when that was asked [s].
+        told: whether a computation was asked politely.
         killed: whether it was ended by force.
         concluding: whether its end is being entered.
     """
@@ -50,12 +50,13 @@ class LiveJob:
     child: Child | None = None
     asked_to_end: str = ""
     since: float = 0.0
+    told: bool = False
     killed: bool = False
     concluding: bool = False
 
 
 class LiveJobs:
-    """The jobs in the order they came; used from any thread."""
+    """Keeps the jobs in the order they came; used from any thread."""
 
     def __init__(self, lease_factor: float, now: Callable[[], float]) -> None:
         """Begin without jobs.
@@ -82,7 +83,7 @@ class LiveJobs:
 
     @property
     def healthy(self) -> bool:
-        """Whether leases are looked after."""
+        """Tell whether leases are looked after."""
         return self._thread.is_alive()
 
     def add(self, live: LiveJob, stops: int | None = None) -> None:
@@ -124,11 +125,11 @@ class LiveJobs:
             return [live for live in self._jobs.values() if live.entered]
 
     def __bool__(self) -> bool:
-        """Whether there are any."""
+        """Tell whether there are any."""
         return bool(self._jobs)
 
     def __contains__(self, live: LiveJob) -> bool:
-        """Whether a job has not ended yet."""
+        """Tell whether a job has not ended yet."""
         return live.job in self._jobs
 
     def free(self, live: LiveJob, computing: int) -> bool:
@@ -155,7 +156,7 @@ class LiveJobs:
         with self._lock:
             live.child = child
             if live.asked_to_end:
-                _tell_end(live)
+                _say_stop(live)
 
     def conclude(self, live: LiveJob, child: Child) -> None:
         """Speak no more to a process that has ended."""
@@ -165,7 +166,7 @@ class LiveJobs:
     # --- leases and stops
 
     def lease_holder(self, job: str) -> str | None:
-        """Who asked for a motion that waits or moves, and so renews its lease; None where there is none to renew."""
+        """Name who asked for a motion that waits or moves, and so renews its lease; None where there is no lease."""
         live = self._jobs.get(job)
         return None if live is None or not live.order.moves else live.by
 
@@ -198,7 +199,7 @@ class LiveJobs:
         return [live.job for live in found]
 
     def stops(self, arm: str | None) -> int:
-        """How often a stop of this arm, or of all, has been asked for here."""
+        """Count the stops of this arm, or of all, that have been asked for here."""
         return self._stops[None] + (self._stops[arm] if arm is not None else 0)
 
     def end(self, job: str, why: str) -> bool:
@@ -218,11 +219,9 @@ class LiveJobs:
 
     def _end(self, live: LiveJob, why: str) -> None:
         """Ask a job to end; the first reason counts."""
-        first = not live.asked_to_end
-        if first:
+        if not live.asked_to_end:
             live.asked_to_end, live.since = why, self._now()
-        if first or live.order.moves:
-            _tell_end(live)
+        _say_stop(live)
         self.changed.set()
 
     def _keep_leases(self) -> None:
@@ -244,9 +243,7 @@ class LiveJobs:
             self._end(live, f"nobody renewed its lease {waited if live.child is None else moved}")
 
 
-def _tell_end(live: LiveJob) -> None:
-    """Tell a process, where there is one: a motion in a line, a computation by a signal."""
+def _say_stop(live: LiveJob) -> None:
+    """Tell a motion's process, where there is one; a computation is ended by the queue."""
     if live.child is not None and live.order.moves:
         live.child.say(STOP)
-    elif live.child is not None:
-        live.child.signal(signal.SIGTERM)
