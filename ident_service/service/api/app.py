@@ -94,7 +94,8 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
     for router in ROUTERS:
         app.include_router(router)
     answer_mistakes(app)
-    app.add_middleware(Doors, settings=settings, metrics=service.metrics, connections=connections or Connections())
+    book = Connections() if connections is None else connections
+    app.add_middleware(Doors, settings=settings, metrics=service.metrics, connections=book)
     return app
 
 

@@ -52,7 +52,7 @@ class Connections:
         self._most, self._now = most, now
         self._open: dict[Peer, Connection] = {}
         self._waiting: dict[Peer, float] = {}  # to the deadline, the longest waiting first
-        self._of_one = Counter[str]()
+        self._of_one, self._requests = Counter[str](), Counter[Peer]()
         self._leaving = 0
 
     @property
@@ -65,7 +65,8 @@ class Connections:
         """Tell whether as many requests are being answered as may be."""
         return len(self._open) - len(self._waiting) >= 3 * self._most // 4
 
-    def __len__(self) -> int:
+    @property
+    def count(self) -> int:
         """Count those that are open."""
         return len(self._open)
 
@@ -89,8 +90,10 @@ class Connections:
 
     def headers_came(self, peer: Peer | None, *, body: bool) -> None:
         """Know that the headers of a request are whole; with a body it has time for that, else it is answered."""
-        if peer in self._waiting:
-            del self._waiting[peer]
+        if peer in self._open:
+            # The next request of a line may come before the end of this one is told.
+            self._requests[peer] += 1
+            self._waiting.pop(peer, None)
             if body:
                 self._waiting[peer] = self._now() + BODY_SECONDS
 
@@ -102,8 +105,10 @@ class Connections:
     def answered(self, peer: Peer | None) -> None:
         """Know that it is answered; the line waits for another one."""
         if peer in self._open:
-            self._waiting.pop(peer, None)
-            self._waiting[peer] = self._now() + HEADER_SECONDS
+            self._requests[peer] -= 1
+            if self._requests[peer] <= 0:
+                self._waiting.pop(peer, None)
+                self._waiting[peer] = self._now() + HEADER_SECONDS
 
     def closed(self, connection: Connection) -> None:
         """Forget one that is closed."""
@@ -129,6 +134,7 @@ class Connections:
     def _forget(self, peer: Peer) -> Connection:
         connection = self._open.pop(peer)
         self._waiting.pop(peer, None)
+        self._requests.pop(peer, None)
         self._of_one[peer[0]] -= 1
         if not self._of_one[peer[0]]:
             del self._of_one[peer[0]]
