@@ -9,8 +9,8 @@ READY  := $(VENV)/.ready
 # Set, it has each of a thousand child processes of the tests compile the whole package anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test unit coverage lint types bench bench-design bench-canopen bench-serve bench-viewers campaign mutants \
-	test-socketcan test-foreign test-latest lock clean
+.PHONY: demo test unit coverage lint types bench bench-design bench-canopen bench-serve bench-stops bench-viewers campaign \
+	mutants test-socketcan test-foreign test-latest lock clean
 
 demo: $(READY)
 	@echo "commissioning a simulated arm: about a minute on an idle machine"
@@ -50,9 +50,12 @@ bench-design: $(READY)
 bench-canopen: $(READY)
 	$(BIN)/python -m benchmarks.canopen
 
-# The daemon's first page; and what ten viewers of the live page cost the loop.
+# The daemon's first page; stops while everything waits; and what ten viewers of the live page cost the loop.
 bench-serve: $(READY)
 	$(BIN)/python -m benchmarks.serve
+
+bench-stops: $(READY)
+	$(BIN)/python -m benchmarks.stops
 
 bench-viewers: $(READY)
 	$(BIN)/python -m benchmarks.viewers

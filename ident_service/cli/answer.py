@@ -95,6 +95,19 @@ def state_folder(arguments: argparse.Namespace) -> Path:
     return (Path(base) if base else Path.home() / ".local" / "state") / "ident"
 
 
+def own_state_folder(arguments: argparse.Namespace) -> Path:
+    """The same for a verb that writes there: what it writes is its owner's alone.
+
+    Raises:
+        UsageError: as `state_folder`; or others can enter it.
+    """
+    from ident_service.service.state_folder import keep_private
+
+    state = state_folder(arguments)
+    keep_private(state)
+    return state
+
+
 def hear_interrupts() -> None:
     """Hear Ctrl-C although the shell that started this process told it not to.
 

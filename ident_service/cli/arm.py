@@ -6,13 +6,24 @@ Boundary: words to requests, results to words; the work is `service/run.py`. `st
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import sys
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, interrupting, state_folder, tell
+from ident_service.cli.answer import (
+    DONE,
+    VERDICT_NO,
+    Answer,
+    StopOnSignal,
+    interrupting,
+    own_state_folder,
+    state_folder,
+    tell,
+)
+from ident_service.cli.keeping import add_by, note_act
 from ident_service.cli.lease import add_lease, asked_lease, until
 from ident_service.cli.moving import RELEASED, HeldKey, add_can_log, moved, require_terminal
 from ident_service.cli.words import Parser, Verbs, seconds, share, speed
@@ -60,17 +71,18 @@ def add(verbs: Verbs) -> None:
     sub.add_argument("--no-key", action="store_true", help="no key to hold; Ctrl-C and `ident stop` stop")
     sub.add_argument("--speed", type=speed, default=_REHEARSAL, metavar="SHARE", help="of the motion's own speed")
     for name, text in (
-        ("stop", "bring the arm to a controlled stop; needs no lease and always works"),
+        ("stop", "bring the arm, or every arm, to a controlled stop; needs no lease and always works"),
         ("pause", "let the arm stand"),
         ("resume", "let it go on"),
         ("finish", "leave out the rest of the motion: the arm goes back to where it stood, and the run is done"),
     ):
-        sub = verbs.add(name, _ask, text)
-        sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+        sub = verbs.add(name, _stop if name == "stop" else _ask, text)
+        sub.add_argument("arm", metavar="ARM", nargs="?" if name == "stop" else None, help=_HELP_ARM)
         sub.set_defaults(asks=name)
     sub = verbs.add("ack", _ack, "acknowledge a latched fault by its name")
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("fault", metavar="FAULT")
+    add_by(sub)
 
 
 def _motion(sub: Parser) -> None:
@@ -131,7 +143,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
     if arguments.home and arguments.motion is not None:
         raise UsageError("give a motion or --home, not both")
     motion = None if arguments.home else _chosen(config, arguments.motion)
-    state = state_folder(arguments)
+    state = own_state_folder(arguments)
     path, faults = ticket_path(state, config.name), fault_file(state, config.name)
     faults.require_none(faults.latched())
     require_writable(path.parent)
@@ -216,20 +228,35 @@ def _rehearse(arguments: argparse.Namespace) -> Answer:
         )
 
 
+def _stop(arguments: argparse.Namespace) -> Answer:
+    """Stop an arm, or all; what is told and entered of it comes after."""
+    from ident_service.motion.control_file import ControlFile
+    from ident_service.service.jobs.reach import stop_arms
+
+    if arguments.arm is None:
+        reached = stop_arms(state_folder(arguments), None)
+        note_act(arguments, "stop", "all arms", reached=reached)
+        text = f"stop asked of {', '.join(reached)}" if reached else "nobody moves an arm"
+        text += "; no motion will begin that was asked for before now\n"
+        return DONE, text, {"arms": reached, "asked": "stop"}
+    name, path = _control(arguments)
+    pid = ControlFile.stop_all(path)
+    note_act(arguments, "stop", name, reached=[] if pid is None else [name])
+    if pid is None:
+        raise UsageError(f"nobody moves {name}; no motion will begin that was asked for before now ({path})")
+    return DONE, f"{name}: stop asked of process {pid}\n", {"arm": name, "asked": "stop", "pid": pid}
+
+
 def _ask(arguments: argparse.Namespace) -> Answer:
     from ident_service.motion.control_file import ControlFile
 
     name, path = _control(arguments)
-    if arguments.asks == "stop":
-        pid = ControlFile.stop_all(path)
-        if pid is None:
-            raise UsageError(f"nobody moves {name}; no motion will begin that was asked for before now ({path})")
-    else:
-        with ControlFile.reach(path) as controls:
-            if arguments.asks == "finish":
-                controls.ask_finish()
-            controls.ask_pause(arguments.asks == "pause")
-            pid = controls.pid
+    with ControlFile.reach(path) as controls:
+        if arguments.asks == "finish":
+            controls.ask_finish()
+        controls.ask_pause(arguments.asks == "pause")
+        pid = controls.pid
+    note_act(arguments, arguments.asks, name, reached=[name])
     document: dict[str, Any] = {"arm": name, "asked": arguments.asks, "pid": pid}
     return DONE, f"{name}: {arguments.asks} asked of process {pid}\n", document
 
@@ -238,13 +265,15 @@ def _ack(arguments: argparse.Namespace) -> Answer:
     from ident_service.service.arm_state import fault_file
 
     name = _name(arguments)
-    cause = fault_file(state_folder(arguments), name).acknowledge(arguments.fault)
+    cause = fault_file(own_state_folder(arguments), name).acknowledge(arguments.fault)
+    note_act(arguments, "fault acknowledged", name, code=arguments.fault, cause=cause)
     return DONE, f"{name}: acknowledged {arguments.fault} ({cause})\n", {"arm": name, "acknowledged": arguments.fault}
 
 
 def _control(arguments: argparse.Namespace) -> tuple[str, Path]:
     from ident_service.service.arm_state import control_path
 
+    os.umask(0o077)  # and no more: a stop is not refused for a folder that others can enter
     name = _name(arguments)
     return name, control_path(state_folder(arguments), name)
 

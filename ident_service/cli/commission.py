@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
+from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, own_state_folder, tell
 from ident_service.cli.words import FEASIBLE_SETS, Verbs, delay, replicates, seed, weight
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
     config = described = load_arm(arguments.arm)
     if arguments.seed is not None and config.driver is not None:
         config = config.model_copy(update={"driver": config.driver.model_copy(update={"seed": arguments.seed})})
-    folder = arguments.out or new_run_folder(state_folder(arguments), config.name)
+    folder = arguments.out or new_run_folder(own_state_folder(arguments), config.name)
     stopping = StopOnSignal()
     with stopping:
         result = simulate(
@@ -113,7 +113,7 @@ def _identify(arguments: argparse.Namespace) -> Answer:
         essential=arguments.essential,
         sdpa=arguments.sdpa,
     )
-    folder = arguments.out or new_run_folder(state_folder(arguments), load_arm(arguments.arm).name)
+    folder = arguments.out or new_run_folder(own_state_folder(arguments), load_arm(arguments.arm).name)
     result = identify_files(request, folder, lambda line: tell(arguments, line))
     estimate = result.estimate
     sys.stderr.write("".join(f"ident: {line}\n" for line in result.warnings))

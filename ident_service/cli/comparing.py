@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ident_service.cli.answer import DONE, VERDICT_NO, Answer, state_folder
+from ident_service.cli.answer import DONE, VERDICT_NO, Answer, own_state_folder
 from ident_service.cli.words import Verbs
 from ident_service.errors import UsageError
 
@@ -53,7 +53,7 @@ def _payload(arguments: argparse.Namespace) -> Answer:
     from ident_service.service.commission import new_run_folder
     from ident_service.service.payload import payload_files
 
-    folder = arguments.out or new_run_folder(state_folder(arguments), arguments.run.resolve().name, "payloads")
+    folder = arguments.out or new_run_folder(own_state_folder(arguments), arguments.run.resolve().name, "payloads")
     found = payload_files(arguments.run, arguments.recordings, folder, refit_offsets=arguments.refit_offsets)
     text = found.text
     if found.comparison is not None:

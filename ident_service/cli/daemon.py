@@ -11,10 +11,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from ident_service.cli.answer import DONE, Answer, print_to_person, state_folder
+from ident_service.cli.answer import DONE, Answer, own_state_folder, print_to_person, state_folder
+from ident_service.cli.keeping import add_by, at_terminal
 from ident_service.cli.words import Verbs
 
-TERMINAL = "terminal"
 _PORT = 8470
 
 
@@ -37,9 +37,11 @@ def add(verbs: Verbs) -> None:
     sub = token.add("add", _add, "make a token and print it; nothing can print it again")
     sub.add_argument("name", metavar="NAME", help="which the audit trail will show")
     sub.add_argument("--role", choices=["viewer", "operator"], required=True)
+    add_by(sub)
     token.add("list", _list, "names and roles")
     sub = token.add("revoke", _revoke, "let a token, and the sessions that it began, count no more")
     sub.add_argument("name", metavar="NAME")
+    add_by(sub)
 
 
 def _serve(arguments: argparse.Namespace) -> Answer:
@@ -68,8 +70,8 @@ def _add(arguments: argparse.Namespace) -> Answer:
     from ident_service.service.registry.database import Database
     from ident_service.service.registry.tokens import add_token
 
-    with Database(state_folder(arguments)) as db:
-        secret = add_token(db, arguments.name, arguments.role, TERMINAL)
+    with Database(own_state_folder(arguments)) as db:
+        secret = add_token(db, arguments.name, arguments.role, at_terminal(arguments))
     return DONE, f"{secret}\n", {"name": arguments.name, "role": arguments.role, "token": secret}
 
 
@@ -77,7 +79,7 @@ def _list(arguments: argparse.Namespace) -> Answer:
     from ident_service.service.registry.database import Database
     from ident_service.service.registry.tokens import tokens
 
-    with Database(state_folder(arguments)) as db:
+    with Database(own_state_folder(arguments)) as db:
         rows = tokens(db)
     return (
         DONE,
@@ -96,8 +98,8 @@ def _revoke(arguments: argparse.Namespace) -> Answer:
     from ident_service.service.registry.database import Database
     from ident_service.service.registry.tokens import revoke_token
 
-    with Database(state_folder(arguments)) as db:
-        revoke_token(db, arguments.name, TERMINAL)
+    with Database(own_state_folder(arguments)) as db:
+        revoke_token(db, arguments.name, at_terminal(arguments))
     return DONE, f"{arguments.name}: revoked\n", {"name": arguments.name, "revoked": True}
 
 

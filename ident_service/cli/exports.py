@@ -9,7 +9,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from ident_service.cli.answer import DONE, Answer, state_folder
+from ident_service.cli.answer import DONE, Answer, own_state_folder
 from ident_service.cli.words import Verbs
 
 _FORMATS = "urdf,mjcf,sdf,json,csv,c"
@@ -28,7 +28,7 @@ def _export(arguments: argparse.Namespace) -> Answer:
     from ident_service.service.commission import new_run_folder
 
     formats = known_formats(arguments.format)
-    folder = arguments.out or new_run_folder(state_folder(arguments), arguments.run.resolve().name, "exports")
+    folder = arguments.out or new_run_folder(own_state_folder(arguments), arguments.run.resolve().name, "exports")
     made = export_run(arguments.run, formats, folder)
     lines, files = [f"files: {folder}"], []
     for export in made:

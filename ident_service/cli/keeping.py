@@ -13,11 +13,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from ident_service.cli.answer import DONE, Answer, state_folder
+from ident_service.cli.answer import DONE, Answer, own_state_folder, print_to_person, state_folder
 from ident_service.cli.words import Parser, Verbs, count
 from ident_service.errors import UsageError
 
 _LONGEST_NAME = 80
+_PATIENCE = 1.0  # s that an act, which is done, waits for its line in the audit trail
 
 
 def add_by(sub: Parser) -> None:
@@ -31,7 +32,7 @@ def at_terminal(arguments: argparse.Namespace) -> str:
     Raises:
         UsageError: no name.
     """
-    if arguments.by is not None:
+    if getattr(arguments, "by", None) is not None:
         name = arguments.by.strip()
     else:
         try:
@@ -41,6 +42,32 @@ def at_terminal(arguments: argparse.Namespace) -> str:
     if not name or len(name) > _LONGEST_NAME:
         raise UsageError(f"--by needs a name of 1 to {_LONGEST_NAME} characters")
     return f"terminal:{name}"
+
+
+def note_act(arguments: argparse.Namespace, what: str, about: str, **detail: Any) -> None:
+    """Enter what was done at a terminal in the audit trail, where the state folder has one.
+
+    It has been done already: a registry that is kept or full is told of, and changes nothing.
+
+    Args:
+        arguments: of the verb.
+        what: one word or two, as in the daemon's own lines.
+        about: name of the arm.
+        detail: JSON values.
+    """
+    import sqlite3
+
+    from ident_service.service.registry.audit import note
+    from ident_service.service.registry.database import FILE, Database
+
+    state = state_folder(arguments)
+    if not (state / FILE).is_file():
+        return
+    try:
+        with Database(state, busy=_PATIENCE) as db:
+            note(db, at_terminal(arguments), what, about, **detail)
+    except (UsageError, sqlite3.Error) as error:
+        print_to_person(f"ident: done, but not entered in the audit trail: {error}\n")
 
 
 def add(verbs: Verbs) -> None:
@@ -68,7 +95,7 @@ def _accept(arguments: argparse.Namespace) -> Answer:
     from ident_service.service.arm_state import arm_folder
     from ident_service.service.registry.database import Database
 
-    state = state_folder(arguments)
+    state = own_state_folder(arguments)
     with Database(state) as db:
         act = accept(db, state, arguments.run.resolve(), arguments.note, at_terminal(arguments))
     path = arm_folder(state, act.arm) / CURRENT / PARAMETERS
@@ -80,7 +107,7 @@ def _rollback(arguments: argparse.Namespace) -> Answer:
     from ident_service.service.arm_state import arm_folder
     from ident_service.service.registry.database import Database
 
-    state = state_folder(arguments)
+    state = own_state_folder(arguments)
     with Database(state) as db:
         act = rollback(db, state, arguments.arm, arguments.note, at_terminal(arguments), arguments.to)
     path = arm_folder(state, act.arm) / CURRENT / PARAMETERS
@@ -93,7 +120,7 @@ def _import(arguments: argparse.Namespace) -> Answer:
     from ident_service.service.registry.database import Database
     from ident_service.service.registry.runs import RUNS
 
-    state = state_folder(arguments)
+    state = own_state_folder(arguments)
     with Database(state) as db:
         row = import_run(db, state, arguments.run, at_terminal(arguments))
     folder = state / RUNS / row["id"]
@@ -112,7 +139,7 @@ def _prune(arguments: argparse.Namespace) -> Answer:
     from ident_service.service.registry.runs import rebuild_runs
     from ident_service.service.retention import expendable, let_go
 
-    state = state_folder(arguments)
+    state = own_state_folder(arguments)
     with Database(state) as db:
         untold = rebuild_runs(db, state)
         gone = (

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
+from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, own_state_folder, tell
 from ident_service.cli.words import Parser, Verbs, count, frequency, seconds, seed, share, weight, workers
 from ident_service.errors import UsageError
 
@@ -101,7 +101,7 @@ def _design(arguments: argparse.Namespace) -> Answer:
         budget=Budget(limit, arguments.starts, arguments.workers),
         resume=arguments.resume,
     )
-    folder = arguments.out or new_run_folder(state_folder(arguments), load_arm(arguments.arm).name, "motions")
+    folder = arguments.out or new_run_folder(own_state_folder(arguments), load_arm(arguments.arm).name, "motions")
     stopping = StopOnSignal()
     with stopping:
         designed, seen = design_files(request, folder, _progress(arguments), stopping.requested)

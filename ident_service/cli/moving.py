@@ -16,7 +16,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.answer import DONE, FAILED, Answer, state_folder, tell
+from ident_service.cli.answer import DONE, FAILED, Answer, own_state_folder, tell
 from ident_service.cli.words import Parser
 from ident_service.errors import IdentError, MotionRefused, UsageError
 
@@ -141,7 +141,7 @@ def moved(
     from ident_service.service.commission import new_run_folder
     from ident_service.service.run import run_motion
 
-    state = state_folder(arguments)
+    state = own_state_folder(arguments)
     path = ticket_path(state, config.name)
     if not path.exists():
         raise MotionRefused(f"{config.name}: not checked yet; `ident check` comes before every motion")

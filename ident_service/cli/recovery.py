@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
+from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, own_state_folder, tell
 from ident_service.cli.lease import add_lease, asked_lease, until
 from ident_service.cli.moving import add_can_log, moved
 from ident_service.cli.words import Verbs
@@ -78,7 +78,7 @@ def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
             return str(arguments.confirm)
         return input(f"{question} ") if sys.stdin.isatty() and not arguments.json else ""
 
-    done = take_home(config, state_folder(arguments), confirm)
+    done = take_home(config, own_state_folder(arguments), confirm)
     lines = [f"{done.arm}: zeroed, until its drives lose their power", *(f"  {words}" for words in done.drives)]
     lines += [f"  latched still: {fault.code}: {fault.cause}" for fault in done.faults]
     if isinstance(config.driver, CanopenDriver) and all(bus.interface == "lock_step" for bus in config.driver.buses):
@@ -106,7 +106,7 @@ def _recover(arguments: argparse.Namespace) -> Answer:
         raise UsageError("--lease-from-stdin is for --leave-limit; without it nothing moves")
     if arguments.can_log:
         raise UsageError("--can-log is for --leave-limit; without it nothing moves")
-    found = recover(config, state_folder(arguments), called=arguments.arm)
+    found = recover(config, own_state_folder(arguments), called=arguments.arm)
     document = {
         "arm": found.arm,
         "usable": found.usable,

@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from ident_service.cli.answer import DONE, VERDICT_NO, Answer, state_folder, tell
+from ident_service.cli.answer import DONE, VERDICT_NO, Answer, own_state_folder, state_folder, tell
 from ident_service.cli.keeping import add_by, at_terminal
 from ident_service.cli.schedule import registry
 from ident_service.cli.words import Verbs
@@ -35,7 +35,7 @@ def _reidentify(arguments: argparse.Namespace) -> Answer:
     from ident_service.service.registry.motions import new_id
     from ident_service.service.registry.runs import RUNS, index_run
 
-    state, config, begun = state_folder(arguments), load_arm(arguments.arm), time.time()
+    state, config, begun = own_state_folder(arguments), load_arm(arguments.arm), time.time()
     who = at_terminal(arguments)
     with registry(arguments) as db:
         number = require_comparable(state, config)

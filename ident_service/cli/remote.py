@@ -179,6 +179,14 @@ def _home(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
     return {"kind": "zero", "arm": arguments.arm}
 
 
+def _stop(client: Client, arguments: argparse.Namespace) -> Answer:
+    if arguments.arm is not None:
+        return _ask(client, arguments)
+    answer = client.post("/api/v1/stop")
+    names = ", ".join([*answer["arms"], *answer["jobs"]])
+    return DONE, f"stop asked of {names}\n" if names else "nobody moves an arm there\n", answer
+
+
 def _ask(client: Client, arguments: argparse.Namespace) -> Answer:
     answer = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/{arguments.word}")
     reached = bool(answer.get("reached", answer.get("arms")) or answer.get("jobs"))
@@ -220,7 +228,8 @@ REMOTE: dict[str, Verb] = {
     "check": asked(_check),
     "run": asked(_run),
     "home": asked(_home),
-    **dict.fromkeys(("stop", "pause", "resume", "finish"), _ask),
+    "stop": _stop,
+    **dict.fromkeys(("pause", "resume", "finish"), _ask),
     "ack": _ack,
     "jobs list": _list,
     "jobs show": _show,

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.answer import DONE, VERDICT_NO, Answer, state_folder
+from ident_service.cli.answer import DONE, VERDICT_NO, Answer, own_state_folder, state_folder
 from ident_service.cli.keeping import add_by, at_terminal
 from ident_service.cli.words import Parser, Verbs, count
 
@@ -61,7 +61,7 @@ def registry(arguments: argparse.Namespace) -> Database:
     from ident_service.service.registry.arms import know_shipped
     from ident_service.service.registry.database import Database
 
-    db = Database(state_folder(arguments))
+    db = Database(own_state_folder(arguments))
     know_shipped(db)
     return db
 

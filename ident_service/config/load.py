@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from ident_service.config import canopen, design, recording, simulation, workspace
 from ident_service.config.canopen import CanopenDriver
-from ident_service.config.quantities import MAX_FILE_BYTES, Section
+from ident_service.config.quantities import MAX_FILE_BYTES, UPLOAD, Section
 from ident_service.config.recording import RecordingFormat
 from ident_service.config.schema import ArmConfig, DHTable, FourierMotion
 from ident_service.config.shipped import shipped_arms as shipped_arms
@@ -36,19 +36,20 @@ def find_arm(arm: str) -> Path:
     raise UsageError(f"no arm description {arm!r}: not a file, and not one of {', '.join(shipped)}")
 
 
-def load_arm(arm: str | Path) -> ArmConfig:
+def load_arm(arm: str | Path, *, upload: bool = False) -> ArmConfig:
     """Read and check an arm description.
 
     Args:
         arm: a YAML file, or the name of a shipped description.
+        upload: whether somebody has sent it: then it names files of its own folder only, and shipped descriptions.
 
     Raises:
         UsageError: no such file and no such name.
         ConfigError: every mistake in it, each with file, line and column.
     """
     path = find_arm(str(arm))
-    tree = read_tree(path)
-    config = _validated(ArmConfig, tree, path)
+    tree = read_tree(path, upload=upload)
+    config = _validated(ArmConfig, tree, path, {UPLOAD: path.resolve().parent} if upload else None)
     problems = [tree.problem(where, message, path) for where, message in _disagreements(config)]
     if problems:
         raise ConfigError(problems)
@@ -98,9 +99,9 @@ def mistake(arm: str | Path, where: KeyPath, message: str) -> ConfigError:
     return ConfigError([read_tree(path).problem(where, f"{'.'.join(map(str, where))}: {message}", path)])
 
 
-def _validated(kind: type[_Described], tree: Tree, path: Path) -> _Described:
+def _validated(kind: type[_Described], tree: Tree, path: Path, context: dict[str, Any] | None = None) -> _Described:
     try:
-        return kind.model_validate(tree.value)
+        return kind.model_validate(tree.value, context=context)
     except ValidationError as error:
         raise ConfigError(list(_problems(error, tree, path))) from None
 

@@ -11,9 +11,10 @@ import re
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, model_validator
 
 MAX_FILE_BYTES = 16 * 2**20
+UPLOAD = "upload"  # key of a validation's context
 _PI = re.compile(r"^\s*([+-]?)\s*(\d+(?:\.\d*)?)?\s*\*?\s*pi\s*(?:/\s*(\d+(?:\.\d*)?))?\s*$")
 _DEGREES = re.compile(r"^\s*([+-]?\d+(?:\.\d*)?)\s*deg\s*$")
 
@@ -74,13 +75,25 @@ class TextFile(Section):
     text: str
 
 
-def read_beside(value: Any) -> Any:
-    """Read the file a `LocatedStr` names, relative to the YAML file it stands in; bounded in size."""
+def read_beside(value: Any, info: ValidationInfo) -> Any:
+    """Read the file a `LocatedStr` names, relative to the YAML file it stands in; bounded in size.
+
+    Where the validation's context names that folder as `upload`, only files in it are read, and none is looked for
+    elsewhere: who sends a description learns nothing about other files.
+    """
     if not isinstance(value, str):
         return value
     folder = value.folder if isinstance(value, LocatedStr) else Path.cwd()
+    if info.context is not None and info.context.get(UPLOAD) == folder and Path(value).name != value:
+        raise ValueError(
+            f"{str(value)[:100]!r} leads out of the upload; send the file with the description, and name it"
+        )
     path = folder / value
-    if not path.is_file():
+    try:
+        there = path.is_file()
+    except OSError:  # what is too long for a name, say
+        there = False
+    if not there:
         raise ValueError(f"no such file: {path}")
     if path.stat().st_size > MAX_FILE_BYTES:
         raise ValueError(f"{path} is larger than {MAX_FILE_BYTES} bytes")
@@ -101,9 +114,9 @@ class ParameterTable(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _from_file_or_mapping(cls, value: Any) -> Any:
+    def _from_file_or_mapping(cls, value: Any, info: ValidationInfo) -> Any:
         if isinstance(value, str):
-            value = read_beside(value)
+            value = read_beside(value, info)
             try:
                 content = json.loads(value["text"])
                 return {"names": tuple(content["names"]), "values": tuple(float(v) for v in content["values"])}

@@ -40,10 +40,14 @@ class Tree:
         return Problem(fallback, 1, 1, message)
 
 
-def read_tree(path: Path, _chain: tuple[Path, ...] = ()) -> Tree:
+def read_tree(path: Path, _chain: tuple[Path, ...] = (), *, upload: bool = False) -> Tree:
     """Read a YAML file and, underneath it, the file that its `extends` names, or the shipped description of that name.
 
     Mappings merge key by key, everything else is replaced.
+
+    Args:
+        path: of the file.
+        upload: whether it was sent by somebody and so extends shipped descriptions only.
 
     Raises:
         ConfigError: unreadable file, bad YAML, something refused, or files that extend each other in a circle.
@@ -59,6 +63,8 @@ def read_tree(path: Path, _chain: tuple[Path, ...] = ()) -> Tree:
         return tree
     if not isinstance(parent, str):
         raise ConfigError([tree.problem(("extends",), "extends takes one file name", path)])
+    if upload and parent not in shipped_arms():
+        raise ConfigError([tree.problem(("extends",), "extends: an uploaded description extends a shipped arm", path)])
     base_path = path.parent / parent
     if not base_path.is_file():
         base_path = shipped_arms().get(parent, base_path)

@@ -209,6 +209,19 @@ def mover(path: Path) -> int | None:
         return None
 
 
+def stop_asked_ns(path: Path) -> int:
+    """Read when a stop of the arm was asked for last [ns of the machine's monotonic clock]; 0 where none is known."""
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except OSError:
+        return 0
+    try:
+        stamp = os.pread(fd, 8, _STOPPED)
+    finally:
+        os.close(fd)
+    return int(struct.unpack("<q", stamp)[0]) if len(stamp) == 8 else 0
+
+
 def in_use(path: Path) -> bool:
     """Whether a process moves the arm whose control file this is."""
     try:

@@ -48,7 +48,7 @@ class Acceptance:
         parameters_sha256: of its `parameters.json`.
         note: why, in the person's words.
         at: when [s since 1970 in UTC].
-        who: the name of the token, or `terminal`.
+        who: the name of the token, or `terminal:NAME`.
     """
 
     arm: str

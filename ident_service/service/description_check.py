@@ -38,17 +38,18 @@ class CheckedDescription:
         return self.gains is None or self.gains.stable
 
 
-def check_description(arm: str | Path) -> CheckedDescription:
+def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescription:
     """Judge a description.
 
     Args:
         arm: its file, or its name if it is shipped.
+        upload: whether somebody has sent it (`load_arm`).
 
     Raises:
         ConfigError: every mistake in it, each with line and column; a bus budget that does not fit is one.
         ModelError: its mechanism cannot be computed with.
     """
-    model = arm_model(load_arm(arm))
+    model = arm_model(load_arm(arm, upload=upload))
     budget = require_budget(arm, model.config)
     try:
         limits = motion_limits(model.config)

@@ -234,7 +234,7 @@ def test_one_motion_at_a_time_and_a_lease_while_it_waits(state: Path) -> None:
         # Whoever waits and falls silent does not move an arm later.
         blocker = daemon.begin({"kind": "check", "arm": ARM}, confirmed=True)
         silent = daemon.begin({"kind": "home", "arm": ARM}, confirmed=True)
-        daemon.service.engine._factor = 0.1
+        daemon.service.engine.live.lease_factor = 0.1
         ended = daemon.follow(silent["id"])
         assert (ended["state"], ended["started"]) == ("cancelled", None)
         assert "nothing has moved" in ended["detail"]
@@ -250,7 +250,7 @@ def test_the_services_own_lease_carries_a_run_that_nobody_watches(daemon: Asked,
 
 def test_events_tell_a_job_to_its_end(daemon: Asked, arm: str) -> None:
     job = daemon.begin({"kind": "check", "arm": ARM}, confirmed=True)
-    daemon.service.engine.renew(job["id"])
+    daemon.service.engine.live.renew(job["id"])
     answer = daemon.get(f"/api/v1/jobs/{job['id']}/events")  # lasts as long as the job
     assert answer.headers["content-type"].startswith("text/event-stream")
     told = [json.loads(line[6:])["state"] for line in answer.text.splitlines() if line.startswith("data: ")]

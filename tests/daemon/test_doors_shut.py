@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import re
+import time
 from pathlib import Path
 
 import httpx
@@ -13,7 +15,7 @@ from ident_service.config.load import shipped_arms
 from ident_service.errors import UsageError
 from ident_service.motion.control_file import ControlFile
 from ident_service.service.api.doors import MOST_BODY, MOST_UPLOAD
-from ident_service.service.api.gate import CHALLENGE_SECONDS, Gate, Throttle, Throttled
+from ident_service.service.api.gate import CHALLENGE_SECONDS, SESSION_SECONDS, Gate, Throttle, Throttled
 from ident_service.service.api.settings import Settings
 from ident_service.service.arm_state import control_path
 from ident_service.service.registry.audit import trail
@@ -163,17 +165,33 @@ def test_failed_logins_are_throttled_and_stop_is_not(daemon: Asked) -> None:
     assert daemon.post("/api/v1/login", {"token": other}, address="198.51.100.7").status_code == 200
 
 
-def test_the_throttle_counts_addresses_and_all_of_them() -> None:
+def test_the_throttle_counts_each_address_and_each_token() -> None:
     now = [0.0]
     throttle = Throttle(lambda: now[0])
-    for k in range(100):
-        throttle.require(f"10.0.0.{k}")
-        throttle.failed(f"10.0.0.{k}")
-    with pytest.raises(Throttled) as caught:
-        throttle.require("10.0.1.1")
-    assert caught.value.seconds == 60.0
+    for k in range(10):
+        throttle.require("10.0.0.1", f"token {k}")
+        throttle.failed("10.0.0.1", f"token {k}")
+        now[0] += 1.0
+        throttle.require(f"10.0.1.{k}", "revoked")
+        throttle.failed(f"10.0.1.{k}", "revoked")
+    for keys in (("10.0.0.1", "good"), ("10.0.0.2", "revoked")):
+        with pytest.raises(Throttled) as caught:
+            throttle.require(*keys)
+        assert 50.0 <= caught.value.seconds <= 60.0
+    throttle.require("10.0.0.2", "good")
     now[0] = 60.1
-    throttle.require("10.0.1.1")
+    throttle.require("10.0.0.1", "good")
+
+
+def test_failures_elsewhere_lock_out_nobody(daemon: Asked) -> None:
+    good = add_token(daemon.service.db, "late", "operator", "test")
+    daemon.headers.clear()
+    codes = [
+        daemon.post("/api/v1/login", {"token": f"wrong{k}"}, address=f"198.51.100.{k % 11}").status_code
+        for k in range(110)
+    ]
+    assert codes == [401] * 110
+    assert daemon.post("/api/v1/login", {"token": good}, address="203.0.113.1").status_code == 200
 
 
 @pytest.mark.parametrize(
@@ -239,6 +257,38 @@ def test_an_upload_leads_nowhere(daemon: Asked, state: Path, reach: str, door: s
     assert not any(row["name"] == "spy" for row in daemon.get("/api/v1/arms").json())
 
 
+@pytest.mark.parametrize("door", ["arms", "descriptions/check"])
+def test_an_upload_learns_nothing_of_other_files(daemon: Asked, state: Path, door: str) -> None:
+    def answer(key: str, value: str) -> str:
+        text = f"format: ident-arm\nversion: 1\nname: spy\n{key.format(json.dumps(value))}\n"
+        told = daemon.post(f"/api/v1/{door}", {"description": text, "files": {"own.urdf": "<robot name='x'/>"}})
+        assert str(state) not in told.text
+        return f"{told.status_code} {told.text.replace(value, 'FILE')}"
+
+    (state / "descriptions").mkdir(exist_ok=True)
+    for key in (
+        "kinematics: {{urdf: {}}}",
+        "kinematics: {{urdf: own.urdf}}\nprior: {}",
+        "description: {}",
+        "gravity: {}",
+    ):
+        # A text is a text, and a file that is there is told from one that is not by nobody.
+        for there, not_there in (("/etc/shadow", "/etc/shadov"), ("../../token", "../../tokem"), ("..", "...")):
+            assert answer(key, there) == answer(key, not_there), key
+        if "description" in key:
+            assert "FILE" not in answer(key, "/etc/shadow")
+    assert "no such file: FILE" in answer("kinematics: {{urdf: {}}}", "x" * 300)
+
+
+def test_a_file_of_an_upload_is_not_taken_for_a_shipped_arm(daemon: Asked, state: Path) -> None:
+    secret = state.parent / "secret.urdf"
+    secret.write_text("<robot name='secret'/>")
+    files = {"planar2": f"extends: {secret}\n"}
+    refusal(
+        daemon.post("/api/v1/arms", {"description": "extends: planar2\nname: spy\n", "files": files}), 400, "shipped"
+    )
+
+
 @pytest.mark.parametrize("name", ["../x", "arm.yaml", "a/b", "", ".x", "a" * 200])
 def test_an_uploaded_file_has_a_plain_name(daemon: Asked, name: str) -> None:
     text = shipped_arms()["planar2"].read_text()
@@ -287,6 +337,31 @@ def test_a_challenge_does_not_count_for_long(tmp_path: Path) -> None:
         assert not gate.confirm(word, "a", "me")
 
 
+def test_a_session_survives_a_restart_and_ends_in_time(state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with serving(state) as daemon:
+        secret = daemon.headers.pop("Authorization").removeprefix("Bearer ")
+        word = daemon.post("/api/v1/login", {"token": secret}).cookies["ident_session"]
+        gone = daemon.post("/api/v1/login", {"token": secret}).cookies["ident_session"]
+        daemon.post("/api/v1/logout", headers={"Cookie": f"ident_session={gone}", "Origin": URL})
+    assert word not in "".join(path.read_text("latin-1") for path in state.glob("registry.sqlite*"))
+    with serving(state) as daemon:
+        daemon.headers.clear()
+        header = {"Cookie": f"ident_session={word}"}
+        assert daemon.get("/api/v1/whoami", headers=header).json()["name"] == "owner"
+        refusal(daemon.get("/api/v1/whoami", headers={"Cookie": f"ident_session={gone}"}), 401)
+        revoke_token(daemon.service.db, "owner", "test")
+        refusal(daemon.get("/api/v1/whoami", headers=header), 401)
+    with Database(state) as db:
+        other = add_token(db, "late", "viewer", "test")
+        gate = Gate(db)
+        session = gate.log_in(other, "here")
+        assert session is not None
+        now = time.time()
+        monkeypatch.setattr(time, "time", lambda: now + SESSION_SECONDS + 1.0)
+        assert gate.by_session(session[0]) is None
+        assert gate.known(None, session[0]) is None
+
+
 def test_stop_needs_no_token_here_and_any_token_from_elsewhere(daemon: Asked, viewer: str, state: Path) -> None:
     with ControlFile.take(control_path(state, "planar2"), None) as mover:
         daemon.headers.clear()
@@ -300,6 +375,7 @@ def test_stop_needs_no_token_here_and_any_token_from_elsewhere(daemon: Asked, vi
         # A token that counts no more keeps nobody from a stop on the arm's own machine.
         assert daemon.post("/api/v1/stop", headers={"Authorization": "Bearer wrong"}).json()["arms"] == ["planar2"]
         assert mover.stop
+    assert daemon.service.engine.audit.flush(10.0)
     assert {line["who"] for line in trail(daemon.service.db) if line["what"] == "stop"} == {"looks", "anybody"}
 
 

@@ -60,7 +60,7 @@ class Scene:
         if answer is not None:
             (self.state / JOBS / job / "answer.json").write_text(json.dumps(answer))
         jobs.ended(self.db, job, state, detail)
-        self.engine._live.pop(job)
+        self.engine.live._jobs.pop(job)
         self.keeper.look()
 
     @property
@@ -72,7 +72,7 @@ class Scene:
     def queued(self) -> list[tuple[str, bool]]:
         """Kind, and whether its lease is the service's own."""
         rows = {row["id"]: row["kind"] for row in jobs.queue(self.db)}
-        return [(rows[live.job], live.own_lease) for live in self.engine._live.values() if live.job in rows]
+        return [(rows[live.job], live.own_lease) for live in self.engine.live.entered() if live.job in rows]
 
     @property
     def why(self) -> list[str]:
@@ -177,7 +177,7 @@ def test_a_stop_between_the_steps_is_a_stop(scene: Scene) -> None:
     scene.keeper.reidentifications.begin(Wanted(ARM), "ann")
     job = scene.only["job"]
     jobs.ended(scene.db, job, "done", "")
-    scene.engine._live.pop(job)
+    scene.engine.live._jobs.pop(job)
     assert scene.engine.stop(ARM, "bob") == {"arms": [], "jobs": []}  # nothing moves at this moment
     scene.keeper.look()
     assert (scene.only["state"], scene.queued) == ("cancelled", [])

@@ -111,7 +111,7 @@ def test_an_allowed_arm_does_it_by_itself_and_stops_when_it_is_told_to(daemon: A
 
 @pytest.mark.timeout(300)
 def test_a_lease_that_nobody_renews_ends_it(daemon: Asked) -> None:
-    daemon.service.engine._factor = 0.1  # of two seconds
+    daemon.service.engine.live.lease_factor = 0.1  # of two seconds
     body = {"arm": ARM, "confirm": {"name": ARM, "challenge": daemon.challenge(ARM)}}
     name = daemon.post("/api/v1/reidentifications", body).json()["id"]
     ended = followed(daemon, name, lease=False)

@@ -20,6 +20,7 @@ from ident_service.motion.control_file import in_use
 from ident_service.service.arm_state import control_path
 from ident_service.service.registry import jobs as rows
 from ident_service.service.registry.arms import add_arm
+from ident_service.service.registry.audit import trail
 from ident_service.service.registry.tokens import add_token
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
@@ -177,7 +178,7 @@ def test_a_stop_in_the_middle(browser: Browser, reached: Reached, state: Path, h
             dead.keyboard.press(key)
         dead.get_by_role("heading", name="Stop asked").wait_for()
     else:
-        reached.service.engine._factor = 1.0
+        reached.service.engine.live.lease_factor = 1.0
         page.goto(f"{reached.url}/audit")
     job = rows.jobs(reached.service.db, arm=ARM, most=1)[0]["id"]
     until = time.monotonic() + 60.0
@@ -235,6 +236,19 @@ def test_a_rehearsal_with_another_name_moves_nothing(browser: Browser, reached: 
     page.locator("#hold").press(" ")
     expect(page.locator("#detail")).to_contain_text("Nothing has moved")
     assert not rows.jobs(reached.service.db, arm=ARM)
+
+
+def test_escape_pressed_ten_times_is_one_stop(browser: Browser, reached: Reached) -> None:
+    page = log_in(browser, reached)
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url) if request.method == "POST" else None)
+    presses = "for (let k = 0; k < 10; k++) document.dispatchEvent(new KeyboardEvent('keydown', {key: 'Escape'}))"
+    for times in (1, 2):
+        page.evaluate(presses)
+        expect(page.locator("#stop-status")).to_have_text("Nothing was moving.")
+        assert asked == [f"{reached.url}/api/v1/stop"] * times
+    assert reached.service.engine.audit.flush(10.0)
+    assert [line["what"] for line in trail(reached.service.db)].count("stop") == 2
 
 
 @pytest.mark.parametrize("width", [1280, 400])

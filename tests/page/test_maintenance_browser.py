@@ -162,7 +162,7 @@ def test_leaving_its_page_stops_the_arm_and_ends_it(browser: Browser, reached: R
     page.locator("#step-run.busy").wait_for()
     page.get_by_role("heading", name="The arm now").wait_for()
     page.goto(f"{reached.url}/audit")
-    reached.service.engine._factor = 0.1  # of two seconds
+    reached.service.engine.live.lease_factor = 0.1  # of two seconds
     db = reached.service.db
     until = 600
     while (row := reidentifications(db)[0])["state"] == "running" and (until := until - 1):

@@ -21,6 +21,7 @@ from ident_service.service.maintenance.schedules import dues
 from ident_service.service.registry.audit import trail
 
 router = APIRouter(tags=["service"], responses=failures())
+AUDIT_SECONDS = 1.0  # that a reader of the trail waits for lines that are to be entered
 
 
 class Login(BaseModel):
@@ -100,4 +101,5 @@ def audit(
     most: Annotated[int, Query(ge=1, le=500)] = 100,
 ) -> list[AuditLine]:
     """Who did what, the newest first; `before` the id of a line goes on from there."""
+    service.engine.audit.flush(AUDIT_SECONDS)
     return [AuditLine(**row) for row in trail(service.db, before=before, most=most)]

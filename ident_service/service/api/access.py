@@ -38,4 +38,5 @@ def list_tokens(service: Serving, _: Operator) -> list[TokenLine]:
 def revoke(service: Serving, who: Operator, token: TokenName) -> TokenLine:
     """Let a token, and the sessions that it began, count no more."""
     revoke_token(service.db, token, who.name)
+    service.gate.refresh()
     return next(TokenLine(**row) for row in tokens(service.db) if row["name"] == token)

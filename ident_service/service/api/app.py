@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
+import logging
+import sqlite3
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -13,6 +16,7 @@ from ident_service import __version__
 from ident_service.service.acceptance import settle
 from ident_service.service.api import about, access, arms, descriptions, exports, jobs, maintenance, pruning, runs
 from ident_service.service.api.asking import Service
+from ident_service.service.api.connections import Connections
 from ident_service.service.api.doors import Doors
 from ident_service.service.api.gate import Gate
 from ident_service.service.api.metrics import Metrics
@@ -28,6 +32,8 @@ from ident_service.service.registry.database import Database
 from ident_service.service.registry.runs import rebuild_runs
 from ident_service.service.registry.tokens import first_token
 
+_REFRESH = 1.0  # s between looks for tokens that were made or revoked at a terminal
+_LOG = logging.getLogger("ident.serve")
 ROUTERS = (
     *(about.router, access.router, arms.router, descriptions.router, jobs.router, runs.router, pruning.router),
     *(exports.router, maintenance.router, *PAGES),
@@ -35,11 +41,12 @@ ROUTERS = (
 """In this order."""
 
 
-def create_app(settings: Settings) -> FastAPI:
+def create_app(settings: Settings, connections: Connections | None = None) -> FastAPI:
     """The service as an ASGI application; its database is opened now, its queue runs while its lifespan does.
 
     Args:
         settings: how it runs.
+        connections: of the listener that it is served by; None where something else counts them.
 
     Raises:
         UsageError: the state folder cannot be used.
@@ -61,9 +68,11 @@ def create_app(settings: Settings) -> FastAPI:
         settle(db, settings.state)
         engine.start(lambda: rebuild_runs(db, settings.state))
         keeper.start()
+        refreshing = asyncio.create_task(_refresh(service.gate))
         try:
             yield
         finally:
+            refreshing.cancel()
             await run_in_threadpool(engine.close)
             app.state.live.close()
             await run_in_threadpool(keeper.close)
@@ -85,8 +94,18 @@ def create_app(settings: Settings) -> FastAPI:
     for router in ROUTERS:
         app.include_router(router)
     answer_mistakes(app)
-    app.add_middleware(Doors, settings=settings, metrics=service.metrics)
+    book = Connections() if connections is None else connections
+    app.add_middleware(Doors, settings=settings, metrics=service.metrics, connections=book)
     return app
+
+
+async def _refresh(gate: Gate) -> None:
+    while True:
+        await asyncio.sleep(_REFRESH)
+        try:
+            await run_in_threadpool(gate.refresh)
+        except sqlite3.Error as error:
+            _LOG.error("tokens cannot be read: %s", error)
 
 
 def _webhook(settings: Settings, db: Database) -> Webhook | None:

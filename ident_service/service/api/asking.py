@@ -7,7 +7,6 @@ changes anything with one must say which page it came from, too (`doors.py` has 
 from __future__ import annotations
 
 import ipaddress
-import logging
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +25,6 @@ from ident_service.service.registry.database import Database
 from ident_service.service.registry.tokens import Access
 
 COOKIE: Final = "ident_session"
-_LOG = logging.getLogger("ident.http")
 _SAFE = frozenset({"GET", "HEAD"})
 
 
@@ -52,6 +50,11 @@ def service_of(request: Request) -> Service:
     service = request.app.state.service
     assert isinstance(service, Service)  # noqa: S101 - `create_app` put it there
     return service
+
+
+async def serving(request: Request) -> Service:
+    """Find the service for a route; were this no coroutine, a stop would wait for a thread that others share."""
+    return service_of(request)
 
 
 _bearer = HTTPBearer(auto_error=False, description="a token, as `ident token add` prints it")
@@ -82,11 +85,16 @@ async def access_of(request: Request, bearer: Bearer = None, cookie: Cookie = No
             raise unknown()
     elif cookie is not None:
         found = await run_in_threadpool(service.gate.by_session, cookie)
-        if found is not None and request.method not in _SAFE and "origin" not in request.headers:
-            raise HTTPException(403, "a request with a session says which page it comes from")
+        if found is not None:
+            _require_page(request)
     if found is not None:
         request.state.who = found.name
     return found
+
+
+def _require_page(request: Request) -> None:
+    if request.method not in _SAFE and "origin" not in request.headers:
+        raise HTTPException(403, "a request with a session says which page it comes from")
 
 
 async def viewer(found: Annotated[Access | None, Depends(access_of)]) -> Access:
@@ -103,28 +111,39 @@ async def operator(found: Annotated[Access, Depends(viewer)]) -> Access:
     return found
 
 
-def anybody_near(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> str:
+async def anybody_near(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> str:
     """Whose stop this is: any token or session, and on this machine anybody at all.
 
     A stop does no harm, and whoever needs it may have no token at hand, or one that is out of date, or be throttled.
     From another machine it takes a token of any role, so that strangers on a network cannot keep an arm from working.
+    Memory is asked. The registry is where a stranger's token may be one that was made a moment ago.
     """
     service = service_of(request)
     near = _loopback(address_of(request)) and service.settings.loopback
-    found: Access | None = None
-    try:
-        if bearer is not None:
-            found = service.gate.for_stop(bearer.credentials)
-        elif cookie is not None:
-            found = service.gate.by_session(cookie)
-    except Exception:
-        if not near:
-            raise
-        _LOG.exception("nobody could be asked whose stop this is")
+    secret = None if bearer is None else bearer.credentials
+    found = service.gate.known(secret, cookie)
     if found is None and not near:
-        raise unknown()
+        await run_in_threadpool(service.gate.refresh)
+        if (found := service.gate.known(secret, cookie)) is None:
+            raise unknown()
     request.state.who = "anybody" if found is None else found.name
     return str(request.state.who)
+
+
+async def lease_keeper(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> Access:
+    """Find who renews a lease, as `operator` but by memory: a lease does not last as long as a registry may wait.
+
+    Raises:
+        HTTPException: as `operator`.
+    """
+    secret = None if bearer is None else bearer.credentials
+    found = service_of(request).gate.known(secret, cookie)
+    if found is None:
+        return await operator(await viewer(await access_of(request, bearer, cookie)))
+    if secret is None:
+        _require_page(request)
+    request.state.who = found.name
+    return await operator(found)
 
 
 def unknown() -> HTTPException:
@@ -146,7 +165,9 @@ def _loopback(address: str) -> bool:
         return False
 
 
-Serving = Annotated[Service, Depends(service_of)]
+Serving = Annotated[Service, Depends(serving)]
+Near = Annotated[str, Depends(anybody_near)]
+LeaseKeeper = Annotated[Access, Depends(lease_keeper)]
 Viewer = Annotated[Access, Depends(viewer)]
 Operator = Annotated[Access, Depends(operator)]
 """What routes ask for."""

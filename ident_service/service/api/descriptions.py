@@ -48,7 +48,7 @@ def check(service: Serving, _: Operator, body: Description) -> DescriptionAnswer
     from ident_service.service.description_check import check_description, description_text
 
     with uploaded(service.state, body.description, body.files) as path:
-        checked = check_description(path)
+        checked = check_description(path, upload=True)
     config, gains = checked.model.config, checked.gains
     return DescriptionAnswer(
         arm=config.name,

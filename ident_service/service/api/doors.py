@@ -1,4 +1,6 @@
-"""What every request meets before anything looks at it: its Host, its Origin, its size; and what every answer carries.
+"""What every request meets before anything looks at it: its Host, its Origin, its size, and how many there are.
+
+Every answer gets its security headers here.
 
 Pure ASGI, so that bodies are counted as they come and streams are not held back.
 """
@@ -10,11 +12,13 @@ import logging
 import time
 from collections.abc import Awaitable, Callable, MutableMapping
 from contextlib import suppress
+from http import HTTPStatus
 from typing import Any, Final
 from urllib.parse import urlsplit
 
 from fastapi import HTTPException
 
+from ident_service.service.api.connections import Connections, Peer
 from ident_service.service.api.metrics import Metrics
 from ident_service.service.api.settings import Settings
 
@@ -27,6 +31,7 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 MOST_BODY: Final = 64 * 1024
 MOST_UPLOAD: Final = 16 * 2**20
 UPLOADS: Final = ("/api/v1/arms", "/api/v1/motions", "/api/v1/descriptions/check")
+_URGENT: Final = ("/stop", "/lease")  # ends of paths that are answered however busy the service is
 _SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
 _LOG = logging.getLogger("ident.http")
 _HEADERS: Final = (
@@ -54,8 +59,8 @@ class _TooLarge(HTTPException):
 class Doors:
     """Wraps the application."""
 
-    def __init__(self, app: App, settings: Settings, metrics: Metrics) -> None:
-        self._app, self._metrics = app, metrics
+    def __init__(self, app: App, settings: Settings, metrics: Metrics, connections: Connections) -> None:
+        self._app, self._metrics, self._connections = app, metrics, connections
         self._hosts, self._scheme = settings.hosts, "https" if settings.tls else "http"
         hsts = ((b"strict-transport-security", b"max-age=31536000"),) if settings.tls else ()
         self._headers = (*_HEADERS, *hsts)
@@ -68,6 +73,9 @@ class Doors:
         if scope["type"] != "http":
             return  # there is nothing else here
         began, status, started = time.perf_counter(), 500, False
+        peer: Peer | None = scope.get("client")
+        busy = self._connections.busy and not scope["path"].endswith(_URGENT)
+        self._connections.headers_came(peer, body=_has_body(scope))
 
         async def answer(message: Message) -> None:
             nonlocal status, started
@@ -84,12 +92,16 @@ class Doors:
             if (refused := self._refusal(scope)) is not None:
                 await _refuse(answer, *refused)
                 return
+            if busy:
+                await _refuse(answer, 503, "Busy", "too many requests are being answered; ask again")
+                return
             try:
-                await self._app(scope, _counted(scope, receive), answer)
+                await self._app(scope, self._counted(scope, receive), answer)
             except _TooLarge as error:
                 if not started:
                     await _refuse(answer, 413, "TooLarge", error.detail)
         finally:
+            self._connections.answered(peer)
             self._metrics.request(scope["method"], status, time.perf_counter() - began)
             _LOG.info(
                 "request",
@@ -117,6 +129,30 @@ class Doors:
             return 403, "WrongOrigin", "a page of another origin may not ask this service for anything"
         return None
 
+    def _counted(self, scope: Scope, receive: Receive) -> Receive:
+        upload = scope["method"] == "POST" and scope["path"] in UPLOADS
+        most, seen = MOST_UPLOAD if upload else MOST_BODY, 0
+
+        async def counted() -> Message:
+            nonlocal seen
+            message = await receive()
+            if message["type"] == "http.request":
+                seen += len(message.get("body", b""))
+                if seen > most:
+                    raise _TooLarge(most)
+                if not message.get("more_body", False):
+                    self._connections.request_came(scope.get("client"))
+            return message
+
+        return counted
+
+
+def _has_body(scope: Scope) -> bool:
+    return any(
+        name == b"transfer-encoding" or (name == b"content-length" and value.strip(b"0"))
+        for name, value in scope["headers"]
+    )
+
 
 def _name(host: str) -> str:
     """The name in a Host header, without port and brackets; empty where it is not one."""
@@ -128,26 +164,12 @@ def _name(host: str) -> str:
     return ""
 
 
-def _counted(scope: Scope, receive: Receive) -> Receive:
-    upload = scope["method"] == "POST" and scope["path"] in UPLOADS
-    most, seen = MOST_UPLOAD if upload else MOST_BODY, 0
-
-    async def counted() -> Message:
-        nonlocal seen
-        message = await receive()
-        if message["type"] == "http.request":
-            seen += len(message.get("body", b""))
-            if seen > most:
-                raise _TooLarge(most)
-        return message
-
-    return counted
-
-
 async def _refuse(send: Send, status: int, kind: str, words: str) -> None:
     body = json.dumps({"error": {"kind": kind, "message": words}}).encode()
     length = str(len(body)).encode()
     # What is left of the body is not read: the connection ends with the answer.
     headers = [(b"content-type", b"application/json"), (b"content-length", length), (b"connection", b"close")]
+    if status == HTTPStatus.SERVICE_UNAVAILABLE:
+        headers.append((b"retry-after", b"1"))
     await send({"type": "http.response.start", "status": status, "headers": headers})
     await send({"type": "http.response.body", "body": body})

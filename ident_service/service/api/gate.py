@@ -1,5 +1,7 @@
 """Who asks, and may they: tokens, sessions of the page, and the throttle of failed attempts.
 
+Tokens and sessions are in the registry, where each request but two looks them up. A stop and the renewal of a lease ask
+a copy in memory, and so wait for nobody (`known`).
 Boundary: no HTTP here; `asking.py` takes tokens out of requests.
 """
 
@@ -14,13 +16,13 @@ from dataclasses import dataclass
 from typing import Final, TypeVar
 
 from ident_service.service.registry.database import Database
-from ident_service.service.registry.tokens import Access, access, digest
+from ident_service.service.registry.tokens import Access, begin_session, digest, digests, end_session, sessions
 
 SESSION_SECONDS: Final = 12 * 3600.0
 CHALLENGE_SECONDS: Final = 60.0
 _MOST_SESSIONS, _MOST_CHALLENGES, _MOST_ADDRESSES = 1000, 1000, 10_000
 _WINDOW: Final = 60.0  # s
-_FAILURES_OF_ONE, _FAILURES_OF_ALL = 10, 100  # in a window
+_FAILURES = 10  # in a window, from one address or of one token
 
 
 Key = TypeVar("Key")
@@ -36,41 +38,29 @@ class Throttled(Exception):
 
 
 class Throttle:
-    """Counts failed attempts, per address and of all together."""
+    """Counts failed attempts, per address and per token.
+
+    Nothing is counted of all together: nobody guesses 256 bits, and whoever fails elsewhere must lock out no one here.
+    """
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
         self._now = now
-        self._of_all: deque[float] = deque()
-        self._of_one: OrderedDict[str, deque[float]] = OrderedDict()
+        self._failures: OrderedDict[str, deque[float]] = OrderedDict()
 
-    def require(self, address: str) -> None:
-        """Raise Throttled where an attempt from this address does not count now."""
-        wait = max(
-            self._wait(self._of_all, _FAILURES_OF_ALL), self._wait(self._of_one.get(address, deque()), _FAILURES_OF_ONE)
-        )
-        if wait > 0.0:
+    def require(self, *keys: str) -> None:
+        """Raise Throttled where an attempt with one of these, an address or the digest of a token, does not count."""
+        if (wait := max(self._wait(self._failures.get(key, deque())) for key in keys)) > 0.0:
             raise Throttled(wait)
 
-    def failed(self, address: str) -> None:
-        """Count one."""
-        now = self._now()
-        self._of_all.append(now)
-        self._of_one.setdefault(address, deque()).append(now)
-        self._of_one.move_to_end(address)
-        while len(self._of_one) > _MOST_ADDRESSES:
-            self._of_one.popitem(last=False)
+    def failed(self, *keys: str) -> None:
+        """Count one failure of each."""
+        for key in keys:
+            _remember(self._failures, key, self._failures.get(key, deque(maxlen=_FAILURES)), _MOST_ADDRESSES)
+            self._failures[key].append(self._now())
 
-    def _wait(self, failures: deque[float], most: int) -> float:
-        now = self._now()
-        while failures and now - failures[0] > _WINDOW:
-            failures.popleft()
-        return _WINDOW - (now - failures[-most]) if len(failures) >= most else 0.0
-
-
-@dataclass(frozen=True)
-class _Session:
-    secret_digest: str  # of the token: a session ends when its token is revoked
-    until: float
+    def _wait(self, failures: deque[float]) -> float:
+        full = len(failures) == _FAILURES
+        return _WINDOW - (self._now() - failures[0]) if full else 0.0
 
 
 @dataclass(frozen=True)
@@ -84,17 +74,34 @@ class Gate:
     """Knows who asks."""
 
     def __init__(self, db: Database, now: Callable[[], float] = time.monotonic) -> None:
-        """Begin without sessions.
+        """Begin with the tokens and sessions that the registry knows.
 
         Args:
             db: the registry.
-            now: clock of sessions, challenges and throttle [s].
+            now: clock of challenges and throttle [s]; sessions outlast this process and end by the machine's time.
         """
         self._db, self._now, self._lock = db, now, threading.Lock()
         self._throttle = Throttle(now)
         self._good: OrderedDict[tuple[str, str], None] = OrderedDict()
-        self._sessions: OrderedDict[str, _Session] = OrderedDict()
+        self._sessions: dict[str, tuple[str, float]] = {}
         self._challenges: OrderedDict[str, _Challenge] = OrderedDict()
+
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Copy tokens and sessions from the registry, where another process may have changed them."""
+        self._tokens, self._sessions = digests(self._db), sessions(self._db)
+
+    def known(self, secret: str | None, session: str | None) -> Access | None:
+        """Tell whose token or session this is by the copy in memory; whatever failed before, and waiting for nobody.
+
+        A token that was revoked at a terminal counts here until the next `refresh`, which each request brings about.
+        """
+        key = None if secret is None else digest(secret)
+        if secret is None and session is not None:
+            key, until = self._sessions.get(digest(session), (None, 0.0))
+            key = key if until >= time.time() else None
+        return None if key is None else self._tokens.get(key)
 
     def by_token(self, secret: str, address: str) -> Access | None:
         """Whose token this is; None if nobody's.
@@ -105,19 +112,16 @@ class Gate:
         key = (address, digest(secret))
         with self._lock:
             if key not in self._good:
-                self._throttle.require(address)
-        found = access(self._db, secret)
+                self._throttle.require(*key)
+        self._tokens = digests(self._db)
+        found = self._tokens.get(key[1])
         with self._lock:
             if found is None:
                 self._good.pop(key, None)
-                self._throttle.failed(address)
+                self._throttle.failed(*key)
             else:
                 _remember(self._good, key, None, _MOST_ADDRESSES)
         return found
-
-    def for_stop(self, secret: str) -> Access | None:
-        """Whose token this is, whatever failed before: a stop meets no throttle."""
-        return access(self._db, secret)
 
     def log_in(self, secret: str, address: str) -> tuple[str, Access] | None:
         """Exchange a token for a session; None if it is nobody's. Raises as `by_token`."""
@@ -125,25 +129,19 @@ class Gate:
         if found is None:
             return None
         session = secrets.token_urlsafe(32)
-        with self._lock:
-            entry = _Session(digest(secret), self._now() + SESSION_SECONDS)
-            _remember(self._sessions, digest(session), entry, _MOST_SESSIONS)
+        begin_session(self._db, session, secret, time.time() + SESSION_SECONDS, _MOST_SESSIONS)
+        self.refresh()
         return session, found
 
     def by_session(self, session: str) -> Access | None:
         """Whose session this is; None if nobody's, or if its time is over."""
-        with self._lock:
-            entry = self._sessions.get(digest(session))
-            if entry is None or entry.until < self._now():
-                self._sessions.pop(digest(session), None)
-                return None
-        row = self._db.row("SELECT name, role FROM tokens WHERE sha256 = ? AND revoked IS NULL", entry.secret_digest)
-        return None if row is None else Access(row["name"], row["role"])
+        self.refresh()
+        return self.known(None, session)
 
     def log_out(self, session: str) -> None:
         """End a session."""
-        with self._lock:
-            self._sessions.pop(digest(session), None)
+        end_session(self._db, session)
+        self.refresh()
 
     def challenge(self, arm: str, who: str) -> str:
         """A word that confirms one motion of an arm, once, together with the arm's typed name."""

@@ -9,15 +9,14 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from typing import Annotated, Any, Final, Literal
 
-from fastapi import APIRouter, Depends, HTTPException, Query, Request
+from fastapi import APIRouter, HTTPException, Query
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import PlainTextResponse, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
 from ident_service.errors import MotionRefused
-from ident_service.motion.controls import HOLD_TO_RUN_SECONDS, LEASE_SECONDS
 from ident_service.service.api.answers import JobAnswer, JobResult, LeaseAnswer, StopAnswer
-from ident_service.service.api.asking import Bearer, Cookie, Operator, Service, Serving, Viewer, anybody_near
+from ident_service.service.api.asking import LeaseKeeper, Near, Operator, Service, Serving, Viewer
 from ident_service.service.api.mistakes import failures, failures_of_files
 from ident_service.service.jobs.asked import MOVES, ArmName, Asked, Id
 from ident_service.service.jobs.commands import JOBS
@@ -127,22 +126,15 @@ def cancel_job(service: Serving, who: Operator, job: Id) -> JobAnswer:
 
 
 @router.post("/jobs/{job}/lease")
-def renew_lease(service: Serving, who: Operator, job: Id) -> LeaseAnswer:
+async def renew_lease(service: Serving, who: LeaseKeeper, job: Id) -> LeaseAnswer:
     """Say that whoever asked for the motion is still there; only they can."""
-    row = rows.known_job(service.db, job)
-    if row["created_by"] != who.name:
+    holder = service.engine.live.lease_holder(job)
+    if holder is not None and holder != who.name:
         raise HTTPException(403, "the lease of a motion is renewed by whoever asked for it")
-    if not service.engine.renew(row["id"]):
+    if (seconds := service.engine.live.renew(job)) is None:
+        row = await run_in_threadpool(rows.known_job, service.db, job)
         raise MotionRefused(f"the job {job} has no lease to renew: {row['state']}")
-    seconds = HOLD_TO_RUN_SECONDS if row["kind"] == "rehearse" else LEASE_SECONDS
-    return LeaseAnswer(job=row["id"], seconds=seconds)
-
-
-async def _near(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> str:
-    return await asyncio.get_running_loop().run_in_executor(_STOPS, anybody_near, request, bearer, cookie)
-
-
-Near = Annotated[str, Depends(_near)]
+    return LeaseAnswer(job=job, seconds=seconds)
 
 
 @router.post("/stop")

@@ -1,14 +1,28 @@
-"""Logs as lines of JSON on standard error: when, how bad, where, what, and the facts with their names."""
+"""Logs as lines of JSON on standard error: when, how bad, where, what, and the facts with their names.
+
+A thread of its own writes them: a reader of standard error that stands still keeps nobody else, a stop least of all.
+Lines that nobody takes are left out, and so are those that say the same thing again and again.
+"""
 
 from __future__ import annotations
 
+import atexit
 import json
 import logging
+import queue
 import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
 from datetime import UTC, datetime
-from typing import Final
+from typing import Final, TextIO
 
 _OURS: Final = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "taskName", "color_message"}
+_MOST_WAITING: Final = 1000  # lines for a reader that stands still
+_MOST_ALIKE, _WINDOW = 100, 10.0  # lines in so many seconds
+_MOST_KINDS: Final = 1000
+_LAST_LINES = 1.0  # s for what waits when the process ends
 
 
 class JsonLines(logging.Formatter):
@@ -28,10 +42,65 @@ class JsonLines(logging.Formatter):
         return json.dumps(line, default=str)
 
 
+class NotTooOften(logging.Filter):
+    """Leaves lines out that say the same thing too often; the next one that is let through says how many."""
+
+    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+        super().__init__()
+        self._now, self._lock = now, threading.Lock()
+        self._kinds: dict[tuple[str, str, object], tuple[float, int]] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Tell whether a line is written; alike are those of one logger, template and status."""
+        kind = (record.name, str(record.msg)[:80], getattr(record, "status", None))
+        with self._lock:
+            if len(self._kinds) > _MOST_KINDS:
+                self._kinds.clear()
+            since, count = self._kinds.get(kind, (self._now(), 0))
+            if self._now() - since > _WINDOW:
+                if count > _MOST_ALIKE:
+                    record.left_out = count - _MOST_ALIKE
+                since, count = self._now(), 0
+            self._kinds[kind] = since, count + 1
+        return count < _MOST_ALIKE
+
+
+class AsideHandler(logging.Handler):
+    """Hands lines to a thread that writes them; never waits for it."""
+
+    def __init__(self, stream: TextIO) -> None:
+        """Begin the thread; `stream` is written by it alone."""
+        super().__init__()
+        self._stream, self._lines = stream, queue.Queue[str | None](_MOST_WAITING)
+        self._thread = threading.Thread(target=self._work, name="log", daemon=True)
+        self._thread.start()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Hand over one line, or leave it out."""
+        with suppress(queue.Full):
+            self._lines.put_nowait(self.format(record))
+
+    def close(self) -> None:
+        """Have written what waits, as far as it is read soon."""
+        with suppress(queue.Full):
+            self._lines.put(None, timeout=_LAST_LINES)
+            self._thread.join(_LAST_LINES)
+        super().close()
+
+    def _work(self) -> None:
+        while (line := self._lines.get()) is not None:
+            with suppress(OSError, ValueError):  # nobody is left to tell
+                self._stream.write(line + "\n")
+                if self._lines.empty():
+                    self._stream.flush()
+
+
 def log_as_json(level: int = logging.INFO) -> None:
     """From now on, all logs of this process."""
-    handler = logging.StreamHandler(sys.stderr)
+    handler = AsideHandler(sys.stderr)
     handler.setFormatter(JsonLines())
+    handler.addFilter(NotTooOften())
+    atexit.register(handler.close)
     logging.basicConfig(level=level, handlers=[handler], force=True)
     # Each request has its line already (`doors.py`).
     logging.getLogger("uvicorn.access").disabled = True

@@ -6,11 +6,12 @@ import time
 from typing import Annotated
 
 from fastapi import APIRouter, HTTPException, Path, Query
+from fastapi.concurrency import run_in_threadpool
 from pydantic import BaseModel, ConfigDict, Field
 
 from ident_service.motion.controls import LEASE_SECONDS
 from ident_service.service.api.answers import LeaseAnswer
-from ident_service.service.api.asking import Operator, Service, Serving, Viewer
+from ident_service.service.api.asking import LeaseKeeper, Operator, Service, Serving, Viewer
 from ident_service.service.api.jobs import Confirmation, require_confirmed, without_paths
 from ident_service.service.api.maintenance_answers import (
     AlarmAnswer,
@@ -149,14 +150,17 @@ def get_reidentification(service: Serving, _: Viewer, name: Id) -> Reidentificat
 
 
 @router.post("/reidentifications/{name}/lease")
-def renew_reidentification(service: Serving, who: Operator, name: Id) -> LeaseAnswer:
+async def renew_reidentification(service: Serving, who: LeaseKeeper, name: Id) -> LeaseAnswer:
     """Renew the lease of the step that it is at; where nothing moves there is nothing to renew, and no mistake."""
-    row = known_reidentification(service.db, name)
-    if row["begun_by"] != who.name:
+    step = service.keeper.reidentifications.step(name)
+    if step is None:
+        row = await run_in_threadpool(known_reidentification, service.db, name)
+        step = row["begun_by"], row["job"]
+    if step[0] != who.name:
         raise HTTPException(403, "the lease of a motion is renewed by whoever asked for it")
-    if row["job"] is not None:
-        service.engine.renew(row["job"])
-    return LeaseAnswer(job=row["job"] or "", seconds=LEASE_SECONDS)
+    if step[1] is not None:
+        service.engine.live.renew(step[1])
+    return LeaseAnswer(job=step[1] or "", seconds=LEASE_SECONDS)
 
 
 @router.get("/alarms")

@@ -4,28 +4,34 @@ from __future__ import annotations
 
 import asyncio
 import fcntl
+import gc
 import logging
 import os
 import signal
 import socket
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import Final
+from typing import Any, Final
 
 import uvicorn
+from fastapi import FastAPI
 
 from ident_service.errors import UsageError
 from ident_service.record.files import write_atomically
 from ident_service.service.api.app import create_app
-from ident_service.service.api.asking import Service
+from ident_service.service.api.connections import Connections, Listener, most_connections
 from ident_service.service.api.notify import tell_manager, watchdog_seconds
 from ident_service.service.api.settings import Settings
+from ident_service.service.state_folder import keep_private
 
 LOCK: Final = "serve.lock"
 URL_FILE: Final = "serve.url"
+_MOST_HEADERS = 32 * 1024  # bytes
+_SWITCH = 0.0005  # s
 _LAST_ANSWERS = 5  # s for requests that are being answered when the service ends
 _READY_AGAIN = 0.1  # s until a manager whose queue was full is told again that we are ready
 _LOG = logging.getLogger("ident.serve")
@@ -39,9 +45,11 @@ def serve(settings: Settings, tell: Callable[[str], None] = lambda _: None) -> N
         tell: called with the address, when it answers.
 
     Raises:
-        UsageError: another service has the state folder, or the address cannot be had.
+        UsageError: another service has the state folder, others can enter it, or the address cannot be had.
     """
-    with single_instance(settings.state), _listening(settings) as listening:
+    keep_private(settings.state)
+    book = Connections(most_connections())
+    with single_instance(settings.state), _listening(settings, book) as listening:
         host, port = listening.getsockname()[:2]
         url = f"{'https' if settings.tls else 'http'}://{f'[{host}]' if ':' in host else host}:{port}"
 
@@ -50,7 +58,7 @@ def serve(settings: Settings, tell: Callable[[str], None] = lambda _: None) -> N
             write_atomically(settings.state / URL_FILE, url + "\n")
             tell(url)
 
-        app = create_app(settings)
+        app = create_app(settings, book)
         config = uvicorn.Config(
             app,
             log_config=None,
@@ -60,11 +68,15 @@ def serve(settings: Settings, tell: Callable[[str], None] = lambda _: None) -> N
             ws="none",
             lifespan="on",
             http="h11",
+            loop="asyncio",  # which takes its connections from our listener
+            h11_max_incomplete_event_size=_MOST_HEADERS,
             timeout_graceful_shutdown=_LAST_ANSWERS,
             ssl_certfile=settings.tls_cert,
             ssl_keyfile=settings.tls_key,
         )
-        server = _Server(config, app.state.service, ready)
+        # A stop meets several turns of the event loop; each waits so long for a thread that computes.
+        sys.setswitchinterval(_SWITCH)
+        server = _Server(config, app, book, ready)
         try:
             server.run(sockets=[listening])
         finally:
@@ -80,7 +92,7 @@ def single_instance(state: Path) -> Iterator[None]:
     """
     path = state / LOCK
     try:
-        state.mkdir(parents=True, exist_ok=True)
+        state.mkdir(mode=0o700, parents=True, exist_ok=True)
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
     except OSError as error:
         raise UsageError(f"{path}: cannot be made: {error.strerror}; give another state folder") from None
@@ -100,12 +112,16 @@ def single_instance(state: Path) -> Iterator[None]:
 class _Server(uvicorn.Server):
     """uvicorn's, that stops the arms as soon as it is to end, and tells the service manager that it lives."""
 
-    def __init__(self, config: uvicorn.Config, service: Service, ready: Callable[[], None]) -> None:
+    def __init__(self, config: uvicorn.Config, app: FastAPI, book: Connections, ready: Callable[[], None]) -> None:
         super().__init__(config)
-        self._service, self._ready = service, ready
+        self._app, self._service, self._book, self._ready = app, app.state.service, book, ready
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Listen, and only then say so: whoever comes at the word is not refused."""
+        await _make_routes(self._app)
+        # What is there now stays: a full collection would hold the first stops up for a tenth of a second.
+        gc.collect()
+        gc.freeze()
         await super().startup(sockets)
         if self.started:
             self._ready()
@@ -119,6 +135,11 @@ class _Server(uvicorn.Server):
         # uvicorn would raise the signal again at the end; ours is a good one.
         self.force_exit = self.should_exit and sig == signal.SIGINT
         self.should_exit = True
+
+    async def on_tick(self, counter: int) -> bool:
+        """Ten times a second: let connections go that do not come to a request."""
+        self._book.sweep()
+        return await super().on_tick(counter)
 
     async def main_loop(self) -> None:
         """Serve; tell the manager that we are ready, then keep its watchdog quiet while the queue is looked after."""
@@ -143,15 +164,29 @@ class _Server(uvicorn.Server):
             await asyncio.sleep(seconds)
 
 
+async def _make_routes(app: FastAPI) -> None:
+    """Ask for what is not there: FastAPI makes its routes at the first request, which may be a stop."""
+
+    async def receive() -> dict[str, Any]:
+        return {"type": "http.request", "body": b"", "more_body": False}
+
+    async def send(_: Any) -> None:
+        pass
+
+    scope = {"type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": "POST", "scheme": "http"}
+    place = {"path": "/nothing", "raw_path": b"/nothing", "query_string": b"", "root_path": "", "headers": []}
+    await app.router({**scope, **place}, receive, send)
+
+
 @contextmanager
-def _listening(settings: Settings) -> Iterator[socket.socket]:
+def _listening(settings: Settings, book: Connections) -> Iterator[socket.socket]:
     """A socket at the address.
 
     Raises:
         UsageError: it cannot be had.
     """
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
-    listening = socket.socket(family, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
+    listening = Listener(family, book)
     try:
         try:
             listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -154,7 +154,12 @@ class Reidentifications:
         """
         self._engine, self._db, self._state, self._now = engine, engine.db, engine.state, now
         self._stops: dict[str, int] = {}
+        self._steps: dict[str, tuple[str, str]] = {}
         self._lock = threading.Lock()
+
+    def step(self, name: str) -> tuple[str, str] | None:
+        """Tell from memory who began one that runs, and the job that it is at; None for one that this does not know."""
+        return self._steps.get(name)
 
     def begin(self, wanted: Wanted, by: str) -> Row:
         """Queue the first step.
@@ -172,7 +177,7 @@ class Reidentifications:
         if wanted.unattended:
             _require_allowed(config)
         against = require_comparable(self._state, config)
-        name, stops = new_id(wanted.arm), self._engine.stops(wanted.arm)
+        name, stops = new_id(wanted.arm), self._engine.live.stops(wanted.arm)
 
         def enter(job: Row) -> None:
             try:
@@ -184,6 +189,7 @@ class Reidentifications:
             except sqlite3.IntegrityError:
                 raise MotionRefused(f"{wanted.arm}: is being re-identified already") from None
             note(self._db, by, "re-identification begun", wanted.arm, id=name, unattended=wanted.unattended)
+            self._steps[name] = by, job["id"]
 
         with self._lock:
             check = Check(kind="check", arm=wanted.arm, motion=wanted.motion)
@@ -212,7 +218,7 @@ class Reidentifications:
         answer = said(self._state / JOBS / job["id"]).answer if judged else {}
         if "verdict" in answer:
             conclude(self._db, row, verdict_of(answer), self._now())
-            self._stops.pop(row["id"], None)
+            self._forget(row["id"])
         elif job["state"] != "done":
             state = "failed" if judged else job["state"]
             self._ended(row, state, f"{row['step']}: {job['detail'] or job['state']}{_kept(row)}")
@@ -242,6 +248,7 @@ class Reidentifications:
                 f"UPDATE reidentifications SET step = ?, job = ?, {column} = ? WHERE id = ?",  # noqa: S608 - ours
                 *(following, job["id"], job["run"], row["id"]),
             )
+            self._steps[row["id"]] = row["begun_by"], job["id"]
 
         stops = self._stops.get(row["id"]) if step == "check" else None
         own = bool(row["unattended"])
@@ -249,7 +256,11 @@ class Reidentifications:
 
     def _ended(self, row: Row, state: str, detail: str) -> None:
         _end(self._db, row, state, detail, self._now())
-        self._stops.pop(row["id"], None)
+        self._forget(row["id"])
+
+    def _forget(self, name: str) -> None:
+        self._stops.pop(name, None)
+        self._steps.pop(name, None)
 
 
 def _end(db: Database, row: Row, state: str, detail: str, now: float) -> bool:

@@ -77,7 +77,7 @@ def failure(request: Request, status: int, words: str) -> Response:
     """What went wrong, as a page."""
     service = service_of(request)
     cookie = request.cookies.get(COOKIE)
-    who = None if cookie is None else service.gate.by_session(cookie)
+    who = service.gate.known(None, cookie)
     title = HTTPStatus(status).phrase
     words = words.replace(f"{service.state}/", "").encode("utf-8", "replace").decode()
     return page("failure", who, status, title=title, words=words)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from typing import Annotated
 from urllib.parse import urlsplit
 
 from fastapi import APIRouter, HTTPException, Query, Request, Response
-from fastapi.concurrency import run_in_threadpool
 
 from ident_service.service.api import about
-from ident_service.service.api.asking import Cookie, Serving
-from ident_service.service.api.jobs import Near, stop_all
+from ident_service.service.api.asking import Cookie, Near, Serving
+from ident_service.service.api.jobs import stop_all
 from ident_service.service.pages.asking import Form, PageRoute, inside, seen
 from ident_service.service.pages.render import STATIC, mark, page, static
 
@@ -60,7 +58,5 @@ async def stop(service: Serving, request: Request, near: Near, cookie: Cookie = 
     """Bring all arms to a controlled stop; who may is who may ask the API to."""
     done = await stop_all(service, near)
     back = inside(urlsplit(request.headers.get("referer", "")).path or "/")
-    who = None
-    with suppress(Exception):  # whoever it was: the arms stop
-        who = None if cookie is None else await run_in_threadpool(service.gate.by_session, cookie)
+    who = service.gate.known(None, cookie)
     return page("stopped", who, arms=done.arms, jobs=done.jobs, back="/" if back == "/stop" else back)

@@ -9,6 +9,7 @@ from fastapi.responses import HTMLResponse
 
 from ident_service.errors import UsageError
 from ident_service.service.api import runs
+from ident_service.service.api.about import AUDIT_SECONDS
 from ident_service.service.api.asking import Serving, Viewer
 from ident_service.service.jobs.asked import ArmName, Id
 from ident_service.service.jobs.commands import REPORTS
@@ -55,5 +56,6 @@ def compare(service: Serving, who: Viewer, reference: Id, other: Id) -> Response
 @router.get("/audit")
 def audit(service: Serving, who: Viewer, before: Annotated[int, Query(ge=0, lt=2**62)] | None = None) -> Response:
     """Who did what, the newest first."""
+    service.engine.audit.flush(AUDIT_SECONDS)
     lines = trail(service.db, before=before, most=100)
     return page("audit", who, lines=lines, more=len(lines) == 100)

@@ -2,15 +2,17 @@
 
 Write-ahead logging with full synchronisation: what a transaction has written is on the disk when it ends, and a kill at
 any moment loses nothing of it. Other processes of the same machine (`ident accept`) may use the file at the same time.
+One connection writes and another one reads: who reads does not wait for who writes, here or in another process.
 """
 
 from __future__ import annotations
 
+import os
 import re
 import sqlite3
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
@@ -24,35 +26,50 @@ Row = Mapping[str, Any]
 
 
 class Database:
-    """One connection, used by one thread at a time."""
+    """A connection that writes and one that reads, each used by one thread at a time."""
 
-    def __init__(self, state: Path, migrations: Sequence[str] = MIGRATIONS) -> None:
+    def __init__(self, state: Path, migrations: Sequence[str] = MIGRATIONS, *, busy: float = _BUSY) -> None:
         """Open the registry of a state folder; made and migrated where necessary.
+
+        Args:
+            state: the state folder.
+            migrations: SQL scripts, the oldest first.
+            busy: how long a write waits for another process that writes [s].
 
         Raises:
             UsageError: it cannot be made, is damaged, or was written by newer software.
         """
-        self._path, self._lock = state / FILE, threading.RLock()
-        self._depth = 0
+        self._path, self._lock, self._read_lock = state / FILE, threading.RLock(), threading.Lock()
+        self._writer: int | None = None  # the thread whose transaction is open
         try:
-            state.mkdir(parents=True, exist_ok=True)
-            self._connection = sqlite3.connect(
-                self._path, timeout=_BUSY, isolation_level=None, check_same_thread=False, cached_statements=256
-            )
+            state.mkdir(mode=0o700, parents=True, exist_ok=True)
+            with suppress(FileExistsError):  # SQLite gives its other files the mode of this one
+                os.close(os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600))
+            self._connection = self._connect(busy)
+            self._reader = self._connect(busy)
         except (OSError, sqlite3.Error) as error:
             raise UsageError(f"{self._path}: cannot be opened: {error}; give another state folder") from None
-        self._connection.row_factory = sqlite3.Row
         try:
             for pragma in ("journal_mode = WAL", "synchronous = FULL", "foreign_keys = ON"):
                 self._connection.execute(f"PRAGMA {pragma}")
             self._migrate(migrations)
-            self._path.chmod(0o600)
+            self._reader.execute("PRAGMA query_only = ON")
+            for ending in ("", "-wal", "-shm"):  # of folders that older software made
+                with suppress(FileNotFoundError):
+                    self._path.with_name(self._path.name + ending).chmod(0o600)
         except sqlite3.Error as error:
             self.close()
             raise UsageError(f"{self._path}: {error}; the file is damaged or in use, put a copy of it back") from None
         except UsageError:
             self.close()
             raise
+
+    def _connect(self, busy: float) -> sqlite3.Connection:
+        connection = sqlite3.connect(
+            self._path, timeout=busy, isolation_level=None, check_same_thread=False, cached_statements=256
+        )
+        connection.row_factory = sqlite3.Row
+        return connection
 
     def _migrate(self, migrations: Sequence[str]) -> None:
         with self.transaction():
@@ -71,11 +88,11 @@ class Database:
     def transaction(self) -> Iterator[None]:
         """All that is written in the block, or nothing of it; blocks within blocks are one."""
         with self._lock:
-            if self._depth:
+            if self._writer is not None:
                 yield
                 return
             self._connection.execute("BEGIN IMMEDIATE")
-            self._depth = 1
+            self._writer = threading.get_ident()
             try:
                 yield
             except BaseException:
@@ -84,7 +101,7 @@ class Database:
             else:
                 self._connection.execute("COMMIT")
             finally:
-                self._depth = 0
+                self._writer = None
 
     def write(self, sql: str, *values: Any) -> int:
         """Execute one statement; how many rows it changed."""
@@ -92,9 +109,11 @@ class Database:
             return self._connection.execute(sql, values).rowcount
 
     def rows(self, sql: str, *values: Any) -> list[Row]:
-        """All rows of a query, as mappings of column to value."""
-        with self._lock:
+        """All rows of a query, as mappings of column to value; within a transaction, with what it has written."""
+        if self._writer == threading.get_ident():
             return [dict(row) for row in self._connection.execute(sql, values)]
+        with self._read_lock:
+            return [dict(row) for row in self._reader.execute(sql, values)]
 
     def row(self, sql: str, *values: Any) -> Row | None:
         """The first row of a query."""
@@ -108,7 +127,8 @@ class Database:
 
     def close(self) -> None:
         """Let the file go."""
-        with self._lock:
+        with self._lock, self._read_lock:
+            self._reader.close()
             self._connection.close()
 
     def __enter__(self) -> Self:

@@ -187,4 +187,12 @@ CREATE TABLE alarms (
 ) STRICT;
 """
 
-MIGRATIONS: Final[tuple[str, ...]] = (_FIRST, _MAINTENANCE)
+_SESSIONS = """
+CREATE TABLE sessions (
+    sha256 TEXT PRIMARY KEY,           -- of the word in the browser's cookie
+    token TEXT NOT NULL,               -- SHA-256 of the token that it was exchanged for
+    until REAL NOT NULL
+) STRICT;
+"""
+
+MIGRATIONS: Final[tuple[str, ...]] = (_FIRST, _MAINTENANCE, _SESSIONS)

@@ -1,12 +1,11 @@
 """Access: tokens of 256 random bits with a name and a role; only their SHA-256 is kept.
 
-A random token of that length needs no slow hash. It is looked up by comparing digests in constant time.
+A random token of that length needs no slow hash, and looking up its digest tells nobody anything about it.
 """
 
 from __future__ import annotations
 
 import hashlib
-import hmac
 import os
 import re
 import secrets
@@ -75,13 +74,43 @@ def tokens(db: Database) -> list[Row]:
     return db.rows("SELECT name, role, created, revoked FROM tokens ORDER BY created, name")
 
 
+def digests(db: Database) -> dict[str, Access]:
+    """Read who may ask, by the digest of their token."""
+    rows = db.rows("SELECT name, role, sha256 FROM tokens WHERE revoked IS NULL")
+    return {row["sha256"]: Access(row["name"], row["role"]) for row in rows}
+
+
 def access(db: Database, secret: str) -> Access | None:
     """Whose token this is, None if nobody's."""
-    asked, found = digest(secret), None
-    for row in db.rows("SELECT name, role, sha256 FROM tokens WHERE revoked IS NULL"):
-        if hmac.compare_digest(asked, row["sha256"]):
-            found = Access(row["name"], row["role"])
-    return found
+    return digests(db).get(digest(secret))
+
+
+def begin_session(db: Database, session: str, secret: str, until: float, most: int) -> None:
+    """Keep a session of the page over restarts of the service; beyond `most`, the ones that end first are forgotten.
+
+    Args:
+        db: the registry.
+        session: its word, of which the digest is kept.
+        secret: the token that it was exchanged for; it ends with that, too.
+        until: when it ends [s since 1970 in UTC].
+        most: how many there may be.
+    """
+    with db.transaction():
+        db.write("DELETE FROM sessions WHERE until < ?", time.time())
+        db.write("INSERT INTO sessions VALUES (?, ?, ?)", digest(session), digest(secret), until)
+        db.write(
+            "DELETE FROM sessions WHERE sha256 NOT IN (SELECT sha256 FROM sessions ORDER BY until DESC LIMIT ?)", most
+        )
+
+
+def end_session(db: Database, session: str) -> None:
+    """Forget a session."""
+    db.write("DELETE FROM sessions WHERE sha256 = ?", digest(session))
+
+
+def sessions(db: Database) -> dict[str, tuple[str, float]]:
+    """Read all sessions: digest of the word to the digest of its token and its end [s since 1970 in UTC]."""
+    return {row["sha256"]: (row["token"], row["until"]) for row in db.rows("SELECT * FROM sessions")}
 
 
 def digest(secret: str) -> str:

@@ -12,9 +12,14 @@ function closeStreams() {
 addEventListener("pagehide", closeStreams);
 document.addEventListener("submit", closeStreams);
 
+// Whoever presses again and again asks for one stop: the next is asked for when this one is answered.
+let stopping = false;
+
 document.addEventListener("keydown", (event) => {
   if (event.key !== "Escape" || event.repeat) return;
   event.preventDefault();
+  if (stopping) return;
+  stopping = true;
   const status = document.getElementById("stop-status");
   status.textContent = "Stop asked …";
   closeStreams();
@@ -28,5 +33,6 @@ document.addEventListener("keydown", (event) => {
       status.textContent = what ? `Asked to stop: ${what}.` : "Nothing was moving.";
     })
     .then(() => document.dispatchEvent(new Event("stop-asked")))
-    .catch(() => document.getElementById("stop").submit());
+    .catch(() => document.getElementById("stop").submit())
+    .finally(() => (stopping = false));
 });

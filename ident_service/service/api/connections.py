@@ -1,0 +1,194 @@
+"""The listener of the service: how many connections there are, and how long one may keep its place without a request.
+
+A newcomer is always let in. Where there are too many, of one address or of all, the connection goes that has waited
+longest without a whole request: half a request, a TLS handshake that does not go on, an idle line. So a stop finds a
+place, whoever keeps lines open. What is being answered stays; there is less of it than there are places, because
+the doors refuse more (`busy`), a stop and a lease excepted.
+
+uvicorn's own `limit_concurrency` counts idle lines and would refuse the stop, and it has no deadline for a request.
+Boundary: sockets of the event loop's thread; requests and answers are `doors.py`.
+"""
+
+from __future__ import annotations
+
+import resource
+import socket
+import time
+from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any, Final, Self
+
+HEADER_SECONDS: Final = 10.0  # for a handshake and the headers of a request
+BODY_SECONDS: Final = 60.0  # for 16 MiB over 2.2 Mbit/s
+_MOST, _FEWEST = 512, 16
+_DESCRIPTORS = 4096  # that are asked for, where the limit of the process may be raised so far
+_RESERVE = 256  # descriptors for files, pipes of jobs, and connections that are about to go
+_LEAVING = 64
+_AT_ONCE = 16  # accepted before the loop looks at what else there is
+Peer = tuple[str, int]
+
+
+def most_connections() -> int:
+    """Raise the limit of open files as far as it may be, and tell how many connections it leaves room for."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = _DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, _DESCRIPTORS)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+        soft = wanted
+    return _MOST if soft == resource.RLIM_INFINITY else max(_FEWEST, min(_MOST, soft - _RESERVE))
+
+
+class Connections:
+    """Knows the connections that are open, and which of them wait."""
+
+    def __init__(self, most: int = _MOST, now: Callable[[], float] = time.monotonic) -> None:
+        """Begin with none.
+
+        Args:
+            most: how many there may be; half as many of one address.
+            now: clock of the deadlines [s].
+        """
+        self._most, self._now = most, now
+        self._open: dict[Peer, Connection] = {}
+        self._waiting: dict[Peer, float] = {}  # to the deadline, the longest waiting first
+        self._of_one, self._requests = Counter[str](), Counter[Peer]()
+        self._leaving = 0
+
+    @property
+    def full(self) -> bool:
+        """Tell whether even those that are about to go have not gone yet."""
+        return len(self._open) + self._leaving >= self._most + _LEAVING
+
+    @property
+    def busy(self) -> bool:
+        """Tell whether as many requests are being answered as may be."""
+        return len(self._open) - len(self._waiting) >= 3 * self._most // 4
+
+    @property
+    def count(self) -> int:
+        """Count those that are open."""
+        return len(self._open)
+
+    def admit(self, connection: Connection) -> bool:
+        """Let a newcomer in, another one go if necessary; False where nobody can go."""
+        host = connection.peer[0]
+        if self._of_one[host] >= max(self._most // 2, 1):
+            longest = next((peer for peer in self._waiting if peer[0] == host), None)
+        elif len(self._open) >= self._most:
+            longest = next(iter(self._waiting), None)
+        else:
+            longest = connection.peer
+        if longest is None:
+            return False
+        if longest != connection.peer:
+            self._let_go(longest)
+        self._open[connection.peer] = connection
+        self._of_one[host] += 1
+        self._waiting[connection.peer] = self._now() + HEADER_SECONDS
+        return True
+
+    def headers_came(self, peer: Peer | None, *, body: bool) -> None:
+        """Know that the headers of a request are whole; with a body it has time for that, else it is answered."""
+        if peer in self._open:
+            # The next request of a line may come before the end of this one is told.
+            self._requests[peer] += 1
+            self._waiting.pop(peer, None)
+            if body:
+                self._waiting[peer] = self._now() + BODY_SECONDS
+
+    def request_came(self, peer: Peer | None) -> None:
+        """Know that a request is whole."""
+        if peer is not None:
+            self._waiting.pop(peer, None)
+
+    def answered(self, peer: Peer | None) -> None:
+        """Know that it is answered; the line waits for another one."""
+        if peer in self._open:
+            self._requests[peer] -= 1
+            if self._requests[peer] <= 0:
+                self._waiting.pop(peer, None)
+                self._waiting[peer] = self._now() + HEADER_SECONDS
+
+    def closed(self, connection: Connection) -> None:
+        """Forget one that is closed."""
+        if self._open.get(connection.peer) is connection:
+            self._forget(connection.peer)
+        elif connection.leaving:
+            self._leaving -= 1
+
+    def sweep(self) -> None:
+        """Let those go whose time is over."""
+        now = self._now()
+        for peer in [peer for peer, deadline in self._waiting.items() if deadline < now]:
+            self._let_go(peer)
+
+    def _let_go(self, peer: Peer) -> None:
+        connection = self._forget(peer)
+        connection.leaving = True
+        self._leaving += 1
+        # The event loop reads the end of it, during a TLS handshake too, and closes it.
+        with suppress(OSError):
+            connection.shutdown(socket.SHUT_RDWR)
+
+    def _forget(self, peer: Peer) -> Connection:
+        connection = self._open.pop(peer)
+        self._waiting.pop(peer, None)
+        self._requests.pop(peer, None)
+        self._of_one[peer[0]] -= 1
+        if not self._of_one[peer[0]]:
+            del self._of_one[peer[0]]
+        return connection
+
+
+class Connection(socket.socket):
+    """Tells its book when it is closed."""
+
+    peer: Peer
+    leaving = False
+    book: Connections
+
+    @classmethod
+    def of(cls, accepted: socket.socket, peer: Peer, book: Connections) -> Self:
+        """Take over an accepted socket."""
+        made = cls(accepted.family, accepted.type, accepted.proto, fileno=accepted.detach())
+        made.peer, made.book = peer, book
+        return made
+
+    def close(self) -> None:
+        """Close, and say so once."""
+        gone = self.fileno() < 0
+        super().close()
+        if not gone:
+            self.book.closed(self)
+
+
+class Listener(socket.socket):
+    """Counts its connections before anything is read from them."""
+
+    def __init__(self, family: int, book: Connections) -> None:
+        """Make it; it is not bound yet.
+
+        Args:
+            family: of addresses.
+            book: counts.
+        """
+        super().__init__(family, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
+        self._book, self._accepted = book, 0
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        """Accept the next connection that is let in.
+
+        Raises:
+            BlockingIOError: nobody waits, or it is somebody else's turn in the event loop.
+        """
+        while True:
+            self._accepted += 1
+            if self._accepted > _AT_ONCE or self._book.full:
+                self._accepted = 0
+                raise BlockingIOError
+            accepted, address = super().accept()
+            connection = Connection.of(accepted, (str(address[0]), int(address[1])), self._book)
+            if self._book.admit(connection):
+                return connection, address
+            connection.close()

@@ -1,0 +1,119 @@
+"""Who else is on the machine reads nothing of the state folder and blocks nothing in it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import stat
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from daemon.conftest import quick_text
+from daemon.served import daemon_process
+
+from ident_service.cli import main
+from ident_service.errors import UsageError
+from ident_service.motion.control_file import ControlFile
+from ident_service.service.api.serve import serve
+from ident_service.service.api.settings import Settings
+from ident_service.service.arm_state import control_path
+from ident_service.service.registry.database import FILE, Database
+
+
+@pytest.fixture(autouse=True)
+def usual_umask() -> Iterator[None]:
+    """Begin with what shells begin with; verbs may change it."""
+    before = os.umask(0o022)
+    yield
+    os.umask(before)
+
+
+@pytest.fixture
+def entered() -> Iterator[Path]:
+    """Make a folder that everybody on the machine can enter; the state folder is to be in it."""
+    folder = Path(tempfile.mkdtemp(dir="/tmp"))
+    folder.chmod(0o755)
+    yield folder / "state"
+    shutil.rmtree(folder)
+
+
+def readable(folder: Path) -> list[tuple[str, str]]:
+    """List whatever others may read, write or enter, with its mode."""
+    modes = [(path, path.lstat().st_mode) for path in (folder, *folder.rglob("*")) if not path.is_symlink()]
+    return [(str(path.relative_to(folder)), oct(mode)) for path, mode in modes if mode & 0o077]
+
+
+VERBS = (
+    ("token", "add", "ann", "--role", "viewer"),
+    ("check", "planar2"),
+    ("run", "planar2"),
+    ("simulate", "planar2"),
+    ("schedule", "add", "planar2", "--maintenance"),
+    ("ack", "planar2", "late_cycle"),
+    ("serve", "--port", "0"),
+)
+
+
+@pytest.mark.parametrize("mode", [0o755, 0o711, 0o710, 0o770])
+def test_a_folder_that_others_can_enter_is_refused_with_the_remedy(
+    entered: Path, mode: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    entered.mkdir()
+    entered.chmod(mode)
+    for words in VERBS:
+        assert main([*words, "--state", str(entered)]) == 2, words
+        assert f"others can enter it, and read or block what is in it; close it: chmod 700 {entered}" in (
+            capsys.readouterr().err
+        )
+    assert list(entered.iterdir()) == []
+    with pytest.raises(UsageError, match="chmod 700"):
+        serve(Settings(entered, port=0))
+    # An arm is stopped all the same.
+    with ControlFile.take(control_path(entered, "planar2"), None) as mover:
+        assert main(["stop", "--state", str(entered)]) == 0
+        assert mover.stop
+    entered.chmod(0o700)
+    assert main([*VERBS[0], "--state", str(entered)]) == 0
+
+
+def test_what_lies_below_a_closed_folder_is_not_refused(entered: Path) -> None:
+    entered.parent.chmod(0o700)
+    entered.mkdir(mode=0o755)
+    assert main([*VERBS[0], "--state", str(entered)]) == 0
+
+
+def test_what_a_verb_writes_is_its_owners_alone(entered: Path) -> None:
+    assert main([*VERBS[0], "--state", str(entered)]) == 0
+    assert main(["stop", "planar2", "--state", str(entered)]) == 2  # nobody moves it
+    assert readable(entered) == []
+
+
+def test_the_registry_is_its_owners_whatever_the_umask_and_the_past(tmp_path: Path) -> None:
+    with Database(tmp_path / "new" / "state") as db:
+        db.write("UPDATE tokens SET revoked = 1")
+        assert readable(tmp_path / "new" / "state") == []
+    (tmp_path / "old").mkdir()
+    with Database(tmp_path / "old") as db:
+        db.write("UPDATE tokens SET revoked = 1")
+        for path in (tmp_path / "old").iterdir():
+            path.chmod(0o644)
+        with Database(tmp_path / "old"):
+            modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in (tmp_path / "old").iterdir()}
+    assert modes == dict.fromkeys((FILE, f"{FILE}-wal", f"{FILE}-shm"), 0o600)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_what_a_daemon_and_its_jobs_write_is_its_owners_alone(entered: Path) -> None:
+    entered.mkdir(mode=0o700)  # as the service manager does
+    with daemon_process(entered) as (_, client):
+        client.post("/api/v1/arms", {"description": quick_text()})
+        job = client.post("/api/v1/jobs", {"job": {"kind": "simulate", "arm": "quick"}})["id"]
+        while (now := client.get(f"/api/v1/jobs/{job}"))["state"] in ("queued", "running"):
+            time.sleep(0.2)
+        assert now["state"] == "done"
+        assert (entered / "runs" / now["run"] / "parameters.json").is_file()
+        assert readable(entered) == []
