@@ -32,6 +32,7 @@ class SecondOpinion:
         torque_percent: |R_1 (beta_2 - beta_1)| of |rho_1|, in percent: how far the predicted torques are apart.
         deviations: the largest difference of a base parameter, in its standard deviations.
         expression: of that parameter.
+        margin: of the second solution in the set; where it is negative, the solver missed the set by so much.
     """
 
     solvers: tuple[str, str]
@@ -40,6 +41,7 @@ class SecondOpinion:
     torque_percent: float
     deviations: float
     expression: str
+    margin: float
 
     @property
     def agrees(self) -> bool:
@@ -79,7 +81,9 @@ def second_opinion(
     asked = solver or SOLVER
     if custom is not None:
         asked = next(name for name in (SOLVER, "scs", *available_solvers()) if name != before)
-    second = convex_least_squares(fit, base, conditions, prior=prior, custom=custom, solver=asked, bound=first.bound)
+    second = convex_least_squares(
+        fit, base, conditions, prior=prior, custom=custom, solver=asked, bound=first.bound, inside=False
+    )
     found = second.estimate
     apart = np.abs(found.beta - first.beta)
     known = np.isfinite(deviations) & (deviations > 0.0)
@@ -93,4 +97,5 @@ def second_opinion(
         torque_percent=100.0 * float(np.linalg.norm(fit.R1 @ (found.beta - first.beta))) / size,
         deviations=float(shifts[worst]),
         expression=base.expressions[worst],
+        margin=found.margin,
     )

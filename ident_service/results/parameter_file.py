@@ -225,6 +225,7 @@ def convex_document(estimate: Estimate) -> dict[str, Any]:
             "torque_difference_percent": second.torque_percent,
             "largest_difference_in_deviations": second.deviations,
             "expression": second.expression,
+            "margin": second.margin,
         }
     return document
 

@@ -140,7 +140,8 @@ def _convex(estimate: Estimate) -> list[str]:
             "",
             f"second opinion, {second_by} through cvxpy ({second.status}): "
             + ("the two agree" if second.agrees else "THE TWO DIFFER, use neither before you know why"),
-            f"  objective {one:.9g} by {first_by}, {other:.9g} by {second_by}",
+            f"  objective {one:.9g} by {first_by}, {other:.9g} by {second_by}"
+            + (f", which misses the set by {-second.margin:.1g}" if second.margin <= 0.0 else ""),
             f"  predicted torques differ by {second.torque_percent:.2g} %, base parameters by at most "
             f"{second.deviations:.2g} deviations: {_short(second.expression)}",
         ]
