@@ -83,14 +83,14 @@ class CustomKnowledge:
     Attributes:
         function: that was called.
         solver: that found the constrained estimates.
-        residual: |rho_1 - R_1 beta| of the estimate, the part of the residual that parameters can change.
-        residual_without: the same of the estimate that knows the rest of the description alone.
+        error: relative torque error [percent] (eq. 84) of the estimate, on the rows that were fitted to.
+        error_without: the same of the estimate that knows the rest of the description alone.
     """
 
     function: CustomFunction
     solver: str
-    residual: float
-    residual_without: float
+    error: float
+    error_without: float
 
 
 @dataclass(frozen=True)
@@ -119,8 +119,8 @@ class Estimate:
         recordings: name and hash of what it was fitted to.
         candidates: the estimates of table 8, this one's among them.
         chosen: index of this estimate among the candidates.
-        custom: further knowledge in the constrained estimates, where the description names some; neither `margin` nor a
-            certificate is about it.
+        custom: further knowledge in the estimate, where the description names some and it is constrained; neither
+            `margin` nor a certificate is about it.
         second: another solution of the constrained problem, where it was asked for.
     """
 
@@ -209,7 +209,8 @@ def identify(
             for name, one in sets.items()
         }
         without = constrained_least_squares(found.fit, base, conditions, prior)
-        knowledge = CustomKnowledge(custom, by.lower(), held[kind].objective, without.objective)
+        errors = (torque_error(prepared.equations.total, one.beta) for one in (held[kind], without))
+        knowledge = CustomKnowledge(custom, by.lower(), *(error.relative_percent for error in errors))
     deviations = np.sqrt(np.diag(found.covariance))
     second = None
     if again:
@@ -264,7 +265,7 @@ def identify(
         recordings=tuple((recording.path.name, recording.sha256) for recording in recordings),
         candidates=tuple(candidates),
         chosen=chosen,
-        custom=knowledge,
+        custom=None if free else knowledge,
         second=second,
     )
 

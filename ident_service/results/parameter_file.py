@@ -213,8 +213,8 @@ def convex_document(estimate: Estimate) -> dict[str, Any]:
             "file": known.function.file,
             "sha256": known.function.sha256,
             "solver": known.solver,
-            "residual": known.residual,
-            "residual_without": known.residual_without,
+            "relative_error_percent": known.error,
+            "relative_error_percent_without": known.error_without,
         }
     if (second := estimate.second) is not None:
         document["second_opinion"] = {

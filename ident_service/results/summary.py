@@ -129,8 +129,8 @@ def _convex(estimate: Estimate) -> list[str]:
         function = known.function
         lines += [
             "",
-            f"with {function.name} ({function.file}) by {known.solver}: residual {known.residual:.6g}, "
-            f"{known.residual_without:.6g} without it",
+            f"with {function.name} ({function.file}) by {known.solver}: torque error {known.error:.4f} % where joints "
+            f"move, {known.error_without:.4f} % without it",
             "(verdict, margin and certificate are about the other conditions of the description alone)",
         ]
     if (second := estimate.second) is not None:

@@ -6,14 +6,14 @@ import hashlib
 import json
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cvxpy as cp
 import numpy as np
 import pytest
-from estimation.synthetic import SampledRecording, exact_torque, stamps, waves
+from estimation.synthetic import SampledRecording, exact_torque, random_information, stamps, waves
 
 from ident_service.cli import main
 from ident_service.config.load import arm_from_json, load_arm
@@ -25,7 +25,15 @@ from ident_service.estimation.feasible.feasibility import constrained_least_squa
 from ident_service.estimation.feasible.feasible_set import feasible_set
 from ident_service.estimation.feasible.priors import Prior
 from ident_service.estimation.identify import Estimate, identify
+from ident_service.estimation.least_squares import ordinary_least_squares
+from ident_service.estimation.second_opinion import second_opinion
 from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.model.base import base_parameters
+from ident_service.record.open import open_recording
+from ident_service.results.evidence.making import gather_evidence
+from ident_service.results.parameter_file import ParameterFile, convex_document
+from ident_service.results.report.reservations import reservations
+from ident_service.results.summary import summary
 from ident_service.service.identification import Request, identify_files
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "extending.md"
@@ -89,7 +97,7 @@ def test_the_documented_example(setting: Setting, tmp_path: Path, capsys: pytest
     arm, out = tmp_path / "arm.yaml", tmp_path / "result"
     assert main(["identify", str(setting.path), "--arm", str(arm), "--out", str(out), "--second-opinion"]) == 0
     printed = capsys.readouterr().out
-    assert "with known_bodies:payload_and_wrist (known_bodies.py) by clarabel: residual " in printed
+    assert "with known_bodies:payload_and_wrist (known_bodies.py) by clarabel: torque error " in printed
     assert "second opinion, scs through cvxpy (optimal): the two agree" in printed
     report = (out / "report.txt").read_text()
     assert "with known_bodies:payload_and_wrist" in report
@@ -101,7 +109,8 @@ def test_the_documented_example(setting: Setting, tmp_path: Path, capsys: pytest
     assert [values[name] for name in ("lz2", "Lxz2", "Lyz2")] == pytest.approx([0.0, 0.0, 0.0], abs=1e-6)
     known = document["custom"]
     assert known["sha256"] == hashlib.sha256((tmp_path / "known_bodies.py").read_bytes()).hexdigest()
-    assert known["residual"] >= known["residual_without"]
+    assert known["relative_error_percent"] >= known["relative_error_percent_without"] > 0.0
+    assert "They were also held to what known_bodies:payload_and_wrist says" in (out / "report.html").read_text()
     assert document["feasibility"]["feasible"]
     assert document["feasibility"]["certificate"]["kind"] == "witness"
 
@@ -178,6 +187,11 @@ def test_knowledge_about_base_parameters_and_every_replicate(setting: Setting, t
     assert found.beta[-3] == pytest.approx(0.5, abs=1e-6)
     drawn = json.loads((tmp_path / "out" / "parameters.json").read_text())["bootstrap"]["standard_deviations"]
     assert drawn[-3] < 1e-6 < drawn[-2]
+    without = identify_files(
+        Request(arm=str(tmp_path / "arm.yaml"), recordings=(setting.path,), set_name="none"), tmp_path
+    )
+    assert without.estimate.custom is None
+    np.testing.assert_array_equal(without.estimate.beta, without.estimate.fit.beta)
     # What is not constrained does not know of it, and the description's hash does.
     np.testing.assert_allclose(found.fit.beta, setting.plain.fit.beta, rtol=0, atol=1e-6)
     assert found.model.config.sha256 != load_arm("planar2").sha256
@@ -215,10 +229,6 @@ def test_a_second_opinion_agrees(
 
 
 def test_a_second_opinion_sees_a_wrong_first_one(setting: Setting) -> None:
-    from dataclasses import replace
-
-    from ident_service.estimation.second_opinion import second_opinion
-
     plain = setting.plain
     right = constrained_least_squares(plain.fit, plain.base, plain.conditions)
     wrong = replace(right, beta=right.beta * 1.01, objective=float(np.linalg.norm(plain.fit.R1 @ (right.beta * 1.01))))
@@ -226,15 +236,16 @@ def test_a_second_opinion_sees_a_wrong_first_one(setting: Setting) -> None:
     assert not seen.agrees
     assert seen.torque_percent == pytest.approx(1.0, rel=0.1)
     assert seen.deviations > 1.0
+    document = {"base_parameters": {}, "second_opinion": convex_document(replace(plain, second=seen))["second_opinion"]}
+    file = ParameterFile(plain.base, plain.beta, "pseudo_inertia", document)
+    evidence = gather_evidence(plain, [open_recording(setting.path)], [], "0" * 64, [])
+    assert "A second solution of the constrained problem predicts other torques" in " ".join(
+        reservations(evidence, file)
+    )
+    assert "THE TWO DIFFER" in summary(replace(plain, second=seen))
 
 
 def test_the_wam_agrees_too(wam7: ArmModel) -> None:
-    from estimation.synthetic import random_information
-
-    from ident_service.estimation.least_squares import ordinary_least_squares
-    from ident_service.estimation.second_opinion import second_opinion
-    from ident_service.model.base import base_parameters
-
     base = base_parameters(wam7.chain, wam7.layout)
     assert wam7.prior is not None
     delta = wam7.prior.copy()
