@@ -34,7 +34,8 @@ from drivers.canopen.profile import bus_profiles
 from drivers.canopen.sdo import Objects
 from drivers.canopen.session_log import SessionLog, logged_links, require_format
 from drivers.canopen.setup import Setup, configure, identify, released
-from drivers.canopen.words import DISABLE_VOLTAGE, QUICK_STOP, DriveState, NmtCommand, joint_status
+from drivers.canopen.stopping import StopCommand
+from drivers.canopen.words import NmtCommand, joint_status
 from drivers.canopen.zero import zeros_of
 from drivers.canopen.zeroing import ZeroingArm
 from drivers.clock import Clock, RealClock, VirtualClock
@@ -46,11 +47,6 @@ from ident_service.errors import DriverError, PositionUnknown
 LIMIT_SLACK = 0.05  # rad or m beyond the joints' limits that the drives are told of
 # Between two looks at everybody's heartbeats and status reports: share of a status period, and cycles at most.
 _LOOK_SHARE, _MOST_UNLOOKED = 0.1, 10
-_QUICK_STOP = 1.0  # s that drives may take for a quick stop before the arm is left to them
-_ENDING = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP, DriveState.FAULT_REACTION)
-_FAREWELL = 5  # cycles after the last control words, in which drives say that they are off
-# A transmit queue that is full for a moment must not lose a stop; a drive's own deadline comes before the last try.
-_STOP_TRIES, _STOP_AGAIN = 75, 0.001  # s
 
 
 class CanopenArm(Arm):
@@ -98,8 +94,8 @@ class CanopenArm(Arm):
         self._reset_state()
 
     def _reset_state(self) -> None:
-        self._enabled = self._streaming = self._braking = False
-        self._untold: list[int] = []  # drives whose last stop command could not be sent
+        self._enabled = self._streaming = False
+        self._stop = StopCommand()
         self._stops = 0  # told so far
         self._counts = [0] * len(self._limits)
         self._acting = _frozen(np.zeros(len(self._limits)))
@@ -188,8 +184,7 @@ class CanopenArm(Arm):
         """
         buses = self._open()
         self._no_torque()
-        self._streaming, self._braking = True, False
-        self._untold = []
+        self._streaming, self._stop = True, StopCommand()
         try:
             reports = self._driver.status.inhibit, self._driver.status.period
             steps = Enabling(buses.drives, self._names, self._driver.bring_up, self.clock.now_ns(), reports)
@@ -227,10 +222,9 @@ class CanopenArm(Arm):
             wanted = np.minimum(np.maximum(wanted, -self._limits), self._limits)  # np.clip takes three times as long
             self._counts, _ = self._coordinates.torque_counts(wanted)
             self._acting = _frozen(self._coordinates.joint_torque(self._counts))
+        self._stop.repeat(buses)
         # Enabled, an exchange that only looks is no torque frame: drives that count them must notice.
-        if self._untold:
-            self._tell_stop(buses)
-        idle = None if self._enabled else self._idle_counts()
+        idle = self._stop.counts(self._counts) if self._streaming and not self._enabled else None
         stamp_ns = buses.cycle(idle if torque is None else self._counts)
         sample = self._sample(buses, stamp_ns)
         self._cycle += 1
@@ -239,46 +233,20 @@ class CanopenArm(Arm):
     def stop(self, kind: StopKind) -> None:
         """Tell every drive to let go, or to stop by itself; never raises. What was sent before acts until it does.
 
-        A drive that cannot be told is told again every millisecond for 75 ms, then by `close`.
+        A drive that cannot be told is told again for 75 ms, and then before each cycle.
         """
         self._enabled = False
-        self._braking = kind is StopKind.QUICK_STOP
         self._stops += 1
         self._no_torque()
         if self._buses is not None:
-            self._untold = list(range(len(self._limits)))
-            for _ in range(_STOP_TRIES):
-                self._tell_stop(self._buses)
-                if not self._untold:
-                    break
-                with suppress(Exception):
-                    self.clock.sleep_until_ns(self.clock.now_ns() + round(_STOP_AGAIN * 1e9))
-
-    def _tell_stop(self, buses: Buses) -> None:
-        """Send the control word of the last stop to the drives that have not been told; never raises."""
-        word = QUICK_STOP if self._braking else DISABLE_VOLTAGE
-        untold = []
-        for number in self._untold:
-            # One drive that cannot be told must not keep the others from it.
-            try:
-                buses.control(number, word)
-            except Exception:  # noqa: BLE001 - whatever the link died of, the other drives must be told
-                untold.append(number)
-        self._untold = untold
-
-    def _idle_counts(self) -> list[int] | None:
-        """Return what torque frames carry to drives that are not enabled by us; None for no such frames.
-
-        There are none before all drives have been told to brake: by zero torque an arm without brakes would fall.
-        """
-        return self._counts if self._streaming and not (self._braking and self._untold) else None
+            self._stop.give(self._buses, kind)
 
     def close(self) -> None:
         """Torque off, drives as they were powered up, buses free; any number of times.
 
         A quick stop is not cut short by it: drives that are told to let go in the midst of one would let the arm fall.
         """
-        if not self._braking:
+        if not self._stop.braking:
             self.stop(StopKind.TORQUE_OFF)
         if self._buses is not None:
             self._leave(self._buses)
@@ -292,27 +260,20 @@ class CanopenArm(Arm):
 
     def _leave(self, buses: Buses) -> None:
         """Let drives that are off forget that a host will be missed; the others shall miss it. Never raises."""
-        most = max(_FAREWELL, round(_QUICK_STOP * 1e9 / self._period_ns))
-        for cycle in range(1, most + 1):
-            self._tell_stop(buses)
-            with suppress(Exception):  # one cycle: the next one may be possible
-                buses.cycle(self._idle_counts())
-            brakes = self._braking and any(drive.state in _ENDING for drive in buses.drives)
-            if brakes and cycle % _FAREWELL == 0:
-                self._untold = list(range(len(buses.drives)))  # again: the first may have been lost
-            if cycle >= _FAREWELL and not brakes:
-                break
+        zero = self._counts if self._streaming else None
+        self._stop.see_through(buses, zero, self._period_ns)
         there: dict[int, Objects] = {}  # by bus
         for number, drive in enumerate(self._driver.drives[: self._begun]):
             with suppress(Exception):
                 objects = buses.objects(number)
                 # Between two conversations, so that the others do not miss their torque frames.
-                buses.cycle(self._counts if self._streaming else None)
+                buses.cycle(zero)
                 for _ in released(objects, self._zeros, number, buses.restarted(number)):
-                    buses.cycle(self._counts if self._streaming else None)
+                    buses.cycle(zero)
                 there[drive.bus] = objects
-        with suppress(Exception):
-            buses.command(NmtCommand.ENTER_PRE_OPERATIONAL)
+        for number in range(len(buses.drives)):
+            with suppress(Exception):
+                buses.command_drive(number, NmtCommand.ENTER_PRE_OPERATIONAL)
         for objects in there.values():
             with suppress(Exception):  # its answer comes behind all commands, which closing a link could cut off
                 objects.read(od.DEVICE_TYPE)
