@@ -12,7 +12,6 @@ told beforehand `setup.py`.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -27,7 +26,7 @@ from drivers.canopen.buses import Buses
 from drivers.canopen.codec import Drive, Emergency
 from drivers.canopen.coordinates import Coordinates, coordinates, unwrapped
 from drivers.canopen.enabling import Enabling, Resetting
-from drivers.canopen.events import SilentDrives, axis_events
+from drivers.canopen.events import MissedReports, axis_events
 from drivers.canopen.link import Link, open_links
 from drivers.canopen.lock import BusLock
 from drivers.canopen.looking import LookingArm
@@ -35,7 +34,8 @@ from drivers.canopen.profile import bus_profiles
 from drivers.canopen.sdo import Objects
 from drivers.canopen.session_log import SessionLog, logged_links, require_format
 from drivers.canopen.setup import Setup, configure, identify, released
-from drivers.canopen.words import DISABLE_VOLTAGE, QUICK_STOP, DriveState, NmtCommand, joint_status
+from drivers.canopen.stopping import StopCommand
+from drivers.canopen.words import NmtCommand, joint_status
 from drivers.canopen.zero import zeros_of
 from drivers.canopen.zeroing import ZeroingArm
 from drivers.clock import Clock, RealClock, VirtualClock
@@ -44,11 +44,9 @@ from ident_service.config.canopen import CanopenDriver
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError, PositionUnknown
 
-LIMIT_SLACK = 0.05  # rad or m beyond the joints' limits that the drives keep by themselves
-_HEARTBEAT_CHECK = 10  # cycles between two looks at everybody's heartbeat
-_QUICK_STOP = 1.0  # s that drives may take for a quick stop before the arm is left to them
-_ENDING = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP, DriveState.FAULT_REACTION)
-_FAREWELL = 5  # cycles after the last control words, in which drives say that they are off
+LIMIT_SLACK = 0.05  # rad or m beyond the joints' limits that the drives are told of
+# Between two looks at everybody's heartbeats and status reports: share of a status period, and cycles at most.
+_LOOK_SHARE, _MOST_UNLOOKED = 0.1, 10
 
 
 class CanopenArm(Arm):
@@ -69,6 +67,8 @@ class CanopenArm(Arm):
         self._config, self._driver, self._open_bus = config, config.driver, open_bus
         self._period_ns = round(1e9 / config.control.rate)
         self._profiles = bus_profiles(config.driver, config.control.rate)
+        cycles = int(_LOOK_SHARE * config.driver.status.period * config.control.rate)
+        self._look_every = min(max(1, cycles), _MOST_UNLOOKED)
         self._coordinates: Coordinates = coordinates(config.driver, config.transmission)
         self._zeros = zeros_of(config)
         self._limits = np.array([np.inf if j.torque is None else j.torque for j in config.joints.values()])
@@ -94,7 +94,8 @@ class CanopenArm(Arm):
         self._reset_state()
 
     def _reset_state(self) -> None:
-        self._enabled = self._streaming = self._braking = False
+        self._enabled = self._streaming = False
+        self._stop = StopCommand()
         self._stops = 0  # told so far
         self._counts = [0] * len(self._limits)
         self._acting = _frozen(np.zeros(len(self._limits)))
@@ -102,7 +103,7 @@ class CanopenArm(Arm):
         self._told: list[tuple[int | None, Emergency | None]] = []
         self._status: tuple[int, ...] = ()
         self._cycle = self._begun = 0  # drives whose configuration has begun, the first ones
-        self._silent = SilentDrives()
+        self._missed = MissedReports()
         self._identities: tuple[str, ...] = ()
 
     def look(self) -> Arm:
@@ -183,7 +184,7 @@ class CanopenArm(Arm):
         """
         buses = self._open()
         self._no_torque()
-        self._streaming, self._braking = True, False
+        self._streaming, self._stop = True, StopCommand()
         try:
             reports = self._driver.status.inhibit, self._driver.status.period
             steps = Enabling(buses.drives, self._names, self._driver.bring_up, self.clock.now_ns(), reports)
@@ -221,32 +222,31 @@ class CanopenArm(Arm):
             wanted = np.minimum(np.maximum(wanted, -self._limits), self._limits)  # np.clip takes three times as long
             self._counts, _ = self._coordinates.torque_counts(wanted)
             self._acting = _frozen(self._coordinates.joint_torque(self._counts))
+        self._stop.repeat(buses)
         # Enabled, an exchange that only looks is no torque frame: drives that count them must notice.
-        send = torque is not None or (self._streaming and not self._enabled)
-        stamp_ns = buses.cycle(self._counts if send else None)
+        idle = self._stop.counts(self._counts) if self._streaming and not self._enabled else None
+        stamp_ns = buses.cycle(idle if torque is None else self._counts)
         sample = self._sample(buses, stamp_ns)
         self._cycle += 1
         return sample
 
     def stop(self, kind: StopKind) -> None:
-        """Tell every drive to let go, or to stop by itself; never raises. What was sent before acts until it does."""
-        word = QUICK_STOP if kind is StopKind.QUICK_STOP else DISABLE_VOLTAGE
+        """Tell every drive to let go, or to stop by itself; never raises. What was sent before acts until it does.
+
+        A drive that cannot be told is told again for 75 ms, and then before each cycle.
+        """
         self._enabled = False
-        self._braking = kind is StopKind.QUICK_STOP
         self._stops += 1
         self._no_torque()
         if self._buses is not None:
-            for number in range(len(self._limits)):
-                # One drive that cannot be told must not keep the others from it.
-                with suppress(Exception):
-                    self._buses.control(number, word)
+            self._stop.give(self._buses, kind)
 
     def close(self) -> None:
         """Torque off, drives as they were powered up, buses free; any number of times.
 
         A quick stop is not cut short by it: drives that are told to let go in the midst of one would let the arm fall.
         """
-        if not self._braking:
+        if not self._stop.braking:
             self.stop(StopKind.TORQUE_OFF)
         if self._buses is not None:
             self._leave(self._buses)
@@ -260,26 +260,20 @@ class CanopenArm(Arm):
 
     def _leave(self, buses: Buses) -> None:
         """Let drives that are off forget that a host will be missed; the others shall miss it. Never raises."""
-        with suppress(Exception):
-            last = self.clock.now_ns() + round(_QUICK_STOP * 1e9)
-            for cycle in itertools.count(1):
-                buses.cycle(self._counts if self._streaming else None)
-                brakes = self._braking and any(drive.state in _ENDING for drive in buses.drives)
-                if brakes and cycle % _FAREWELL == 0:
-                    self.stop(StopKind.QUICK_STOP)  # again: the first may have been lost
-                if cycle >= _FAREWELL and not (brakes and self.clock.now_ns() < last):
-                    break
+        zero = self._counts if self._streaming else None
+        self._stop.see_through(buses, zero, self._period_ns)
         there: dict[int, Objects] = {}  # by bus
         for number, drive in enumerate(self._driver.drives[: self._begun]):
             with suppress(Exception):
                 objects = buses.objects(number)
                 # Between two conversations, so that the others do not miss their torque frames.
-                buses.cycle(self._counts if self._streaming else None)
+                buses.cycle(zero)
                 for _ in released(objects, self._zeros, number, buses.restarted(number)):
-                    buses.cycle(self._counts if self._streaming else None)
+                    buses.cycle(zero)
                 there[drive.bus] = objects
-        with suppress(Exception):
-            buses.command(NmtCommand.ENTER_PRE_OPERATIONAL)
+        for number in range(len(buses.drives)):
+            with suppress(Exception):
+                buses.command_drive(number, NmtCommand.ENTER_PRE_OPERATIONAL)
         for objects in there.values():
             with suppress(Exception):  # its answer comes behind all commands, which closing a link could cut off
                 objects.read(od.DEVICE_TYPE)
@@ -372,11 +366,11 @@ class CanopenArm(Arm):
         found: list[AxisEvent] = []
         for codec in buses.codecs:
             events = codec.take_events()
-            look = self._cycle % _HEARTBEAT_CHECK == 0
+            look = self._cycle % self._look_every == 0
             if events or look:
                 joints = {self._driver.drives[k].node: self._joints_of[k][0] for k in codec.profile.drives}
                 found += axis_events(events, codec, joints)
-                found += self._silent.new(codec, self.clock.now_ns(), joints) if look else []
+                found += self._missed.new(codec, self.clock.now_ns(), joints) if look else []
         return found
 
 

@@ -16,6 +16,7 @@ class EventCode(StrEnum):
 
     EMERGENCY = "emergency"
     EMERGENCY_RESET = "emergency_reset"
+    NOTICE = "notice"  # an emergency message by which a drive only informs
     BOOT_UP = "boot_up"
     NMT_STATE = "nmt_state"  # operational again
     LEFT = "left"  # not operational any more

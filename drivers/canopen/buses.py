@@ -82,9 +82,13 @@ class Buses:
 
     def command(self, command: NmtCommand) -> None:
         """An NMT command for our drives; others on the bus are none of our business."""
-        for codec, link in self._pairs:
-            for node in codec.profile.nodes:
-                link.send(codec.nmt(command, node))
+        for number in range(len(self.drives)):
+            self.command_drive(number, command)
+
+    def command_drive(self, number: int, command: NmtCommand) -> None:
+        """Send an NMT command to one drive."""
+        codec, link = self._at[number]
+        link.send(codec.nmt(command, self.drives[number].node))
 
     def control(self, number: int, word: int) -> None:
         """A control word for one drive."""

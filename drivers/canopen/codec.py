@@ -10,6 +10,7 @@ changes a torque. This runs in every cycle: `struct` and one look-up by identifi
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -42,6 +43,7 @@ from drivers.canopen.words import (
     state_of,
 )
 from drivers.status import AxisStatus
+from ident_service.config.canopen import BUS_EMERGENCIES
 from ident_service.errors import DriverError
 
 _POSITION, _STATUS, _CONTROL = struct.Struct("<i"), struct.Struct("<Hh"), struct.Struct("<Hb")
@@ -164,6 +166,8 @@ class BusCodec:
         self._missing = len(self.drives)  # answers that have not come in this cycle
         self._now_ns = 0
         self._events: list[Event] = []
+        self._status_cycles = math.ceil(profile.status_timeout * profile.rate)
+        self._notices = dict(zip(profile.nodes, profile.notices, strict=True))
         self._strangers: set[int] = set()
         self._foreign: set[int] = set()
         self._frames = [
@@ -241,6 +245,10 @@ class BusCodec:
         oldest = now_ns - round(self.profile.heartbeat_timeout * 1e9)
         return [drive.node for drive in self.drives if drive.nmt is None or drive.heartbeat_ns < oldest]
 
+    def stale(self) -> list[int]:
+        """Return the nodes whose status report has been missing for longer than its profile allows."""
+        return [drive.node for drive in self.drives if drive.status_age > self._status_cycles]
+
     def take_events(self) -> list[Event]:
         """What happened since the last time, oldest first."""
         if not self._events:
@@ -316,9 +324,19 @@ class BusCodec:
         if code == 0:
             drive.emergency = None
             self._tell(EventCode.EMERGENCY_RESET, drive.node, "error reset")
+        elif self._is_notice(drive.node, code, data):
+            self._tell(EventCode.NOTICE, drive.node, emergency_words(code, register, vendor))
         else:
             drive.emergency = Emergency(code, register, vendor)
             self._tell(EventCode.EMERGENCY, drive.node, emergency_words(code, register, vendor))
+
+    def _is_notice(self, node: int, code: int, data: bytes) -> bool:
+        """Return whether an emergency only informs: no bit of the error register, or a code that the drive's list has.
+
+        A torn one lacks its register and is none, and neither is one that tells of a lost host.
+        """
+        silent = len(data) == _EMERGENCY_BYTES and data[2] == 0
+        return code not in BUS_EMERGENCIES and (silent or code in self._notices[node])
 
     def _on_heartbeat(self, drive: Drive, frame: Frame) -> None:
         if len(frame.data) != 1:

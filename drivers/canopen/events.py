@@ -13,6 +13,7 @@ from drivers.status import AxisEvent, AxisEventCode
 
 _CODES: dict[EventCode, AxisEventCode] = {
     EventCode.EMERGENCY: AxisEventCode.EMERGENCY_MESSAGE,
+    EventCode.NOTICE: AxisEventCode.DRIVE_NOTICE,
     EventCode.BOOT_UP: AxisEventCode.DRIVE_RESTARTED,
     EventCode.LEFT: AxisEventCode.DRIVE_LEFT,
     EventCode.DEAF: AxisEventCode.TORQUE_IGNORED,
@@ -53,25 +54,27 @@ def axis_events(events: Iterable[Event], codec: BusCodec, joint_of: Mapping[int,
     return found
 
 
-class SilentDrives:
-    """Drives of all buses whose heartbeat is missing, each told once until it is heard again."""
+class MissedReports:
+    """Drives of all buses whose heartbeat or status report is missing, each told once until it is heard again."""
 
     def __init__(self) -> None:
-        self._told: set[tuple[int, int]] = set()
+        self._told: set[tuple[int, int, AxisEventCode]] = set()
 
     def new(self, codec: BusCodec, now_ns: int, joint_of: Mapping[int, int]) -> list[AxisEvent]:
-        """Those of one bus that have fallen silent since this was asked last.
+        """Return what has been missing on one bus since this was asked last.
 
         Args:
             codec: of the bus.
             now_ns: of the links' clock [ns].
             joint_of: first joint that each node moves.
         """
-        bus, timeout = codec.profile.number, codec.profile.heartbeat_timeout
-        silent = {(bus, node) for node in codec.silent(now_ns)}
-        new = sorted(silent - self._told)
-        self._told = {place for place in self._told if place[0] != bus} | silent
-        return [
-            AxisEvent(AxisEventCode.DRIVE_SILENT, joint_of[node], f"node {node}: no heartbeat for {timeout:g} s")
-            for _, node in new
-        ]
+        bus, profile = codec.profile.number, codec.profile
+        missing = {(bus, node, AxisEventCode.DRIVE_SILENT) for node in codec.silent(now_ns)}
+        missing |= {(bus, node, AxisEventCode.STATUS_STALE) for node in codec.stale()}
+        new = sorted(missing - self._told)
+        self._told = {place for place in self._told if place[0] != bus} | missing
+        words = {
+            AxisEventCode.DRIVE_SILENT: f"no heartbeat for {profile.heartbeat_timeout:g} s",
+            AxisEventCode.STATUS_STALE: f"no status report for {profile.status_timeout:g} s",
+        }
+        return [AxisEvent(code, joint_of[node], f"node {node}: {words[code]}") for _, node, code in new]

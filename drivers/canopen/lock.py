@@ -1,20 +1,24 @@
-"""One driver a bus: an advisory lock on a file that is named after the interface and its channel.
+"""One driver a bus: a socket address that only one process can have, named after the bus.
 
-The lock vanishes with the process that holds it, however it ends. It keeps a second driver of this machine away, also
-one with another description of the arm; another machine on the same bus shows by its frames (`SECOND_HOST`).
+The address is abstract (unix(7)): it has no file, so no folder and no permissions, and processes of all users meet at
+it, under systemd too. It belongs to the network namespace, as the names of CAN interfaces do. It vanishes with the
+process that holds it, however that ends. It keeps a second driver of this machine away, also one with another
+description of the arm; another machine on the same bus shows by its frames (`SECOND_HOST`). Decision 0048.
 """
 
 from __future__ import annotations
 
-import fcntl
-import os
-import re
-import tempfile
+import errno
+import hashlib
+import socket
+import struct
 from contextlib import suppress
-from pathlib import Path
 
 from ident_service.config.canopen import CanBus
 from ident_service.errors import DriverError
+
+_CREDENTIALS = struct.Struct("3i")  # struct ucred: pid, uid, gid
+_LONGEST = 64  # of a name that stands in the address as it is, of the 107 bytes that an address has
 
 
 class BusLock:
@@ -26,30 +30,36 @@ class BusLock:
         Raises:
             DriverError: another process has it, or no lock can be made.
         """
-        name = re.sub(r"[^A-Za-z0-9]+", "-", f"{bus.interface}-{bus.channel}").strip("-")
-        runtime = os.environ.get("XDG_RUNTIME_DIR")
-        folder = Path(runtime if runtime and Path(runtime).is_dir() else tempfile.gettempdir())
-        path = folder / f"ident-can-{name}.lock"
+        address = _address(bus)
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
-            # Anybody may hold it, whoever made it.
-            mask = os.umask(0)
-            try:
-                self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
-            finally:
-                os.umask(mask)
+            self._socket.bind(address)
+            self._socket.listen()  # so that others can ask the kernel who holds it
         except OSError as error:
-            raise DriverError(f"the bus {bus.channel} cannot be locked: {path}: {error.strerror}") from None
-        try:
-            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            owner = os.pread(self._fd, 20, 0).decode("ascii", "replace").strip() or "unknown"
-            os.close(self._fd)
-            raise DriverError(f"the bus {bus.channel} is in use by process {owner}") from None
-        os.ftruncate(self._fd, 0)
-        os.pwrite(self._fd, str(os.getpid()).encode(), 0)
+            self._socket.close()
+            if error.errno != errno.EADDRINUSE:
+                raise DriverError(f"the bus {bus.channel} cannot be locked: {error.strerror}") from None
+            raise DriverError(f"the bus {bus.channel} is in use by process {_owner(address)}") from None
 
     def close(self) -> None:
         """Give the bus back; any number of times."""
-        with suppress(OSError):
-            os.close(self._fd)
-        self._fd = -1
+        self._socket.close()
+
+
+def _address(bus: CanBus) -> bytes:
+    medium = bus.medium
+    if medium == "kernel":
+        with suppress(OSError):  # an interface has several names (`ip link property add`), and one index
+            return f"\0ident-can-kernel-{socket.if_nametoindex(bus.channel)}".encode()
+    name = f"{medium}-{bus.channel}".encode()
+    return b"\0ident-can-" + (name if len(name) <= _LONGEST else hashlib.sha256(name).hexdigest().encode())
+
+
+def _owner(address: bytes) -> str:
+    """The number of the process that holds an address; `unknown` where the kernel does not tell."""
+    with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
+        asking.setblocking(False)
+        asking.connect(address)
+        pid = _CREDENTIALS.unpack(asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))[0]
+        return str(pid) if pid > 0 else "unknown"  # 0: of a container that we do not see into
+    return "unknown"

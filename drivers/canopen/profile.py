@@ -39,6 +39,7 @@ _EVERY_SYNC, _ON_RECEPTION, _ON_CHANGE = 1, 255, 255
 _STATUS_SLOTS = (od.STATUS_WORD, od.TORQUE_ACTUAL)
 _UNUSED = (3, 4)  # some drives command their axis by these out of the box
 _MOST_16 = 0xFFFF
+_STATUS_PATIENCE = 2.5  # periods without a status report: one was lost, and the next one is late as well
 
 # One emergency a second and drive (1015h): a drive with a storm of errors must not take the bus from the others.
 EMERGENCY_INHIBIT = 1.0
@@ -137,6 +138,7 @@ class BusProfile:
         host: node number of the host.
         drives: which of the arm's drives are on it, in the arm's order.
         nodes: the same drives as node numbers.
+        notices: of each of them, emergency codes by which it only informs.
         torque_frames: what carries their torques.
         heartbeat_host: period of the host's heartbeat [s].
         heartbeat_drives: period of each drive's [s].
@@ -152,6 +154,7 @@ class BusProfile:
     host: int
     drives: tuple[int, ...]
     nodes: tuple[int, ...]
+    notices: tuple[frozenset[int], ...]
     torque_frames: tuple[TorqueFrame, ...]
     heartbeat_host: float
     heartbeat_drives: float
@@ -164,6 +167,11 @@ class BusProfile:
     def fd(self) -> bool:
         """Whether frames are those of CAN FD."""
         return self.bus.data_bitrate is not None
+
+    @property
+    def status_timeout(self) -> float:
+        """Return how long a drive's status report is waited for [s]: one may be lost, and the next be delayed."""
+        return _STATUS_PATIENCE * max(self.status_period, self.status_inhibit)
 
     @cached_property
     def position_ids(self) -> dict[int, int]:
@@ -240,6 +248,7 @@ def _profile(driver: CanopenDriver, rate: float, number: int, bus: CanBus) -> Bu
         driver.heartbeats.node,
         tuple(drives),
         _nodes(driver.drives, drives),
+        tuple(frozenset(driver.drives[k].notices) for k in drives),
         tuple(_torque_frame(driver.drives, frame) for frame in together),
         driver.heartbeats.period,
         driver.heartbeats.drives,

@@ -1,7 +1,7 @@
 """What every drive is told before anything moves: who it must be, what it protects by itself, which frames it speaks.
 
 Everything that protects is written and read back (FIELDBUS.md 2.5). Entries that a drive may lack are left out where
-it does: SYNC's period and window, the interpolation period, PDOs that are only switched off.
+it does: position limits, SYNC's period and window, the interpolation period, PDOs that are only switched off.
 """
 
 from __future__ import annotations
@@ -13,9 +13,8 @@ from drivers.canopen import dictionary as od
 from drivers.canopen.coordinates import torque_limit_counts
 from drivers.canopen.profile import BusProfile, Write
 from drivers.canopen.sdo import DOES_NOT_EXIST, READ_ONLY, Objects, SdoRefused
-from drivers.canopen.words import axis_status
+from drivers.canopen.words import POWER_OFF, state_of
 from drivers.canopen.zero import Zeros
-from drivers.status import AxisStatus
 from ident_service.config.canopen import CanopenDrive, DriveIdentity, Reactions
 from ident_service.errors import AnotherDrive, DriverError
 
@@ -32,7 +31,7 @@ class Setup:
         drive: its section.
         profile: of its bus.
         reactions: to what it finds by itself.
-        limits: lowest and highest position that the drive itself does not pass [counts]; None where joints have none.
+        limits: lowest and highest position [counts], for a drive that heeds them; None where joints have none.
     """
 
     drive: CanopenDrive
@@ -43,16 +42,19 @@ class Setup:
     def protections(self) -> list[Write]:
         """What the drive keeps to by itself."""
         drive = self.drive
-        todo = [
+        return [
             Write(od.MAX_TORQUE, torque_limit_counts(drive.max_torque, drive.rated_torque)),
             Write(od.MAX_SPEED, round(drive.max_speed)),
             Write(od.QUICK_STOP_OPTION, self.reactions.quick_stop),
             Write(od.FAULT_OPTION, self.reactions.fault),
             Write(od.ABORT_CONNECTION, self.reactions.abort_connection),
         ]
-        if self.limits is not None:
-            todo += [Write(od.LOWER_LIMIT, self.limits[0]), Write(od.UPPER_LIMIT, self.limits[1])]
-        return todo
+
+    def positions(self) -> list[Write]:
+        """Return the position limits: no protection, since drives in torque mode give torque beyond them."""
+        if self.limits is None:
+            return []
+        return [Write(od.LOWER_LIMIT, self.limits[0]), Write(od.UPPER_LIMIT, self.limits[1])]
 
     def timing(self) -> list[Write]:
         """The cycle, for drives that want to know it."""
@@ -112,7 +114,7 @@ def configure(objects: Objects, setup: Setup) -> None:
     _rated_torque(objects, setup.drive)
     for write in setup.protections():
         objects.set(write)
-    for write in setup.timing():
+    for write in (*setup.positions(), *setup.timing()):
         _if_there(objects, write)
     if not objects.read(od.SUPPORTED_MODES) & od.CST_SUPPORTED:
         raise DriverError(f"node {objects.node}: does not support cyclic synchronous torque mode (6502h, bit 9)")
@@ -149,7 +151,7 @@ def released(objects: Objects, zeros: Zeros | None, number: int, restarted: Call
         DriverError: it does not answer, or refuses.
     """
     # Asked for: a status report may be held back by its inhibit time.
-    if axis_status(objects.read(od.STATUS_WORD)) & AxisStatus.POWERED:
+    if state_of(objects.read(od.STATUS_WORD)) not in POWER_OFF:
         return
     counts = None
     if zeros is not None:

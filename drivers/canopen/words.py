@@ -48,6 +48,12 @@ class DriveState(Enum):
         return self.name.lower().replace("_", " ")
 
 
+# States in which the power stage is off for certain (CiA 402-2, 6.2). A quick stop may end in `quick stop active`
+# (605Ah, 5 to 8), in which the drive holds the motor with power.
+POWER_OFF = frozenset(
+    {DriveState.NOT_READY, DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON, DriveState.FAULT}
+)
+
 # Bits of the status word beside the state.
 WARNING, REMOTE, INTERNAL_LIMIT, FOLLOWS = 1 << 7, 1 << 9, 1 << 11, 1 << 12
 

@@ -28,8 +28,12 @@ from ident_service.config.simulation import SimulatedFault
 NodeId = Annotated[int, Field(strict=True, ge=1, le=127)]
 Seconds = Annotated[float, Field(strict=True, ge=0.001, le=60.0)]  # whole ms of 16 bits in the drive
 InhibitTime = Annotated[float, Field(strict=True, ge=0.0001, le=6.5)]  # 100 us of 16 bits
+_KERNELS = ("raw", "socketcan")  # two ways to the same interfaces
 _LEAST_DEADLINE = 2.0  # cycles: one frame may be late
 _MOST_PER_MILLE = 32_767  # of a torque of 16 bits
+EmergencyCode = Annotated[int, Field(strict=True, ge=1, le=0xFFFF)]
+# CiA 301, table 26: CAN controller in error passive; no heartbeat, or no torque frame, of the host.
+BUS_EMERGENCIES = frozenset({0x8120, 0x8130, 0x8250})
 Unsigned32 = Annotated[int, Field(strict=True, ge=0, le=0xFFFF_FFFF)]
 
 
@@ -45,6 +49,11 @@ class CanBus(Section):
     bitrate: Annotated[Count, Field(le=1_000_000)] = 1_000_000
     data_bitrate: Count | None = None
     options: dict[str, str | int | float | bool] = Field(default_factory=dict)
+
+    @property
+    def medium(self) -> str:
+        """Return what `channel` is a name of: `kernel` for CAN interfaces of the kernel, else the interface."""
+        return "kernel" if self.interface in _KERNELS else self.interface
 
     @model_validator(mode="after")
     def _data_not_slower(self) -> CanBus:
@@ -68,7 +77,8 @@ class CanopenDrive(Section):
     `counts` are those of a motor turn (6064h); `rated_torque` [N m] at the motor is what 6076h is set to, or must be
     where the drive does not let it be set; a torque is sent in thousandths of it. `torque_scale` is how much torque
     the motor really gives for one that was asked for. `max_torque` [N m] and `max_speed` [turns per minute] of the
-    motor are set as 6072h and 6080h.
+    motor are set as 6072h and 6080h. `notices` are the emergency codes by which this drive, as its manual says, only
+    informs: they are told and recorded, and stop nothing.
     """
 
     node: NodeId
@@ -79,6 +89,13 @@ class CanopenDrive(Section):
     torque_scale: Positive = 1.0
     max_torque: Positive
     max_speed: Positive
+    notices: tuple[EmergencyCode, ...] = ()
+
+    @model_validator(mode="after")
+    def _notices_are_none_of_the_bus(self) -> CanopenDrive:
+        if bad := [f"{code:04X}h" for code in self.notices if code in BUS_EMERGENCIES]:
+            raise ValueError(f"notices: {', '.join(bad)} tells that the drive does not hear its host; it always counts")
+        return self
 
     @model_validator(mode="after")
     def _fits_the_objects(self) -> CanopenDrive:
@@ -179,9 +196,10 @@ class CanopenDriver(Section):
                 raise ValueError(f"node {node} is a drive and the host (heartbeats.node); give the host another number")
             if places.count((bus, node)) > 1:
                 raise ValueError(f"node {node} stands twice on bus {bus}")
-        wires = [(bus.interface, bus.channel) for bus in self.buses if bus.interface != "lock_step"]
-        if twice := next((wire for wire in wires if wires.count(wire) > 1), None):
-            raise ValueError(f"two buses are {twice[0]} {twice[1]}; give each its own channel")
+        named = [bus for bus in self.buses if bus.interface != "lock_step"]
+        wires = [(bus.medium, bus.channel) for bus in named]
+        if twice := next((bus for bus, wire in zip(named, wires, strict=True) if wires.count(wire) > 1), None):
+            raise ValueError(f"two buses are {twice.interface} {twice.channel}; give each its own channel")
         used = {bus for bus, _ in places}
         for bus in range(len(self.buses)):
             if bus not in used:

@@ -25,6 +25,7 @@ from ident_service.estimation.feasible.feasibility import (
 from ident_service.estimation.feasible.feasible_set import FeasibleSet, SetName, feasible_set
 from ident_service.estimation.feasible.priors import Prior, choose_weight
 from ident_service.estimation.fit import Fit, Prepared, prepare, unconstrained
+from ident_service.estimation.friction_fit import at_the_edge
 from ident_service.estimation.least_squares import (
     LeastSquares,
     TorqueError,
@@ -110,6 +111,7 @@ class Estimate:
         covariance: of the unconstrained estimate, from blocks of scores, shape (base, base).
         standard_deviations: its diagonal's square root, shape (base,).
         white_standard_deviations: the paper's (eq. 81), shape (base,).
+        degrees: degrees of freedom of the standard deviations, shape (base,).
         verdicts: one per base parameter.
         fit: the unconstrained least squares.
         samples: smoothed samples used.
@@ -119,6 +121,7 @@ class Estimate:
         recordings: name and hash of what it was fitted to.
         candidates: the estimates of table 8, this one's among them.
         chosen: index of this estimate among the candidates.
+        remarks: what a person should know of how it was found, in words.
         custom: further knowledge in the estimate, where the description names some and it is constrained; neither
             `margin` nor a certificate is about it.
         second: another solution of the constrained problem, where it was asked for.
@@ -136,6 +139,7 @@ class Estimate:
     covariance: Array
     standard_deviations: Array
     white_standard_deviations: Array
+    degrees: Array
     verdicts: tuple[Verdict, ...]
     fit: LeastSquares
     samples: int
@@ -145,6 +149,7 @@ class Estimate:
     recordings: tuple[tuple[str, str], ...]
     candidates: tuple[Candidate, ...]
     chosen: int
+    remarks: tuple[str, ...] = ()
     custom: CustomKnowledge | None = None
     second: SecondOpinion | None = None
 
@@ -256,7 +261,8 @@ def identify(
         covariance=found.covariance,
         standard_deviations=deviations,
         white_standard_deviations=found.fit.standard_deviations,
-        verdicts=verdicts(beta, deviations, base.units),
+        degrees=found.degrees,
+        verdicts=verdicts(beta, deviations, base.units, found.degrees),
         fit=found.fit,
         samples=prepared.equations.samples,
         prepared=prepared,
@@ -265,9 +271,17 @@ def identify(
         recordings=tuple((recording.path.name, recording.sha256) for recording in recordings),
         candidates=tuple(candidates),
         chosen=chosen,
+        remarks=(*found.remarks, *_remarks_on_friction(model, prepared.model)),
         custom=None if free else knowledge,
         second=second,
     )
+
+
+def _remarks_on_friction(described: ArmModel, fitted: ArmModel) -> tuple[str, ...]:
+    wanted, shape = described.config.identification.friction, fitted.config.identification.friction
+    asked = {key: getattr(shape, key) for key in type(shape).model_fields if getattr(wanted, key) == "fit"}
+    given = {key: 0.0 if key == "presliding" else 0.1 for key in type(shape).model_fields}
+    return at_the_edge(type(shape)(**(given | asked)), fitted.chain.names, fitted.layout.terms)
 
 
 def _check(method: str, recordings: Sequence[Recording], validation: Sequence[Recording]) -> None:

@@ -47,6 +47,9 @@ class ControlFile:
 
     def __init__(self, fd: int, memory: mmap.mmap, now_ns: Callable[[], int]) -> None:
         self._fd, self._memory, self._now_ns = fd, memory, now_ns
+        # Words of 64 bits, each read and written whole: `struct` with a byte order goes byte by byte.
+        self._view = memoryview(memory)
+        self._words = self._view.cast("q")
 
     @classmethod
     def take(
@@ -85,7 +88,7 @@ class ControlFile:
         memory[:_STOPPED] = _MAGIC + struct.pack("<IIBB6xqq", _VERSION, os.getpid(), 0, 0, now_ns(), length)
         taken = cls(fd, memory, now_ns)
         # Read last: a stop either finds these controls in place, or has left its time behind before.
-        stopped = struct.unpack_from("<q", memory, _STOPPED)[0]
+        stopped = taken._words[_STOPPED // 8]
         # One that seems yet to come is from before the machine was started.
         if asked_ns is not None and asked_ns <= stopped <= now_ns():
             taken.ask_stop()
@@ -177,15 +180,17 @@ class ControlFile:
 
     def renew(self) -> None:
         """Say that whoever asked for motion is still there."""
-        struct.pack_into("<q", self._memory, _RENEWED, self._now_ns())
+        self._words[_RENEWED // 8] = self._now_ns()
 
     def lease_ok(self, now_ns: int) -> bool:
         """Whether the lease has been renewed in time; the loop's own clock is not asked."""
-        renewed, length = struct.unpack_from("<qq", self._memory, _RENEWED)
-        return bool(length == 0 or self._now_ns() - renewed <= length)
+        renewed, length = self._words[_RENEWED // 8], self._words[_LENGTH // 8]
+        return length == 0 or self._now_ns() - renewed <= length
 
     def close(self) -> None:
         """Give the lock back."""
+        self._words.release()
+        self._view.release()
         self._memory.close()
         os.close(self._fd)
 

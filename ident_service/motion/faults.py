@@ -70,12 +70,14 @@ class Rule:
         means: what may be the cause, the end of the sentence that a person reads.
         often: of a warning, in how many of the last 100 cycles it is still only a warning.
         becomes: the fault that one more makes of it.
+        each: whether every message of a warning is told, not only the first of its code.
     """
 
     reaction: Reaction
     means: str
     often: int = 20
     becomes: str = "repeated_warnings"
+    each: bool = False
 
     @property
     def severity(self) -> Severity:
@@ -94,6 +96,7 @@ FAULTS: dict[str, Rule] = {
     "torque_saturated": Rule(_WARN, "the motion asks for more than the arm may give; the torque was limited"),
     "torque_rate": Rule(_WARN, "the torque jumped, from noise or a gain that is too high; its change was limited"),
     "torque_not_applied": Rule(_WARN, "a drive limits, delays or ignores what it is told"),
+    "drive_notice": Rule(_WARN, "the drive informs of it, and goes on; its manual says more about the code", each=True),
     "drive_warning": Rule(_WARN, "temperature, voltage or current near its limit; see the drive's manual"),
     "torque_limited": Rule(_WARN, "the drive itself gives less torque than it was asked for"),
     "strange_frame": Rule(_WARN, "a bus that is too full, a wrong node number, or another device on it"),
@@ -110,6 +113,7 @@ FAULTS: dict[str, Rule] = {
     "lease_lost": Rule(_STOP, "whoever asked for motion has gone silent"),
     "controls_failed": Rule(_STOP, "nobody could stop the arm any more"),
     "no_way_back": Rule(_STOP, "the pause cannot be ended by going on"),
+    "status_stale": Rule(_STOP, "nobody would hear of it if the drive let go; its report is lost, or the bus too full"),
     "bus_degraded": Rule(_STOP, "a bad cable, connector or termination, or a wrong bit rate"),
     "recorder_behind": Rule(_STOP, "a motion that is not recorded is worth nothing"),
     # It can be measured, but does not do what it is told.

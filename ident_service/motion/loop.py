@@ -22,7 +22,7 @@ from ident_service.motion.control import ComputedTorque
 from ident_service.motion.controls import Controls
 from ident_service.motion.course import Course
 from ident_service.motion.deadlines import Deadlines
-from ident_service.motion.faults import LOWER, LOWER_AFTER, SETTLE, Fault, Reaction, Severity
+from ident_service.motion.faults import FAULTS, LOWER, LOWER_AFTER, SETTLE, Fault, Reaction, Severity
 from ident_service.motion.guard import Guard
 from ident_service.motion.latch import Latch
 from ident_service.motion.reference import Setpoint, rest
@@ -146,7 +146,7 @@ class Loop:
             ArmFault: torque must end now.
         """
         if fault.reaction is Reaction.WARN:
-            if fault.code not in self._told:  # the report counts the others
+            if fault.code not in self._told or FAULTS[fault.code].each:  # the report counts the others
                 self._told.add(fault.code)
                 self.tell(fault.severity, stamp_ns, f"{fault.code}: {fault.message}")
             return

@@ -164,6 +164,7 @@ def parameters_document(estimate: Estimate, described: ArmConfig | None = None) 
             "unconstrained_values": estimate.fit.beta.tolist(),
             "standard_deviations": _perhaps(estimate.standard_deviations),
             "white_standard_deviations": _perhaps(estimate.white_standard_deviations),
+            "degrees_of_freedom": [round(value, 3) for value in estimate.degrees.tolist()],
             "covariance": [_perhaps(row) for row in estimate.covariance],
             "verdicts": list(estimate.verdicts),
         },

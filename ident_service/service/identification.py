@@ -132,6 +132,7 @@ def identify_files(request: Request, folder: Path, tell: Callable[[str], None] =
             for reason in reasons_in_recording(recording.path.name, seen.joints, model):
                 raise RecordingError(recording.path, reason) from error
         raise
+    warnings += estimate.remarks
     unusable = unusable_because(estimate, found)
     more: dict[str, Any] = {"recording_quality": [_quality_document(recording, seen) for recording, seen in found]}
     if request.replicates:

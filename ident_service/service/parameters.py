@@ -98,7 +98,14 @@ def correct_file(
     for stale in ("fit", "information", "validation", "custom", "second_opinion"):
         content.pop(stale, None)
     table = content["base_parameters"]
-    for stale in ("unconstrained_values", "standard_deviations", "white_standard_deviations", "covariance", "verdicts"):
+    for stale in (
+        "unconstrained_values",
+        "standard_deviations",
+        "white_standard_deviations",
+        "degrees_of_freedom",
+        "covariance",
+        "verdicts",
+    ):
         table.pop(stale, None)
     table["values"] = result.beta.tolist()
     content["method"] = "correction"

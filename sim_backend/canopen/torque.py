@@ -1,8 +1,9 @@
 """The torque loop of an emulated drive in cyclic synchronous torque mode (CiA 402-2, 14): demand, limits, what is told.
 
-Demand is target plus offset, in whole thousandths of the rated torque, cut off at 6072h and 6073h. At a software
-position limit (607Dh) no torque acts that leads further out, above the speed limit (6080h) none that leads faster; the
-target is ignored then, and the statusword says so (bit 12). Current is told as torque, since the motor is linear.
+Demand is target plus offset, in whole thousandths of the rated torque, cut off at 6072h and 6073h. Above the speed
+limit (6080h) no torque acts that leads faster; the target is ignored then, and the statusword says so (bit 12).
+Software position limits (607Dh) are of the position modes: torque acts beyond them. Current is told as torque, since
+the motor is linear.
 
 Boundary: one evaluation; when there is one is `drive.py`.
 """
@@ -49,15 +50,11 @@ class TorqueLoop:
         demand = min(max(asked, -reach), reach)
         self.follows = cyclic
         self.limited = demand != asked
-        if demand and self._leads_out(demand, now_ns):
+        if demand and self._leads_faster(demand, now_ns):
             demand, self.limited, self.follows = 0, True, False
         values[0x607400] = values[0x607700] = values[0x607800] = demand
         self._motor.drive(demand * number(0x6076) * 1e-6, now_ns)
 
-    def _leads_out(self, demand: int, now_ns: int) -> bool:
-        number = self._objects.number
-        position = number(0x6064)
-        if position >= number(0x607D, 2) if demand > 0 else position <= number(0x607D, 1):
-            return True
+    def _leads_faster(self, demand: int, now_ns: int) -> bool:
         speed = self._motor.speed(now_ns)
-        return speed * demand > 0.0 and abs(speed) * _RPM > number(0x6080)
+        return speed * demand > 0.0 and abs(speed) * _RPM > self._objects.number(0x6080)

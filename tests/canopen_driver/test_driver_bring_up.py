@@ -159,7 +159,6 @@ def test_drives_that_do_not_answer_are_named(silent: tuple[int, ...]) -> None:
         (0x605A, 0, "605Ah"),
         (0x605E, 0, "605Eh"),
         (0x6007, 0, "6007h"),
-        (0x607D, 1, "607Dh"),
         (0x1400, 5, "would not stop by itself"),
         (0x1016, 1, "would not stop by itself"),
     ],

@@ -8,6 +8,11 @@ from helpers.emulated_arms import tapped, weightless_config
 
 from drivers.arm import StopKind
 from drivers.canopen.arm import CanopenArm
+from drivers.canopen.bus_errors import BusError
+from drivers.canopen.frame import Frame
+from ident_service.errors import DriverError
+from sim_backend.canopen.drive import CanopenDrive
+from sim_backend.canopen.power import PowerState
 from sim_backend.machine import Truth
 from sim_backend.pucks.lock_step import LockStepArm
 
@@ -67,3 +72,77 @@ def test_an_arm_that_was_stopped_and_closed_is_enabled_again(kind: StopKind) -> 
             arm.enable()
             np.testing.assert_array_equal(arm.exchange(np.zeros(2)).torque, 0.0)
             arm.stop(kind)
+
+
+@pytest.mark.parametrize("full", [0.005, 0.14])
+@pytest.mark.parametrize("kind", list(StopKind))
+def test_a_transmit_queue_that_is_full_for_a_moment_loses_no_stop(kind: StopKind, full: float) -> None:
+    """For 5 ms, within the tries of a stop, and for longer than these, so that closing goes on with them."""
+    config = weightless_config(torque_deadline=1.0)  # the drives' own watchdog does not help
+    behind = LockStepArm(config)
+    taps = tapped(behind, config)
+    tap, sent = taps[0], list[Frame]()
+    with CanopenArm(config, lambda _: taps) as arm:
+        arm.enable()
+        arm.exchange(PUSH)
+        send, free_ns = tap.send, arm.clock.now_ns() + round(full * 1e9)
+
+        def crowded(frame: Frame) -> None:
+            if tap.clock.now_ns() < free_ns:
+                raise BusError("full", "bench")
+            sent.append(frame)
+            send(frame)
+
+        tap.send = crowded  # type: ignore[method-assign]
+        with pytest.raises(DriverError, match="queue is full"):
+            arm.exchange(PUSH)
+        arm.stop(kind)
+    word = bytes([0x02 if kind is StopKind.QUICK_STOP else 0x00, 0, 10])
+    told = [sent.index(Frame(0x300 + node, word)) for node in (1, 2)]
+    torques = [number for number, frame in enumerate(sent) if frame.identifier == 0x201]
+    assert max(told) < min(torques)  # zero torque alone lets an arm without brakes fall
+    assert all(sent[number].data == bytes(4) for number in torques)
+    assert not [state for state in behind.emulator.states if "enabled" in state]
+
+
+def test_a_bus_that_never_recovers_does_not_keep_the_other_from_its_stop() -> None:
+    config = weightless_config(
+        buses=[{"interface": "lock_step", "channel": channel} for channel in ("one", "two")],
+        drives=[
+            {"node": 1, "bus": bus, "counts": 65536, "rated_torque": 1.0, "max_speed": 6000.0, "max_torque": 5.0}
+            for bus in (0, 1)
+        ],
+    )
+    behind = LockStepArm(config)
+    taps = tapped(behind, config)
+    with CanopenArm(config, lambda _: taps) as arm:
+        arm.enable()
+        arm.exchange(PUSH)
+
+        def gone(frame: Frame) -> None:
+            raise BusError("gone", "one")
+
+        taps[0].send = gone  # type: ignore[method-assign]
+        begun = arm.clock.now_ns()
+        arm.stop(StopKind.QUICK_STOP)
+        assert Frame(0x301, bytes([0x02, 0, 10])) in taps[1].sent
+        assert 0.05e9 <= arm.clock.now_ns() - begun <= 0.1e9
+
+
+def test_drives_that_stay_in_quick_stop_keep_their_watchdogs() -> None:
+    """605Ah = 6: powered after the host has gone, so that nobody may have told them to miss nobody."""
+    config = weightless_config(reactions={"quick_stop": 6})
+    behind = LockStepArm(config)
+    with CanopenArm(config, lambda _: [behind.link(0)]) as arm:
+        arm.enable()
+        arm.exchange(PUSH)
+        arm.stop(StopKind.QUICK_STOP)
+    for face in behind.emulator.faces:
+        assert isinstance(face, CanopenDrive)
+        assert face.power.state is PowerState.QUICK_STOP_ACTIVE
+        assert face.objects.number(0x6007) == 3
+        assert face.objects.number(0x1016, 1) != 0
+    with CanopenArm(config, lambda _: [behind.link(0)]) as arm:  # and they can be had again
+        arm.enable()
+        arm.stop(StopKind.TORQUE_OFF)
+    assert [face.objects.number(0x6007) for face in behind.emulator.faces if isinstance(face, CanopenDrive)] == [0, 0]

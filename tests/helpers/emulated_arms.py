@@ -22,6 +22,7 @@ class Tapped:
     Attributes:
         sent: by the host.
         loses: which frames get lost.
+        misses: which frames of the drives the host does not hear.
     """
 
     def __init__(self, link: LockStepLink) -> None:
@@ -30,6 +31,7 @@ class Tapped:
         self._in_cycle: list[Frame] = []
         self.sent: list[Frame] = []
         self.loses: Callable[[Frame], bool] = lambda frame: False
+        self.misses: Callable[[Frame], bool] = lambda frame: False
 
     @property
     def clock(self) -> Clock:
@@ -54,11 +56,15 @@ class Tapped:
             self._link.send(frame)
 
     def receive(self, deadline_ns: int) -> Frame | None:
-        return self._foreign.pop(0) if self._foreign else self._link.receive(deadline_ns)
+        if self._foreign:
+            return self._foreign.pop(0)
+        while (frame := self._link.receive(deadline_ns)) is not None and self.misses(frame):
+            pass
+        return frame
 
     def drain(self) -> Sequence[Frame]:
         heard, self._foreign = self._foreign, []
-        return [*heard, *self._link.drain()]
+        return [*heard, *(frame for frame in self._link.drain() if not self.misses(frame))]
 
     def close(self) -> None:
         self._link.close()

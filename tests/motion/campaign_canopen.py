@@ -35,10 +35,12 @@ FOREIGN: dict[str, Frame] = {
     "foreign_nmt": Frame(0x000, bytes([0x01, 0x01])),
     "foreign_heartbeat": Frame(0x77F, b"\x05"),
 }
-WIRE = ("lost_torques", *FOREIGN)
+NOTICE = Frame(0x081, bytes.fromhex("01 ff 00 00 00 00 00 00"))  # without a bit of the error register
+WIRE = ("lost_torques", "lost_status", "notice", *FOREIGN)
 # Two cycles: a fault may come after the answers of the cycle before which it was handed over.
 SOON = 3
-_TIMEOUT, _DEADLINE = 300, 10  # cycles that are waited for heartbeats, and for torque frames
+# Cycles that are waited for heartbeats, for torque frames, and for status reports.
+_TIMEOUT, _DEADLINE, _STATUS = 300, 10, 250
 # A drive has limits of its own, of speed and position, at which it gives no torque and says so.
 _LIES, _MISREAD = UNTRUE | {"torque_ignored"}, READ_WRONGLY | {"torque_ignored"}
 
@@ -67,6 +69,10 @@ CANOPEN_PROMISES: dict[str, Promise] = {
     "bus_off": Promise({"bus_off"}, within=SOON, words=("bus-off",)),
     "error_passive": Promise({"bus_degraded"}, within=SOON, words=("passive",)),
     "lost_torques": Promise({"drive_emergency"}, duration=50, within=_DEADLINE + SOON, words=("8250h RPDO timeout",)),
+    "lost_status": Promise(
+        {"status_stale"}, duration=10**6, within=_STATUS + 12, words=("no status report for 0.25 s",)
+    ),
+    "notice": Promise({"drive_notice"}, warns="drive_notice", words=("FF01h",)),
     **{kind: Promise({"second_host"}, within=SOON, words=("somebody else",)) for kind in FOREIGN},
 }
 
@@ -96,15 +102,22 @@ class EmulatedArm(WatchedArm):
         return self.taps
 
     def exchange(self, torque: object) -> Sample:
-        if self._strike is not None and self._strike.kind == "lost_torques":
+        if self._strike is not None and self._strike.kind in ("lost_torques", "lost_status"):
             first, last = self._strike.at_cycle, self._strike.at_cycle + (self._strike.duration or 1)
             lost = first <= self.cycle < last
-            self.taps[-1].loses = lambda frame: lost and 0x200 <= frame.identifier < 0x280
+            if self._strike.kind == "lost_torques":
+                self.taps[-1].loses = lambda frame: lost and 0x200 <= frame.identifier < 0x280
+            else:
+                for tap in self.taps:
+                    tap.misses = lambda frame: lost and 0x280 <= frame.identifier < 0x300
         return super().exchange(torque)  # type: ignore[arg-type]
 
     def _break(self, cycle: int) -> None:
         strike = self._strike
-        if strike is None or cycle != strike.at_cycle or strike.kind == "lost_torques":
+        if strike is None or cycle != strike.at_cycle or strike.kind in ("lost_torques", "lost_status"):
+            return
+        if strike.kind == "notice":
+            self.taps[0].disturb([NOTICE], drives_hear=False)
             return
         if strike.kind in FOREIGN:
             self.taps[-1].disturb([FOREIGN[strike.kind]])

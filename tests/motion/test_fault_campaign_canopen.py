@@ -11,6 +11,7 @@ import random
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import pytest
 from campaign_bench import Case, Outcome, subject
@@ -25,6 +26,9 @@ from sim_backend.pucks.motor import Power
 
 SEED = 11
 DRIVES = {"bench canopen": 2, "wam canopen": 7, "wam two buses": 7}
+# At the end of this stop j7 stands still against more than the friction guess, which is taken for a frozen encoder
+# (decision 0008). A stop that a person asks for in the same cycle ends so too.
+REMAINING = {"wam canopen-lost_status-exciting-0.64-None"}
 # Codes of faults that a drive, not the bus or the loop, tells.
 TOLD = {"drive_fault", "drive_emergency", "drive_silent", "drive_restarted", "drive_left", "feedback_gone"}
 
@@ -68,8 +72,15 @@ def test_a_sample_of_the_campaign(some: list[Case], tmp_path: Path) -> None:
     keep_their_promises(some, tmp_path, let_go)
 
 
+def campaign() -> list[Any]:
+    """All cases; one that is known to fail must go on failing, or be taken off the list."""
+    every = [*cases("bench canopen", 2, 2), *cases("wam canopen", 1, 2), *two_buses()]
+    fails = pytest.mark.xfail(strict=True, raises=AssertionError, reason="decision 0008")
+    return [pytest.param(case, id=str(case), marks=fails if str(case) in REMAINING else ()) for case in every]
+
+
 @pytest.mark.campaign
-@pytest.mark.parametrize("case", [*cases("bench canopen", 2, 2), *cases("wam canopen", 1, 2), *two_buses()], ids=str)
+@pytest.mark.parametrize("case", campaign())
 def test_the_campaign(case: Case, tmp_path: Path) -> None:
     let_go(case, keeps_its_promise(case, tmp_path))
 

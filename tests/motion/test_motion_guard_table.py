@@ -236,12 +236,12 @@ def test_the_reactions_are_those_of_the_fault_table() -> None:
     by_reaction = {reaction: {code for code in FAULTS if FAULTS[code].reaction is reaction} for reaction in Reaction}
     assert by_reaction[WARN] == {
         *("torque_saturated", "torque_rate", "torque_not_applied", "encoder_jump", "lost_feedback", "late_cycle"),
-        *("drive_warning", "torque_limited", "strange_frame"),
+        *("drive_notice", "drive_warning", "torque_limited", "strange_frame"),
     }
     assert by_reaction[STOP] == {
         *("repeated_warnings", "late_cycles", "encoder_jumps", "position_envelope", "position_limit", "over_velocity"),
         *("following_error", "workspace", "lease_lost", "controls_failed", "no_way_back", "recorder_behind"),
-        "bus_degraded",
+        *("bus_degraded", "status_stale"),
     }
     assert by_reaction[LOWER] == {"following_lost"}
     assert by_reaction[OFF] == {"emergency_stop", "feedback_not_finite", "frozen_encoder", "far_outside", "runaway"}

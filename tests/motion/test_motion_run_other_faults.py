@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,8 @@ import pytest
 from motion_bench import LOOKED
 from run_bench import HOME, LIMITS, MIDWAY, PERIOD, Bench
 
-from drivers.arm import StopKind
+from drivers.arm import Sample, StopKind
+from drivers.status import AxisEvent, AxisEventCode
 from ident_service.errors import DriverError, MotionRefused
 from ident_service.motion.control import ComputedTorque
 from ident_service.motion.guard import TORQUE_RATE, TORQUE_RATE_SHARE
@@ -70,6 +72,22 @@ def test_events_that_cannot_be_kept_end_nothing(make: Callable[..., Bench]) -> N
     bench.story.at_event = fail
     assert bench.run().state is State.DONE
     assert bench.story.events == []
+
+
+def test_every_notice_of_a_drive_is_told_and_recorded_and_stops_nothing(make: Callable[..., Bench]) -> None:
+    bench, words = make(), ["node 1: FF01h one", "node 2: FF02h another"]
+    cycles = {MIDWAY: words[0], MIDWAY + 300: words[1]}
+
+    def informs(sample: Sample) -> Sample:
+        said = cycles.get(sample.cycle)
+        return sample if said is None else replace(sample, events=(AxisEvent(AxisEventCode.DRIVE_NOTICE, None, said),))
+
+    bench.arm.shown = informs
+    report = bench.run()
+    assert (report.state, report.warnings["drive_notice"]) == (State.DONE, 2)
+    told = [message for _, _, message in bench.story.events if message.startswith("drive_notice: ")]
+    assert len(told) == 2
+    assert all(said in message for said, message in zip(words, told, strict=True))
 
 
 @pytest.mark.parametrize("cycle", [250, MIDWAY, 1500])

@@ -144,3 +144,29 @@ def test_a_stop_that_comes_while_the_controls_are_taken_is_not_lost(tmp_path: Pa
 
     with ControlFile.take(loop_path(tmp_path), None, now, asked_ns) as loop:
         assert loop.stop
+
+
+RENEWER = """
+import sys
+from pathlib import Path
+from ident_service.motion.control_file import ControlFile
+with ControlFile.reach(Path(sys.argv[1])) as controls:
+    print("renewing", flush=True)
+    while True:
+        controls.renew()
+"""
+
+
+def test_a_lease_that_is_renewed_without_pause_never_looks_lapsed(tmp_path: Path) -> None:
+    """A word that is written in parts shows a reader times of decades ago, or yet to come."""
+    path = tmp_path / "control"
+    with ControlFile.take(path, 60.0) as loop:
+        command = [sys.executable, "-c", RENEWER, str(path)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2]) as parent:
+            try:
+                assert parent.stdout is not None
+                assert parent.stdout.readline() == "renewing\n"
+                lapsed = sum(not loop.lease_ok(0) for _ in range(100_000))
+            finally:
+                parent.kill()
+    assert lapsed == 0

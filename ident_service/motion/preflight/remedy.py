@@ -23,6 +23,7 @@ REMEDIES: dict[str, str] = {
     "drive_left": _DRIVE,
     "torque_ignored": _DRIVE,
     "drive_silent": _LINK,
+    "status_stale": _LINK,
     "feedback_gone": _LINK,
     "driver": _LINK,
     "bus_off": _LINK,
@@ -38,6 +39,7 @@ REMEDIES: dict[str, str] = {
     "torque_not_applied": _SUPPLY,
     "torque_limited": _SUPPLY,
     "drive_warning": _SUPPLY,
+    "drive_notice": _DRIVE,
     "drive_watchdog": (
         "Compare control.rate with the drives' watchdog in the driver's section, and look for other load on this "
         "machine: the drives must hear from it well within that time."

@@ -1,0 +1,124 @@
+"""What drives tell beside their positions: status reports that stay away, and emergencies that only inform."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from helpers.emulated_arms import Tapped, tapped, weightless_config
+from pydantic import ValidationError
+
+from drivers.canopen.arm import CanopenArm
+from drivers.canopen.frame import Frame
+from drivers.status import AxisEvent, AxisEventCode
+from sim_backend.pucks.lock_step import LockStepArm
+
+ZERO = np.zeros(2)
+PERIOD = 0.002  # s, of a cycle
+REPORTS = 0.1  # s, between two status reports
+
+
+@pytest.fixture
+def running() -> Iterator[tuple[CanopenArm, Tapped]]:
+    config = weightless_config()
+    taps = tapped(LockStepArm(config), config)
+    with CanopenArm(config, lambda _: taps) as arm:
+        arm.enable()
+        yield arm, taps[0]
+
+
+def told(arm: CanopenArm, seconds: float) -> list[tuple[float, AxisEvent]]:
+    """Events of so many seconds, and when each came."""
+    found = []
+    for cycle in range(round(seconds / PERIOD)):
+        found += [(cycle * PERIOD, event) for event in arm.exchange(ZERO).events]
+    return found
+
+
+def is_status(frame: Frame) -> bool:
+    return frame.identifier in (0x281, 0x282)
+
+
+def test_a_drive_whose_status_report_stays_away_is_told_of_after_two_to_three_periods(
+    running: tuple[CanopenArm, Tapped],
+) -> None:
+    arm, tap = running
+    for _ in range(2):
+        tap.misses = lambda frame: frame.identifier == 0x282
+        ((when, event),) = told(arm, 1.0)
+        assert event == AxisEvent(AxisEventCode.STATUS_STALE, 1, "node 2: no status report for 0.25 s")
+        # The last report came up to a period before they stayed away.
+        assert 1.0 * REPORTS <= when <= 3.0 * REPORTS
+        tap.misses = lambda frame: False
+        assert told(arm, 0.5) == []
+
+
+def test_one_lost_status_report_is_nothing(running: tuple[CanopenArm, Tapped]) -> None:
+    arm, tap = running
+    for _ in range(3):
+        lost: set[int] = set()
+
+        def first(frame: Frame, lost: set[int] = lost) -> bool:
+            new = is_status(frame) and frame.identifier not in lost
+            lost.add(frame.identifier)
+            return new
+
+        tap.misses = first
+        assert told(arm, 0.5) == []
+        assert lost >= {0x281, 0x282}
+
+
+def emergency(code: int, register: int) -> Frame:
+    return Frame(0x082, bytes([code & 0xFF, code >> 8, register, 1, 2, 3, 4, 5]))
+
+
+@pytest.mark.parametrize(
+    ("frame", "code"),
+    [
+        (emergency(0xFF01, 0x00), AxisEventCode.DRIVE_NOTICE),
+        (emergency(0x7500, 0x01), AxisEventCode.DRIVE_NOTICE),  # on the drive's list
+        (emergency(0xFF01, 0x80), AxisEventCode.EMERGENCY_MESSAGE),
+        (emergency(0x8250, 0x00), AxisEventCode.EMERGENCY_MESSAGE),  # it does not hear us, whatever its register says
+        (emergency(0x8120, 0x00), AxisEventCode.BUS_DEGRADED),
+        (Frame(0x082, bytes([0x01, 0xFF])), AxisEventCode.EMERGENCY_MESSAGE),  # torn: nobody knows its register
+        (emergency(0x7500, 0x01)._replace(identifier=0x081), AxisEventCode.EMERGENCY_MESSAGE),  # another drive's list
+    ],
+)
+def test_an_emergency_that_only_informs_is_another_event(frame: Frame, code: AxisEventCode) -> None:
+    plain = weightless_config()
+    drives = plain.model_dump(mode="json", by_alias=True)["driver"]["drives"]
+    drives[1]["notices"] = [0x7500]
+    config = weightless_config(drives=drives)
+    taps = tapped(LockStepArm(config), config)
+    with CanopenArm(config, lambda _: taps) as arm:
+        arm.enable()
+        before = arm.exchange(ZERO)
+        taps[0].disturb([frame], drives_hear=False)
+        sample = arm.exchange(ZERO)
+        node = frame.identifier - 0x080
+        event = next(event for event in sample.events if event.code is code)
+        assert (event.axis, event.words[:8]) == (node - 1, f"node {node}: ")
+        if code is AxisEventCode.DRIVE_NOTICE:
+            assert sample.status == before.status
+            assert "vendor's bytes 01 02 03 04 05" in event.words
+
+
+@pytest.mark.parametrize("code", [0x8120, 0x8130, 0x8250])
+def test_a_lost_host_is_never_a_mere_notice(code: int) -> None:
+    drives = weightless_config().model_dump(mode="json", by_alias=True)["driver"]["drives"]
+    drives[0]["notices"] = [code]
+    with pytest.raises(ValidationError, match=f"{code:04X}h tells that the drive does not hear its host"):
+        weightless_config(drives=drives)
+
+
+def test_a_drive_without_position_limits_is_none_the_worse() -> None:
+    """607Dh is of the position modes; in torque mode it protects nothing, and need not be there."""
+    config = weightless_config()
+    behind = LockStepArm(config)
+    drive = behind.emulator.faces[1]
+    for subindex in (1, 2):
+        del drive.objects.entries[0x607D00 | subindex]  # type: ignore[attr-defined]
+    with CanopenArm(config, lambda _: tapped(behind, config)) as arm:
+        arm.enable()
+        arm.exchange(ZERO)
