@@ -48,6 +48,11 @@ class SecondOpinion:
         """Whether the two predict the same torques, to a thousandth."""
         return self.torque_percent < AGREED_BELOW
 
+    @property
+    def conclusive(self) -> bool:
+        """Whether the comparison says something: a second solver that stopped early proves nobody wrong."""
+        return self.agrees or (self.status == "optimal" and self.margin > 0.0)
+
 
 def second_opinion(
     first: FeasibleEstimate,

@@ -220,6 +220,7 @@ def convex_document(estimate: Estimate) -> dict[str, Any]:
     if (second := estimate.second) is not None:
         document["second_opinion"] = {
             "agrees": second.agrees,
+            "conclusive": second.conclusive,
             "solvers": list(second.solvers),
             "status": second.status,
             "objectives": list(second.objectives),

@@ -136,10 +136,15 @@ def _convex(estimate: Estimate) -> list[str]:
     if (second := estimate.second) is not None:
         one, other = second.objectives
         first_by, second_by = second.solvers
+        if second.agrees:
+            word = "the two agree"
+        elif second.conclusive:
+            word = "THE TWO DIFFER, use neither before you know why"
+        else:
+            word = f"it stopped early, which says little; try another --solver than {second_by}"
         lines += [
             "",
-            f"second opinion, {second_by} through cvxpy ({second.status}): "
-            + ("the two agree" if second.agrees else "THE TWO DIFFER, use neither before you know why"),
+            f"second opinion, {second_by} through cvxpy ({second.status}): " + word,
             f"  objective {one:.9g} by {first_by}, {other:.9g} by {second_by}"
             + (f", which misses the set by {-second.margin:.1g}" if second.margin <= 0.0 else ""),
             f"  predicted torques differ by {second.torque_percent:.2g} %, base parameters by at most "

@@ -44,9 +44,7 @@ def verify_file(path: Path, arm: str | None = None) -> Verification:
 
 def custom_note(name: str) -> str:
     """Say that an answer about an arm leaves out its `constraints.custom`."""
-    return (
-        f"constraints.custom ({name}) of the description is code, which only `ident identify` runs; it is left out here"
-    )
+    return f"constraints.custom ({name}) of the description is code that only identify and simulate run; left out here"
 
 
 def _arm(arm: str, file: Path) -> tuple[Arm, str | None]:

@@ -35,12 +35,12 @@ if TYPE_CHECKING:
 SOLVER = "clarabel"
 _NAME = "constrained least squares in cvxpy"
 _WEIGHT = 8.0  # of the residual norm, as in `nearest.py`: multipliers are then comparable
-_ACCURATE = ("optimal", "optimal_inaccurate")
 # In turn, until the solver reaches an optimum. Other solvers are asked with their own defaults.
 _OPTIONS: dict[str, tuple[dict[str, Any], ...]] = {
     "CLARABEL": tuple(
-        {"tol_gap_abs": tol, "tol_gap_rel": tol, "tol_feas": tol, "max_iter": 200, "max_threads": 1}
-        for tol in (1e-9, 1e-8, 1e-7)
+        {f"{kind}{name}": tolerance for kind in ("", "reduced_") for name in ("tol_gap_abs", "tol_gap_rel", "tol_feas")}
+        | {"max_iter": 200, "max_threads": 1}
+        for tolerance in (1e-9, 1e-8, 1e-7)
     ),
     # Accelerated, SCS now and then wanders for as long as it is let, on one processor and not on another.
     "SCS": ({"eps_abs": 1e-7, "eps_rel": 1e-7, "max_iters": 100_000, "acceleration_lookback": 0},),
@@ -127,15 +127,23 @@ def convex_least_squares(
     size = float(np.max(np.abs(fit.beta), initial=0.0))
     reaches = OF_ESTIMATES if prior is None else (np.inf,)
     bounds = [reach * largest(conditions, size) for reach in reaches] if bound is None else [bound]
-    statuses = []
+    statuses: list[str] = []
+    early: FeasibleEstimate | None = None
     for limit in bounds:
         for options in _OPTIONS.get(name, ({},)):
             status = posed.solve(name, options, limit)
             statuses.append(status)
-            if status in _ACCURATE and ((found := posed.found(limit)).margin > 0.0 or not inside):
-                return ConvexEstimate(found, solver.lower(), status)
+            if status in ("optimal", "optimal_inaccurate"):
+                found = posed.found(limit)
+                if found.margin <= 0.0 and inside:
+                    continue
+                if status == "optimal":
+                    return ConvexEstimate(found, solver.lower(), status)
+                early = early or found
             if status.startswith("infeasible"):
                 break
+        if early is not None:
+            return ConvexEstimate(early, solver.lower(), "optimal_inaccurate")
     if statuses[0].startswith("infeasible"):
         if blocks := contradiction(conditions):
             raise ConditionsError(_NAME, statuses[0], blocks)
@@ -144,8 +152,8 @@ def convex_least_squares(
                 f"{custom.name} contradicts the rest of the description, or asks for links of more than "
                 f"{bounds[-1]:.3g} kg: no parameters fulfil both"
             )
-    status = statuses[0] if statuses[0] not in _ACCURATE else f"{statuses[0]} but outside the set; try another solver"
-    raise SolverError(f"{_NAME} by {solver.lower()}", status)
+    outside = " but outside the set; try another solver" if statuses[0].startswith("optimal") else ""
+    raise SolverError(f"{_NAME} by {solver.lower()}", f"{statuses[0]}{outside}")
 
 
 def objective(fit: LeastSquares, found: FeasibleEstimate, prior: Prior | None) -> float:

@@ -80,7 +80,8 @@ def reservations(evidence: Evidence, parameters: ParameterFile) -> list[str]:
     found = [f"Must not be used: {reason}." for reason in parameters.content.get("unusable", [])]
     if parameters.content.get("feasibility", {}).get("margin", 1.0) <= 0.0:
         found.append("No real body has these parameters.")
-    if not parameters.content.get("second_opinion", {}).get("agrees", True):
+    second = parameters.content.get("second_opinion", {})
+    if second.get("conclusive") and not second.get("agrees", True):
         found.append("A second solution of the constrained problem predicts other torques (report.txt).")
     poor = poor_joints(evidence, parameters)
     if moving := [one for one in poor if one.in_motion]:
