@@ -36,7 +36,7 @@ FOREIGN: dict[str, Frame] = {
     "foreign_heartbeat": Frame(0x77F, b"\x05"),
 }
 NOTICE = Frame(0x081, bytes.fromhex("01 ff 00 00 00 00 00 00"))  # without a bit of the error register
-WIRE = ("lost_torques", "lost_status", "notice", *FOREIGN)
+WIRE = ("lost_torques", "lost_status", "notice", *FOREIGN, "full_queue")
 # Two cycles: a fault may come after the answers of the cycle before which it was handed over.
 SOON = 3
 # Cycles that are waited for heartbeats, for torque frames, and for status reports.
@@ -74,6 +74,7 @@ CANOPEN_PROMISES: dict[str, Promise] = {
     ),
     "notice": Promise({"drive_notice"}, warns="drive_notice", words=("FF01h",)),
     **{kind: Promise({"second_host"}, within=SOON, words=("somebody else",)) for kind in FOREIGN},
+    "full_queue": Promise({"driver"}, duration=5, within=SOON, words=("the transmit queue is full",)),
 }
 
 
@@ -115,6 +116,10 @@ class EmulatedArm(WatchedArm):
     def _break(self, cycle: int) -> None:
         strike = self._strike
         if strike is None or cycle != strike.at_cycle or strike.kind in ("lost_torques", "lost_status"):
+            return
+        if strike.kind == "full_queue":
+            for tap in self.taps:
+                tap.full_until_ns = self.clock.now_ns() + round((strike.duration or 1) * PERIOD * 1e9)
             return
         if strike.kind == "notice":
             self.taps[0].disturb([NOTICE], drives_hear=False)
