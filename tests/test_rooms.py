@@ -237,6 +237,12 @@ def test_the_command_line_loads_no_large_library() -> None:
     assert loaded_after("import ident_service.cli") == set()
 
 
+def test_identification_loads_cvxpy_only_when_it_is_used() -> None:
+    loaded = loaded_after("import ident_service.estimation.identify, ident_service.service.identification")
+    assert "clarabel" in loaded
+    assert "cvxpy" not in loaded
+
+
 @pytest.mark.parametrize("arguments", [["--help"], ["base", "--help"]])
 def test_asking_for_help_loads_no_large_library(arguments: list[str]) -> None:
     code = (

@@ -47,6 +47,12 @@ def add(verbs: Verbs) -> None:
     sub.add_argument("--sdpa", action="store_true", help="also the problems in SDPA format, for other solvers")
     sub.add_argument("--feasible-set", choices=[*FEASIBLE_SETS, "none"], help="default: the arm's; none: unconstrained")
     sub.add_argument(
+        "--second-opinion", action="store_true", help="solve the constrained problem again, in cvxpy, and compare"
+    )
+    sub.add_argument(
+        "--solver", metavar="NAME", help="of cvxpy, for constraints.custom and the second opinion (default: clarabel)"
+    )
+    sub.add_argument(
         "--out",
         type=Path,
         metavar="DIR",
@@ -59,6 +65,7 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
     from ident_service.excitation.excitation import read_excitation
     from ident_service.results.summary import summary
     from ident_service.service.commission import new_run_folder, score_document, simulate
+    from ident_service.service.identification import custom_of
 
     config = described = load_arm(arguments.arm)
     if arguments.seed is not None and config.driver is not None:
@@ -72,6 +79,7 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
             motion=None if arguments.motion is None else read_excitation(arguments.motion),
             set_name=arguments.feasible_set,
             described=described,
+            custom=custom_of(arguments.arm, described),
             tell=lambda line: tell(arguments, line),
             stop_requested=stopping.requested,
         )
@@ -112,6 +120,8 @@ def _identify(arguments: argparse.Namespace) -> Answer:
         replicates=arguments.bootstrap,
         essential=arguments.essential,
         sdpa=arguments.sdpa,
+        solver=arguments.solver,
+        second_opinion=arguments.second_opinion,
     )
     folder = arguments.out or new_run_folder(own_state_folder(arguments), load_arm(arguments.arm).name)
     result = identify_files(request, folder, lambda line: tell(arguments, line))
@@ -128,6 +138,8 @@ def _exit_code(estimate: Estimate, unusable: Sequence[str]) -> int:
 
 
 def _estimate_document(estimate: Estimate, unusable: Sequence[str]) -> dict[str, Any]:
+    from ident_service.results.parameter_file import convex_document
+
     own = estimate.candidates[estimate.chosen]
     return {
         "arm": estimate.model.config.name,
@@ -150,4 +162,5 @@ def _estimate_document(estimate: Estimate, unusable: Sequence[str]) -> dict[str,
             for candidate in estimate.candidates
         ],
         "verdicts": {word: estimate.verdicts.count(word) for word in ("identified", "weak", "unidentified")},
+        **convex_document(estimate),
     }

@@ -87,6 +87,17 @@ def load_recording_format(path: str | Path) -> RecordingFormat:
     return _validated(RecordingFormat, read_tree(path), path)
 
 
+def folder_of(arm: str | Path, where: KeyPath) -> Path:
+    """Return the folder of the file in which a key stands: of the description, or of one that it extends.
+
+    Args:
+        arm: a YAML file, or the name of a shipped description.
+        where: keys from the top of the file.
+    """
+    path = find_arm(str(arm))
+    return read_tree(path).problem(where, "", path).path.parent
+
+
 def mistake(arm: str | Path, where: KeyPath, message: str) -> ConfigError:
     """A mistake that only shows when a description is put to use, with its place.
 

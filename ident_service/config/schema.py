@@ -7,13 +7,21 @@ SI units; angles in radians. Tables 2, 4, 5 and 7 and eqs. 25, 26, 28 of Sousa &
 from __future__ import annotations
 
 import hashlib
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import (
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationInfo,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from ident_service.config.design import Design
 from ident_service.config.drivers import Driver
 from ident_service.config.quantities import (
+    UPLOAD,
     Angle,
     Count,
     Interval,
@@ -34,6 +42,7 @@ FeasibleSetName = Literal["pseudo_inertia", "inertia"]
 Method = Literal["ols", "wls", "huber", "iv"]
 
 
+_FUNCTION = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
 _LARGEST_ANGLE = 6.3  # rad
 _LONGEST_LINK = 20.0  # m; the largest arms that move torque-controlled joints are a tenth of it
 
@@ -171,11 +180,29 @@ class Constraints(Section):
     """Physical knowledge about the whole arm (eqs. 25, 28).
 
     `torque_constant` bounds, per joint, what its measured torque must be multiplied by to be true; 1 elsewhere.
+    `custom` names a Python function, `module:function`, that returns further constraints in cvxpy (docs/extending.md);
+    the module stands beside the description or on PYTHONPATH. A description that is sent to a daemon must not name one.
     """
 
     total_mass: Mass = Mass()
     positive: tuple[Literal["drive_inertia", "viscous", "coulomb"], ...] = ("drive_inertia", "viscous", "coulomb")
     torque_constant: dict[str, tuple[Positive, Positive]] = Field(default_factory=dict)
+    custom: Annotated[str, Field(pattern=_FUNCTION)] | None = None
+
+    @field_validator("custom")
+    @classmethod
+    def _not_sent(cls, value: str | None, info: ValidationInfo) -> str | None:
+        if value is not None and info.context is not None and UPLOAD in info.context:
+            raise ValueError(
+                "a description that is sent names no code; leave it out, or run `ident identify` at a terminal"
+            )
+        return value
+
+    @model_serializer(mode="wrap")
+    def _unless_none(self, serialized: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # Descriptions without it keep the hash that results have named them by.
+        document: dict[str, Any] = serialized(self)
+        return {key: value for key, value in document.items() if key != "custom" or value is not None}
 
     @model_validator(mode="after")
     def _ordered(self) -> Constraints:

@@ -24,9 +24,11 @@ from ident_service.model.information import Information, information_of, support
 from ident_service.model.regressor import joint_regressor
 from ident_service.model.threads import one_blas_thread
 from ident_service.model.zero_phase import low_pass
+from ident_service.record.grid import grid
 from ident_service.record.recording import Recording
 
 MAX_BLOCKS = 256
+LEAST_BLOCKS = 12  # deviations from fewer are hardly known themselves
 _CHUNK = 4096  # samples whose regressor is computed at once
 _DECAY = 28.0  # -ln(1e-12)
 
@@ -113,11 +115,12 @@ def equations(
     blocks: list[Information] = []
     left_out: Information | None = None
     samples, current, origin = 0, -1.0, 0.0
+    length = _block_seconds(recording, model)
     for rows in equation_rows(recording, model, base):
         origin = rows.time[0] if samples == 0 else origin
         samples += len(rows.time)
         # Blocks are stretches of time, whatever the rate after decimation and wherever chunks meet.
-        number = np.floor((rows.time - origin) / model.config.identification.block + 1e-9)
+        number = np.floor((rows.time - origin) / length + 1e-9)
         starts = np.flatnonzero(np.diff(number)) + 1
         weights = None if row_weights is None else row_weights(rows)
         for begin, end in zip([0, *starts], [*starts, len(rows.time)], strict=True):
@@ -140,6 +143,17 @@ def equations(
             f"{', '.join(still)}: never faster than identification.reversal.speed, nothing to identify from",
         )
     return result
+
+
+def _block_seconds(recording: Recording, model: ArmModel) -> float:
+    """Give the length of a block [s]: shorter than asked for where a short recording would have too few."""
+    options = model.config.identification
+    if options.period is not None:
+        seconds = float(options.period)
+    else:
+        stamps = grid(recording, model.config.recording)
+        seconds = (stamps.last_ns - stamps.first_ns) * 1e-9 - 2.0 * options.edge
+    return min(options.block, max(seconds, 0.0) / LEAST_BLOCKS) or options.block
 
 
 def equation_rows(recording: Recording, model: ArmModel, base: BaseParameters) -> Iterator[Rows]:

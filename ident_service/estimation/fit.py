@@ -13,8 +13,9 @@ from functools import reduce
 import numpy as np
 
 from ident_service.config.schema import Method
+from ident_service.estimation import instruments, robust
 from ident_service.estimation.delay import Delay, estimate_delay, with_delay
-from ident_service.estimation.doubt import block_covariance
+from ident_service.estimation.doubt import uncertainty
 from ident_service.estimation.equations import Equations, equations
 from ident_service.estimation.feasible.feasibility import constrained_least_squares
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
@@ -54,11 +55,15 @@ class Fit:
         fit: the least squares whose factors constrained estimates use.
         equations: what it solves, with row weights where the method has them.
         covariance: from blocks of scores, shape (base, base).
+        degrees: degrees of freedom of its diagonal, shape (base,).
+        remarks: what a person should know of how it was found, in words.
     """
 
     fit: LeastSquares
     equations: Equations
     covariance: Array
+    degrees: Array
+    remarks: tuple[str, ...] = ()
 
 
 def prepare(
@@ -101,20 +106,35 @@ def unconstrained(
 
     Raises:
         RecordingError: a recording cannot be used.
-        ModelError: an iteration does not settle.
+        ModelError: the joints' weights do not settle, or instruments say nothing.
         SolverError: the solver stopped without an optimum.
     """
     model, gathered = prepared.model, prepared.equations
     if method == "ols":
-        fit = ordinary_least_squares(gathered.total)
-        return Fit(fit, gathered, block_covariance(gathered, fit))
+        return _doubted(ordinary_least_squares(gathered.total), gathered)
     fit = weighted_least_squares(gathered.total)
     if method == "wls":
-        return Fit(fit, gathered, block_covariance(gathered, fit))
+        return _doubted(fit, gathered)
     if method == "huber":
-        fit, reweighted = huber(recordings, model, base, fit, prepared.torque_scales)
-        return Fit(fit, reweighted, block_covariance(reweighted, fit))
+        fit, reweighted, change = huber(recordings, model, base, fit, prepared.torque_scales)
+        return replace(_doubted(fit, reweighted), remarks=_unsettled("Huber's weights", change, robust.SETTLED))
     delta = constrained_least_squares(fit, base, conditions).delta
     refined = instrumental_variables(recordings, model, base, conditions, fit, delta)
     moved = replace(fit, beta=refined.beta, rho1=fit.R1 @ refined.beta, standard_deviations=refined.standard_deviations)
-    return Fit(moved, gathered, refined.covariance)
+    # The instruments' variances come from as many blocks, each of which counts the same.
+    remarks = _unsettled("the instrumental estimate", refined.change, instruments.SETTLED)
+    return Fit(moved, gathered, refined.covariance, uncertainty(gathered, fit).degrees, remarks)
+
+
+def _unsettled(what: str, change: float, settled: float) -> tuple[str, ...]:
+    if change < settled:
+        return ()
+    return (
+        f"{what} did not settle: of all rounds the one is used that changed a parameter least, by {change:.2g} of its"
+        " standard deviations",
+    )
+
+
+def _doubted(fit: LeastSquares, equations: Equations) -> Fit:
+    found = uncertainty(equations, fit)
+    return Fit(fit, equations, found.covariance, found.degrees)

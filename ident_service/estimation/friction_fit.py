@@ -83,6 +83,26 @@ def fit_friction(recordings: Sequence[Recording], model: ArmModel, base: BasePar
     return with_friction(model, _shape(values))
 
 
+def at_the_edge(shape: FrictionShape, joints: Sequence[str], terms: Sequence[str]) -> tuple[str, ...]:
+    """Say which fitted numbers end where the search does: what they describe may lie beyond, or not be there.
+
+    Args:
+        shape: fitted.
+        joints: their names.
+        terms: of the model's joints; without Stribeck friction its velocity means nothing.
+    """
+    found = []
+    for key, what in (("presliding", "pre-sliding distance"), ("stribeck_velocity", "Stribeck velocity")):
+        if key == "stribeck_velocity" and "stribeck" not in terms:
+            continue
+        grid = _GRIDS[key]
+        for name, value in zip(joints, np.broadcast_to(np.asarray(getattr(shape, key)), len(joints)), strict=True):
+            if value >= grid[-1] or (0.0 < value <= grid[0]):
+                edge = "largest" if value >= grid[-1] else "smallest"
+                found.append(f"{name}: its {what} of {value:g} is the {edge} that is searched")
+    return tuple(found)
+
+
 _Numbers = dict[str, Array]
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ident_service.config.recording import RecordingFormat
 from ident_service.errors import RecordingError
-from ident_service.estimation.doubt import Verdict, block_covariance, verdicts
+from ident_service.estimation.doubt import Verdict, uncertainty, verdicts
 from ident_service.estimation.equations import Equations, Rows, bounded, equation_rows
 from ident_service.estimation.least_squares import ordinary_least_squares
 from ident_service.model.arm_model import ArmModel
@@ -149,11 +149,11 @@ class GrowingInformation:
         spread = np.sqrt(information.squared_residuals(fit.beta) / np.maximum(information.rows, 1))
         floor = 1e-9 * np.sqrt(information.squared_torques() / np.maximum(information.rows, 1)) + 1e-300
         fit = ordinary_least_squares(information, np.where(information.rows > 0, 1.0 / np.maximum(spread, floor), 1.0))
-        deviations, blocks = fit.standard_deviations, self._blocks or []
+        deviations, blocks, degrees = fit.standard_deviations, self._blocks or [], None
         if blocks:
-            spread = np.sqrt(np.diag(block_covariance(Equations(tuple(blocks), 0), fit)))
-            deviations = np.maximum(deviations, spread)
-        words = verdicts(fit.beta, deviations, self.base.units)
+            found = uncertainty(Equations(tuple(blocks), 0), fit)
+            deviations, degrees = np.maximum(deviations, np.sqrt(np.diag(found.covariance))), found.degrees
+        words = verdicts(fit.beta, deviations, self.base.units, degrees)
         return Doubt(self._seconds, fit.beta, deviations, words, len(blocks), self._done_ns)
 
 

@@ -11,8 +11,10 @@ import numpy as np
 
 from ident_service.config.schema import FeasibleSetName, Method
 from ident_service.errors import UsageError
+from ident_service.estimation.custom import CustomFunction
 from ident_service.estimation.doubt import Verdict, verdicts
 from ident_service.estimation.equations import Equations, equations
+from ident_service.estimation.feasible.convex import SOLVER, convex_least_squares, require_solver
 from ident_service.estimation.feasible.feasibility import (
     FeasibilityTest,
     FeasibleEstimate,
@@ -23,12 +25,14 @@ from ident_service.estimation.feasible.feasibility import (
 from ident_service.estimation.feasible.feasible_set import FeasibleSet, SetName, feasible_set
 from ident_service.estimation.feasible.priors import Prior, choose_weight
 from ident_service.estimation.fit import Fit, Prepared, prepare, unconstrained
+from ident_service.estimation.friction_fit import at_the_edge
 from ident_service.estimation.least_squares import (
     LeastSquares,
     TorqueError,
     ordinary_least_squares,
     torque_error,
 )
+from ident_service.estimation.second_opinion import SecondOpinion, second_opinion
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters, base_parameters
 from ident_service.model.chain import Array
@@ -74,6 +78,23 @@ class Candidate:
 
 
 @dataclass(frozen=True)
+class CustomKnowledge:
+    """What `constraints.custom` did to an estimate.
+
+    Attributes:
+        function: that was called.
+        solver: that found the constrained estimates.
+        error: relative torque error [percent] (eq. 84) of the estimate, on the rows that were fitted to.
+        error_without: the same of the estimate that knows the rest of the description alone.
+    """
+
+    function: CustomFunction
+    solver: str
+    error: float
+    error_without: float
+
+
+@dataclass(frozen=True)
 class Estimate:
     """An identified parameter set with everything needed to doubt it.
 
@@ -90,6 +111,7 @@ class Estimate:
         covariance: of the unconstrained estimate, from blocks of scores, shape (base, base).
         standard_deviations: its diagonal's square root, shape (base,).
         white_standard_deviations: the paper's (eq. 81), shape (base,).
+        degrees: degrees of freedom of the standard deviations, shape (base,).
         verdicts: one per base parameter.
         fit: the unconstrained least squares.
         samples: smoothed samples used.
@@ -99,6 +121,10 @@ class Estimate:
         recordings: name and hash of what it was fitted to.
         candidates: the estimates of table 8, this one's among them.
         chosen: index of this estimate among the candidates.
+        remarks: what a person should know of how it was found, in words.
+        custom: further knowledge in the estimate, where the description names some and it is constrained; neither
+            `margin` nor a certificate is about it.
+        second: another solution of the constrained problem, where it was asked for.
     """
 
     model: ArmModel
@@ -113,6 +139,7 @@ class Estimate:
     covariance: Array
     standard_deviations: Array
     white_standard_deviations: Array
+    degrees: Array
     verdicts: tuple[Verdict, ...]
     fit: LeastSquares
     samples: int
@@ -122,6 +149,9 @@ class Estimate:
     recordings: tuple[tuple[str, str], ...]
     candidates: tuple[Candidate, ...]
     chosen: int
+    remarks: tuple[str, ...] = ()
+    custom: CustomKnowledge | None = None
+    second: SecondOpinion | None = None
 
     @property
     def feasible(self) -> bool:
@@ -137,6 +167,9 @@ def identify(
     *,
     method: Method | None = None,
     set_name: SetName | None = None,
+    custom: CustomFunction | None = None,
+    solver: str | None = None,
+    again: bool = False,
 ) -> Estimate:
     """Identify an arm from recordings.
 
@@ -146,14 +179,20 @@ def identify(
         validation: to judge on; never used for the fit.
         method: estimator, the configuration's when None.
         set_name: feasible set to hold the estimate in, `none` for none; the configuration's when None.
+        custom: the function that the configuration's `constraints.custom` names, loaded by `load_custom`.
+        solver: of the problems that are posed in cvxpy, those with `custom` and the second opinion.
+        again: whether to solve the constrained problem a second time.
 
     Raises:
-        UsageError: unknown method, no recordings, the same recording twice, or no prior where one is asked for.
+        UsageError: unknown method, no recordings, the same recording twice, no prior where one is asked for, or a
+            solver that is not installed or has nothing to solve.
+        CustomError: `custom` raises, returns what is not convex, or contradicts the conditions.
         RecordingError: a recording does not fit the arm or cannot be used.
         SolverError: the solver stopped without an optimum.
     """
     method = method or model.config.identification.method
     _check(method, recordings, validation)
+    _check_convex(model, set_name, custom, solver, again=again)
     base = base_parameters(model.chain, model.layout)
     sets = {name: feasible_set(name, base.names, model.config) for name in _SETS}
     kind: FeasibleSetName = model.config.feasible_set if set_name is None or set_name == "none" else set_name
@@ -165,8 +204,26 @@ def identify(
     prior = _prior(prepared.model, found, base, conditions)
     test = feasibility_test(found.fit.beta, base, conditions)
     corrected = feasibility_correction(found.fit.beta, base, conditions)
-    held = {name: constrained_least_squares(found.fit, base, conditions, prior) for name, conditions in sets.items()}
-    if prior is None:
+    knowledge: CustomKnowledge | None = None
+    if custom is None:
+        held = {name: constrained_least_squares(found.fit, base, one, prior) for name, one in sets.items()}
+    else:
+        by = solver or SOLVER
+        held = {
+            name: convex_least_squares(found.fit, base, one, prior=prior, custom=custom, solver=by).estimate
+            for name, one in sets.items()
+        }
+        without = constrained_least_squares(found.fit, base, conditions, prior)
+        errors = (torque_error(prepared.equations.total, one.beta) for one in (held[kind], without))
+        knowledge = CustomKnowledge(custom, by.lower(), *(error.relative_percent for error in errors))
+    deviations = np.sqrt(np.diag(found.covariance))
+    second = None
+    if again:
+        second = second_opinion(
+            held[kind], found.fit, base, conditions, deviations, prior=prior, custom=custom, solver=solver
+        )
+    # Of the bodies behind the same base parameters the central one may not be one that `custom` allows.
+    if prior is None and custom is None:
         held[kind] = held[kind].centred(base, conditions)
 
     everything, total = prepared.equations.everything, prepared.equations.total
@@ -191,7 +248,6 @@ def identify(
     chosen = 0 if free else 2 + _SETS.index(kind)
     beta = candidates[chosen].beta
     delta, margin, tight = _of_test(test) if free else (held[kind].delta, held[kind].margin, held[kind].tight)
-    deviations = np.sqrt(np.diag(found.covariance))
     return Estimate(
         model=prepared.model,
         base=base,
@@ -205,7 +261,8 @@ def identify(
         covariance=found.covariance,
         standard_deviations=deviations,
         white_standard_deviations=found.fit.standard_deviations,
-        verdicts=verdicts(beta, deviations, base.units),
+        degrees=found.degrees,
+        verdicts=verdicts(beta, deviations, base.units, found.degrees),
         fit=found.fit,
         samples=prepared.equations.samples,
         prepared=prepared,
@@ -214,7 +271,17 @@ def identify(
         recordings=tuple((recording.path.name, recording.sha256) for recording in recordings),
         candidates=tuple(candidates),
         chosen=chosen,
+        remarks=(*found.remarks, *_remarks_on_friction(model, prepared.model)),
+        custom=None if free else knowledge,
+        second=second,
     )
+
+
+def _remarks_on_friction(described: ArmModel, fitted: ArmModel) -> tuple[str, ...]:
+    wanted, shape = described.config.identification.friction, fitted.config.identification.friction
+    asked = {key: getattr(shape, key) for key in type(shape).model_fields if getattr(wanted, key) == "fit"}
+    given = {key: 0.0 if key == "presliding" else 0.1 for key in type(shape).model_fields}
+    return at_the_edge(type(shape)(**(given | asked)), fitted.chain.names, fitted.layout.terms)
 
 
 def _check(method: str, recordings: Sequence[Recording], validation: Sequence[Recording]) -> None:
@@ -229,6 +296,23 @@ def _check(method: str, recordings: Sequence[Recording], validation: Sequence[Re
         fitted.add(recording.sha256)
     if seen := [str(recording.path) for recording in validation if recording.sha256 in fitted]:
         raise UsageError(f"{', '.join(seen)}: a recording that is fitted to cannot validate the fit")
+
+
+def _check_convex(
+    model: ArmModel, set_name: SetName | None, custom: CustomFunction | None, solver: str | None, *, again: bool
+) -> None:
+    wanted = model.config.constraints.custom
+    if wanted != (None if custom is None else custom.name):
+        raise UsageError(
+            f"{model.config.name} names {wanted} as constraints.custom; give that function, see load_custom"
+        )
+    if again and set_name == "none":
+        raise UsageError("a second opinion is about the constrained estimate; leave out the feasible set none")
+    if solver is None:
+        return
+    if custom is None and not again:
+        raise UsageError("a solver is for constraints.custom and the second opinion; add --second-opinion")
+    require_solver(solver)
 
 
 def _unseen(recording: Recording, prepared: Prepared, base: BaseParameters) -> Equations:

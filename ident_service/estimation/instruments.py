@@ -46,7 +46,7 @@ from ident_service.record.grid import grid
 from ident_service.record.recording import BLOCK_SAMPLES, Block, Recording, Stamps, join
 from ident_service.record.segments import uniform
 
-_SETTLED = 0.02  # of a standard deviation
+SETTLED = 0.02  # of a standard deviation
 _MOST_ROUNDS = 10
 _RANK_TOLERANCE = 1e-12
 _ORDER = 3  # of the low-pass on what is followed
@@ -66,7 +66,8 @@ class InstrumentalEstimate:
         feasible_beta: the nearest feasible ones in the metric of the equations, shape (base,).
         delta: feasible link parameters that belong to them, shape (parameters,).
         rounds: how often the motion was simulated.
-        change: largest change of a parameter in the last round, in its standard deviations.
+        change: largest change of a parameter in this round, in its standard deviations; of the rounds that there are,
+            the one that changed least. Above `SETTLED` it has not settled.
         strength: correlation of each instrument with its regressor column, shape (base,); below about 0.9 much of
             what the recording knows is not used.
     """
@@ -113,7 +114,7 @@ def instrumental_variables(
 
     Raises:
         ModelError: no recording or too few references, directions that the data do not see, a simulated loop that
-            runs away, instruments that say nothing about some direction, or an estimate that does not settle.
+            runs away, instruments that say nothing about some direction.
         RecordingError: a recording cannot be used.
         SolverError: the solver stopped without an optimum.
     """
@@ -124,6 +125,7 @@ def instrumental_variables(
         raise ModelError(f"{len(recordings)} recordings and {len(follow)} references; each recording needs its own")
     frequency = cutoff or model.config.identification.smoothing.cutoff * (0.25 if references is None else 1.0)
     beta = fit.beta
+    best: InstrumentalEstimate | None = None
     for number in range(1, _MOST_ROUNDS + 1):
         sums: list[_Sums] = []
         for recording, reference in zip(recordings, follow, strict=True):
@@ -136,15 +138,16 @@ def instrumental_variables(
         nearest = constrained_least_squares(replace(fit, beta=beta, rho1=fit.R1 @ beta), base, conditions)
         delta = nearest.delta
         progress(number, change)
-        if number > 1 and change < _SETTLED:
+        if number > 1 and (best is None or change < best.change):
             deviations = np.sqrt(np.diag(solved.covariance))
-            return InstrumentalEstimate(
+            best = InstrumentalEstimate(
                 beta, solved.covariance, deviations, nearest.beta, delta, number, change, solved.strength
             )
-    raise ModelError(
-        f"the instrumental estimate does not settle in {_MOST_ROUNDS} rounds; the last one changed a parameter by "
-        f"{change:.3g} of its standard deviations"
-    )
+        if number > 1 and change < SETTLED:
+            break
+    if best is None:
+        raise ModelError("the instrumental estimate needs two rounds")
+    return best
 
 
 @dataclass(frozen=True)

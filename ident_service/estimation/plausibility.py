@@ -79,8 +79,10 @@ def _errors(own: Candidate) -> Iterator[str]:
 def _against_the_unconstrained(estimate: Estimate) -> Iterator[str]:
     free, own = estimate.candidates[0], estimate.candidates[estimate.chosen]
     before, after = free.moving.relative_percent, own.moving.relative_percent
-    much = estimate.constrained and after > CONSTRAINED_FROM and after > CONSTRAINED_WORSE * before
-    worse = estimate.constrained and after > CONSTRAINED_WORSE_WITH_SIGN * before
+    # A prior and custom knowledge may be as strong as a person likes.
+    held = estimate.constrained and estimate.prior is None and estimate.custom is None
+    much = held and after > CONSTRAINED_FROM and after > CONSTRAINED_WORSE * before
+    worse = held and after > CONSTRAINED_WORSE_WITH_SIGN * before
     wrong = _driving_friction(estimate, PERHAPS_WRONG_SIGN if worse else WRONG_SIGN)
     words = f"its torque error is {after:.1f} %, and {before:.1f} % without the conditions of a real body"
     if wrong:

@@ -22,7 +22,7 @@ from ident_service.record.recording import Recording
 _TUNING = 1.345  # 95 % efficiency where the noise is normal after all
 _CONSISTENT = 1.4826  # of the median absolute deviation, for normal noise
 _SPREAD = 20_000  # rows per joint that the scale is taken from
-_SETTLED = 1e-3  # of a white standard deviation
+SETTLED = 1e-3  # of a white standard deviation
 _MOST_ROUNDS = 50
 
 
@@ -32,8 +32,11 @@ def huber(
     base: BaseParameters,
     start: LeastSquares,
     torque_scales: Array | None = None,
-) -> tuple[LeastSquares, Equations]:
-    """Huber's estimate and the reweighted equations that it solves.
+) -> tuple[LeastSquares, Equations, float]:
+    """Find Huber's estimate, the reweighted equations that it solves, and by how much the last round changed it.
+
+    Where the weights do not settle in the rounds that there are, the one that changed least is the answer: a change
+    above `SETTLED` says so.
 
     Args:
         recordings: to fit to.
@@ -44,9 +47,9 @@ def huber(
 
     Raises:
         RecordingError: a recording cannot be used.
-        ModelError: the weights do not settle.
     """
     fit = start
+    best: tuple[LeastSquares, Equations, float] | None = None
     times = np.ones(model.chain.joints) if torque_scales is None else torque_scales
     for _ in range(_MOST_ROUNDS):
         scales = _scales(recordings, model, base, fit.beta, times)
@@ -60,11 +63,15 @@ def huber(
         gathered = gathered.with_torques_times(times)
         better = ordinary_least_squares(gathered.total)
         deviations = np.where(np.isfinite(better.standard_deviations), better.standard_deviations, np.inf)
-        change = np.max(np.abs(better.beta - fit.beta) / np.maximum(deviations, np.finfo(float).tiny))
+        change = float(np.max(np.abs(better.beta - fit.beta) / np.maximum(deviations, np.finfo(float).tiny)))
         fit = better
-        if change < _SETTLED:
-            return fit, gathered
-    raise ModelError(f"the weights of the rows do not settle in {_MOST_ROUNDS} rounds")
+        if best is None or change < best[2]:
+            best = (fit, gathered, change)
+        if change < SETTLED:
+            break
+    if best is None:
+        raise ModelError("the weights of the rows need at least one round")
+    return best
 
 
 def _residuals(rows: Rows, beta: Array, times: Array) -> Array:

@@ -224,7 +224,8 @@ class _Joints:
         largest = self._largest[0, joint] ** 2
         # A jump comes with the way back, and both are left out.
         others = self._squares[joint] - largest * (2.0 if self._squares[joint] > 2.0 * largest else 1.0)
-        return float(np.sqrt(max(others, 0.0) / max(self._steps - 2, 1)))
+        usual = float(np.sqrt(max(others, 0.0) / max(self._steps - 2, 1)))
+        return float(f"{usual:.6g}")  # the same wherever the file was cut into blocks
 
     def _count(self, steps: Array, stamps_ns: NDArray[np.int64]) -> None:
         taken = np.diff(stamps_ns) * 1e-9

@@ -164,6 +164,7 @@ def parameters_document(estimate: Estimate, described: ArmConfig | None = None) 
             "unconstrained_values": estimate.fit.beta.tolist(),
             "standard_deviations": _perhaps(estimate.standard_deviations),
             "white_standard_deviations": _perhaps(estimate.white_standard_deviations),
+            "degrees_of_freedom": [round(value, 3) for value in estimate.degrees.tolist()],
             "covariance": [_perhaps(row) for row in estimate.covariance],
             "verdicts": list(estimate.verdicts),
         },
@@ -182,6 +183,7 @@ def parameters_document(estimate: Estimate, described: ArmConfig | None = None) 
             "deviation": None if estimate.prepared.delay is None else estimate.prepared.delay.deviation,
         },
         "torque_scales": estimate.prepared.torque_scales.tolist(),
+        **convex_document(estimate),
         "fit": {
             "samples": estimate.samples,
             "blocks": len(estimate.fitted.blocks),
@@ -200,6 +202,32 @@ def parameters_document(estimate: Estimate, described: ArmConfig | None = None) 
             "git": _commit(),
         },
     }
+    return document
+
+
+def convex_document(estimate: Estimate) -> dict[str, Any]:
+    """State as JSON values what was solved through cvxpy: custom knowledge and the second opinion, where there are."""
+    document: dict[str, Any] = {}
+    if (known := estimate.custom) is not None:
+        document["custom"] = {
+            "function": known.function.name,
+            "file": known.function.file,
+            "sha256": known.function.sha256,
+            "solver": known.solver,
+            "relative_error_percent": known.error,
+            "relative_error_percent_without": known.error_without,
+        }
+    if (second := estimate.second) is not None:
+        document["second_opinion"] = {
+            "agrees": second.agrees,
+            "solvers": list(second.solvers),
+            "status": second.status,
+            "objectives": list(second.objectives),
+            "torque_difference_percent": second.torque_percent,
+            "largest_difference_in_deviations": second.deviations,
+            "expression": second.expression,
+            "margin": second.margin,
+        }
     return document
 
 

@@ -29,6 +29,7 @@ def summary(estimate: Estimate, unusable: Sequence[str] = ()) -> str:
         f"condition number of the regressor: {estimate.fit.condition_number:.1f}",
         "",
         _feasibility(estimate),
+        *_convex(estimate),
         "",
         "relative torque error in percent (eq. 84): of all rows, and of joints away from standstill",
         _row(f"  verdict by {estimate.conditions.kind}", columns),
@@ -119,6 +120,32 @@ def _feasibility(estimate: Estimate) -> str:
         return text
     text = f"INFEASIBLE ({kind}): margin {estimate.margin:.3g}; no body has these parameters\ncontradicted by:\n"
     return text + "\n".join(f"  {name}" for name in estimate.tight)
+
+
+def _convex(estimate: Estimate) -> list[str]:
+    """State custom knowledge and the second opinion, where there are."""
+    lines = []
+    if (known := estimate.custom) is not None:
+        function = known.function
+        lines += [
+            "",
+            f"with {function.name} ({function.file}) by {known.solver}: torque error {known.error:.4f} % where joints "
+            f"move, {known.error_without:.4f} % without it",
+            "(verdict, margin and certificate are about the other conditions of the description alone)",
+        ]
+    if (second := estimate.second) is not None:
+        one, other = second.objectives
+        first_by, second_by = second.solvers
+        lines += [
+            "",
+            f"second opinion, {second_by} through cvxpy ({second.status}): "
+            + ("the two agree" if second.agrees else "THE TWO DIFFER, use neither before you know why"),
+            f"  objective {one:.9g} by {first_by}, {other:.9g} by {second_by}"
+            + (f", which misses the set by {-second.margin:.1g}" if second.margin <= 0.0 else ""),
+            f"  predicted torques differ by {second.torque_percent:.2g} %, base parameters by at most "
+            f"{second.deviations:.2g} deviations: {_short(second.expression)}",
+        ]
+    return lines
 
 
 def _short(expression: str, width: int = 58) -> str:

@@ -13,6 +13,7 @@ from drivers.clock import Clock
 from ident_service.config.limits import motion_limits
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import ArmError, UsageError
+from ident_service.estimation.custom import CustomFunction
 from ident_service.estimation.equations import equations
 from ident_service.estimation.feasible.feasible_set import SetName
 from ident_service.estimation.identify import Estimate, identify
@@ -115,6 +116,7 @@ def simulate(
     motion: Excitation | None = None,
     set_name: SetName | None = None,
     described: ArmConfig | None = None,
+    custom: CustomFunction | None = None,
     clock: Clock | None = None,
     tell: Tell = lambda _: None,
     stop_requested: Callable[[], bool] = lambda: False,
@@ -127,6 +129,7 @@ def simulate(
         motion: to identify from, a designed one for example; the description's when None.
         set_name: feasible set, the configuration's when None.
         described: the configuration as it was read, where it was changed since; `config` when None.
+        custom: the function that its `constraints.custom` names.
         clock: the loop's, what the driver section asks for when None.
         tell: called with a line at each step.
         stop_requested: asked every cycle.
@@ -163,7 +166,7 @@ def simulate(
             write_atomically(staging / f"{planned.name}.excitation.json", planned.to_json() + "\n")
         tell("identifying")
         recordings = [KeptRecording(open_recording(path, model.chain.names)) for path in paths]
-        estimate = identify(model, recordings[:1], recordings[1:], set_name=set_name)
+        estimate = identify(model, recordings[:1], recordings[1:], set_name=set_name, custom=custom)
         scored = score(estimate, truth, observed, equations(recordings[1], model, estimate.base))
         found = [(one, recording_quality(one, model)) for one in recordings]
         unusable = unusable_because(estimate, found)

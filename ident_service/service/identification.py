@@ -10,16 +10,20 @@ from typing import Any
 
 import numpy as np
 
-from ident_service.config.load import load_arm, load_recording_format
+from ident_service.config.load import folder_of, load_arm, load_recording_format, mistake
 from ident_service.config.schema import ArmConfig, Method
 from ident_service.errors import RecordingError, SolverError, UsageError
 from ident_service.estimation.bootstrap import bootstrap
+from ident_service.estimation.custom import CustomError, CustomFunction, load_custom
 from ident_service.estimation.essential import essential_parameters
+from ident_service.estimation.feasible.convex import convex_least_squares
 from ident_service.estimation.feasible.feasible_set import SetName
 from ident_service.estimation.identify import Estimate, identify
+from ident_service.estimation.least_squares import LeastSquares
 from ident_service.estimation.plausibility import reasons_against, reasons_in_recording
 from ident_service.estimation.proof.sdpa import bpfc_sdpa, bpft_sdpa, fbpe_sdpa
 from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.model.chain import Array
 from ident_service.record.kept import KeptRecording
 from ident_service.record.open import open_recording
 from ident_service.record.part import TrimmedRecording
@@ -46,7 +50,9 @@ class Request:
         delay: between position and torque [s], or `estimate`; the arm's when None.
         replicates: of the bootstrap of the constrained estimate; 0 for none.
         essential: whether to look for the smallest model that predicts as well.
-        sdpa: whether to write the optimisation problems for other solvers.
+        sdpa: whether to write the optimisation problems for other solvers, `constraints.custom` left out.
+        solver: of what is posed in cvxpy; Clarabel when None.
+        second_opinion: whether to solve the constrained problem a second time, in cvxpy.
     """
 
     arm: str
@@ -61,6 +67,8 @@ class Request:
     replicates: int = 0
     essential: bool = False
     sdpa: bool = False
+    solver: str | None = None
+    second_opinion: bool = False
 
 
 _TRIMMED = re.compile(r"^(?P<path>.+)@(?P<start>\d+(?:\.\d*)?):(?P<end>\d+(?:\.\d*)?)$")
@@ -100,18 +108,31 @@ def identify_files(request: Request, folder: Path, tell: Callable[[str], None] =
         raise UsageError(f"{folder}: is a file, not a folder")
     described = load_arm(request.arm)
     model = arm_model(_config(described, request))
+    custom = custom_of(request.arm, described)
     recordings = [open_for(path, model) for path in request.recordings]
     validation = [open_for(path, model) for path in request.validation]
     found = [(recording, recording_quality(recording, model)) for recording in [*recordings, *validation]]
     warnings = tuple(f"{recording.path}: {line}" for recording, seen in found for line in seen.warnings())
     try:
-        estimate = identify(model, recordings, validation, method=request.method, set_name=request.set_name)
+        estimate = identify(
+            model,
+            recordings,
+            validation,
+            method=request.method,
+            set_name=request.set_name,
+            custom=custom,
+            solver=request.solver,
+            again=request.second_opinion,
+        )
+    except CustomError as error:
+        raise mistake(request.arm, CUSTOM, str(error)) from error
     except SolverError as error:
         # Numbers of another size than the solver can hold are the recording's fault, and the reason says so.
         for recording, seen in found:
             for reason in reasons_in_recording(recording.path.name, seen.joints, model):
                 raise RecordingError(recording.path, reason) from error
         raise
+    warnings += estimate.remarks
     unusable = unusable_because(estimate, found)
     more: dict[str, Any] = {"recording_quality": [_quality_document(recording, seen) for recording, seen in found]}
     if request.replicates:
@@ -127,6 +148,28 @@ def identify_files(request: Request, folder: Path, tell: Callable[[str], None] =
         files += write_report(staging, estimate, recordings, validation, warnings)
         write_manifest(staging)
     return Identified(estimate, (*files, MANIFEST), warnings, unusable)
+
+
+CUSTOM = ("constraints", "custom")
+
+
+def custom_of(arm: str, config: ArmConfig) -> CustomFunction | None:
+    """Load the function that a description names as `constraints.custom`, from beside it or from `sys.path`.
+
+    Args:
+        arm: description file or name of a shipped one.
+        config: what it says.
+
+    Raises:
+        ConfigError: it cannot be imported; with the place where the description names it.
+    """
+    name = config.constraints.custom
+    if name is None:
+        return None
+    try:
+        return load_custom(name, folder_of(arm, CUSTOM))
+    except CustomError as error:
+        raise mistake(arm, CUSTOM, str(error)) from error
 
 
 def unusable_because(estimate: Estimate, found: Sequence[tuple[Recording, Quality]]) -> tuple[str, ...]:
@@ -193,7 +236,15 @@ def _quality_document(recording: Recording, seen: Quality) -> dict[str, Any]:
 
 
 def _bootstrap(estimate: Estimate, replicates: int) -> dict[str, Any]:
-    drawn = bootstrap(estimate.fitted, estimate.fit, estimate.base, estimate.conditions, replicates)
+    base, conditions, known = estimate.base, estimate.conditions, estimate.custom
+    solve = None
+    if known is not None:
+
+        def solve(fit: LeastSquares) -> Array:
+            found = convex_least_squares(fit, base, conditions, custom=known.function, solver=known.solver)
+            return found.estimate.beta
+
+    drawn = bootstrap(estimate.fitted, estimate.fit, base, conditions, replicates, solve=solve)
     return {
         "replicates": replicates,
         "blocks_in_a_run": drawn.run,

@@ -24,6 +24,7 @@ from ident_service.estimation.proof.certificate import certify
 from ident_service.model.arm_model import arm_model
 from ident_service.model.notation import Notation
 from ident_service.results.parameter_file import ParameterFile, read_parameters, write_parameters
+from ident_service.service.verify import custom_note
 
 
 @dataclass(frozen=True)
@@ -60,8 +61,8 @@ def check_file(
         UsageError, ConfigError, ParameterError: the file or the arm cannot be used.
         SolverError: the solver stopped without an optimum.
     """
-    file, conditions = _read(path, kind, arm, notation)
-    return CheckedFile(conditions.kind, feasibility_test(file.values, file.base, conditions), file.notes)
+    file, conditions, notes = _read(path, kind, arm, notation)
+    return CheckedFile(conditions.kind, feasibility_test(file.values, file.base, conditions), notes)
 
 
 def correct_file(
@@ -89,15 +90,22 @@ def correct_file(
         UsageError, ConfigError, ParameterError: the file or the arm cannot be used, or `out` not written.
         SolverError: the solver stopped without an optimum.
     """
-    file, conditions = _read(path, kind, arm, notation)
+    file, conditions, notes = _read(path, kind, arm, notation)
     result = feasibility_correction(
         file.values, file.base, conditions, _covariance(path, file) if metric == "covariance" else None
     ).centred(file.base, conditions)
     content = deepcopy(file.content)
-    for stale in ("fit", "information", "validation"):
+    for stale in ("fit", "information", "validation", "custom", "second_opinion"):
         content.pop(stale, None)
     table = content["base_parameters"]
-    for stale in ("unconstrained_values", "standard_deviations", "white_standard_deviations", "covariance", "verdicts"):
+    for stale in (
+        "unconstrained_values",
+        "standard_deviations",
+        "white_standard_deviations",
+        "degrees_of_freedom",
+        "covariance",
+        "verdicts",
+    ):
         table.pop(stale, None)
     table["values"] = result.beta.tolist()
     content["method"] = "correction"
@@ -110,7 +118,7 @@ def correct_file(
         "certificate": proof.document,
     }
     write_parameters(out, content)
-    return CorrectedFile(conditions.kind, result, file.notes)
+    return CorrectedFile(conditions.kind, result, notes)
 
 
 def _covariance(path: Path, file: ParameterFile) -> NDArray[np.float64]:
@@ -124,7 +132,7 @@ def _covariance(path: Path, file: ParameterFile) -> NDArray[np.float64]:
 
 def _read(
     path: Path, kind: FeasibleSetName | None, arm: str | None, notation: Notation | None
-) -> tuple[ParameterFile, FeasibleSet]:
+) -> tuple[ParameterFile, FeasibleSet, tuple[str, ...]]:
     config, names = None, None
     if arm is not None:
         model = arm_model(load_arm(arm))
@@ -135,4 +143,6 @@ def _read(
         if claimed["joints"] != joints:
             raise ParameterError(f"{path}: is about the arm {claimed['name']} with other joints than {config.name}")
     claimed_set: FeasibleSetName = "inertia" if file.feasible_set == "inertia" else "pseudo_inertia"
-    return file, feasible_set(kind or claimed_set, file.base.names, config, positive=Constraints().positive)
+    conditions = feasible_set(kind or claimed_set, file.base.names, config, positive=Constraints().positive)
+    custom = () if config is None or config.constraints.custom is None else (custom_note(config.constraints.custom),)
+    return file, conditions, (*file.notes, *custom)

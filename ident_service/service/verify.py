@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,13 +31,26 @@ def verify_file(path: Path, arm: str | None = None) -> Verification:
         ConfigError: the description has mistakes.
     """
     try:
-        return verify_path(path, None if arm is None else _arm(arm, path / _FILE if path.is_dir() else path))
+        if arm is None:
+            return verify_path(path)
+        stated, custom = _arm(arm, path / _FILE if path.is_dir() else path)
+        result = verify_path(path, stated)
+        if custom is None:
+            return result
+        return replace(result, message=f"{result.message}; {custom_note(custom)}")
     except OSError as error:
         raise UsageError(f"{error.filename or path}: {error.strerror or error}") from None
 
 
-def _arm(arm: str, file: Path) -> Arm:
-    """State the conditions and expressions of a description."""
+def custom_note(name: str) -> str:
+    """Say that an answer about an arm leaves out its `constraints.custom`."""
+    return (
+        f"constraints.custom ({name}) of the description is code, which only `ident identify` runs; it is left out here"
+    )
+
+
+def _arm(arm: str, file: Path) -> tuple[Arm, str | None]:
+    """State the conditions and expressions of a description, and name the custom knowledge that is none of them."""
     # The numerical packages are loaded only where there is a description to make conditions from.
     from ident_service.config.load import arm_from_json, load_arm
     from ident_service.estimation.feasible.feasible_set import feasible_set
@@ -48,7 +62,8 @@ def _arm(arm: str, file: Path) -> Arm:
     model = arm_model(config)
     base = base_parameters(model.chain, model.layout)
     conditions = feasible_set("pseudo_inertia", base.names, config)
-    return stated_arm(config.name, _sha256(config, file), base, conditions, units=model.layout.units)
+    stated = stated_arm(config.name, _sha256(config, file), base, conditions, units=model.layout.units)
+    return stated, config.constraints.custom
 
 
 def _sha256(config: ArmConfig, file: Path) -> str:

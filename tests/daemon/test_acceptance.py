@@ -9,10 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from ident_service.config.load import arm_from_json
 from ident_service.errors import ParameterError, UnknownId, UsageError
 from ident_service.results.manifest import MANIFEST, write_manifest
 from ident_service.service.acceptance import accept, acceptances, rollback, settle
 from ident_service.service.import_run import import_run
+from ident_service.service.jobs.commands import accepted_description
 from ident_service.service.registry.database import Database
 from ident_service.service.registry.runs import (
     index_run,
@@ -62,6 +64,23 @@ def test_a_kill_after_the_act_and_before_what_follows_is_made_good(db: Database,
     half.mkdir()
     settle(db, state)
     assert len(acceptances(state, "quick")) == 2
+
+
+def test_what_was_identified_with_code_is_not_identified_again_by_a_daemon(
+    db: Database, state: Path, folder: Path
+) -> None:
+    accept(db, state, folder, "good", "me")
+    assert accepted_description(state, "quick", 1).name == "arm.json"
+    config = arm_from_json(folder / "arm.json")
+    extended = config.model_copy(update={"constraints": config.constraints.model_copy(update={"custom": "some:code"})})
+    (folder / "arm.json").write_text(extended.model_dump_json())
+    document = json.loads((folder / "parameters.json").read_text())
+    document["arm"]["sha256"] = extended.sha256
+    (folder / "parameters.json").write_text(json.dumps(document))
+    write_manifest(folder)
+    accept(db, state, folder, "from another machine", "me")
+    with pytest.raises(UsageError, match=r"identified with code \(constraints.custom: some:code\)"):
+        accepted_description(state, "quick", 2)
 
 
 def test_what_is_not_whole_or_not_feasible_is_not_accepted(db: Database, state: Path, folder: Path) -> None:

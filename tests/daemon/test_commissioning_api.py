@@ -57,6 +57,7 @@ def test_a_run_ends_early(daemon: Asked, patient: str, state: Path, asked: str) 
         for word in words:
             answer = daemon.post(f"/api/v1/arms/{ARM}/{word}")
             assert (answer.status_code, answer.json()) == (200, {"arm": ARM, "asked": word, "reached": True})
+        assert daemon.service.engine.audit.flush(10.0)
         assert [line["what"] for line in trail(daemon.service.db, most=len(words))] == words[::-1]
     ended = daemon.follow(job, lease=True)
     assert ended["state"] == "done", ended

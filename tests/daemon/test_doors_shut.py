@@ -280,6 +280,18 @@ def test_an_upload_learns_nothing_of_other_files(daemon: Asked, state: Path, doo
     assert "no such file: FILE" in answer("kinematics: {{urdf: {}}}", "x" * 300)
 
 
+@pytest.mark.parametrize("door", ["arms", "descriptions/check"])
+def test_an_upload_names_no_code(daemon: Asked, state: Path, door: str) -> None:
+    # Were it imported, it would leave a trace, wherever it was looked for.
+    trace = state.parent / "imported"
+    text = "extends: planar2\nname: spy\nconstraints: {custom: spying:spied}\n"
+    files = {"spying.py": f"open({str(trace)!r}, 'w')\ndef spied(link, base): return []\n"}
+    answer = daemon.post(f"/api/v1/{door}", {"description": text, "files": files})
+    refusal(answer, 422, "3:15: constraints.custom: a description that is sent names no code")
+    assert not any(row["name"] == "spy" for row in daemon.get("/api/v1/arms").json())
+    assert not trace.exists()
+
+
 def test_a_file_of_an_upload_is_not_taken_for_a_shipped_arm(daemon: Asked, state: Path) -> None:
     secret = state.parent / "secret.urdf"
     secret.write_text("<robot name='secret'/>")

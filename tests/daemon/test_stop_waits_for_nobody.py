@@ -24,7 +24,7 @@ from ident_service.service.registry.audit import trail
 from ident_service.service.registry.database import FILE
 
 FAR = "203.0.113.9"
-SOON = 3.0  # s: less than the ten that a write waits for another process
+SOON = 8.0  # s: less than the ten that a write waits for another process
 MAINTENANCE = ("/api/v1/arms/planar2/maintenance", {"what": "belt"})
 
 

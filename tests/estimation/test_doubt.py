@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import reduce
 
 import numpy as np
@@ -10,7 +11,7 @@ import scipy.signal
 from estimation.synthetic import one_joint_information, random_information, serial_chain
 from helpers.random_arms import model_around, random_delta
 
-from ident_service.estimation.doubt import REFERENCE, block_covariance, verdicts
+from ident_service.estimation.doubt import REFERENCE, block_covariance, uncertainty, verdicts
 from ident_service.estimation.equations import Equations
 from ident_service.estimation.least_squares import ordinary_least_squares
 from ident_service.model.base import base_parameters
@@ -31,7 +32,7 @@ def test_it_is_the_jackknife_over_blocks() -> None:
         rest = reduce(Information.merged, blocks[:left_out] + blocks[left_out + 1 :])
         change = ordinary_least_squares(rest).beta - fit.beta
         wanted += np.outer(change, change)
-    got = block_covariance(gathered, fit)
+    got = block_covariance(gathered, replace(fit, standard_deviations=np.zeros(base.size)))  # no floor
     scale = np.sqrt(np.outer(np.diag(wanted), np.diag(wanted)))
     np.testing.assert_allclose(got / scale, wanted / scale, rtol=0, atol=1e-8)
 
@@ -57,6 +58,58 @@ def test_it_is_calibrated_where_neighbours_are_alike() -> None:
     np.testing.assert_allclose(np.sqrt(claimed.mean(axis=0)) / empirical, 1.0, rtol=0, atol=0.25)
     # Residuals taken for independent promise too much by the factor that makes the blocks necessary.
     assert np.all(np.sqrt(white.mean(axis=0)) / empirical < 0.5)
+
+
+def few_blocks(seed: int, blocks: int) -> tuple[Equations, np.ndarray]:
+    """Equations of white noise, of which the last column is seen in the first block alone."""
+    rng = np.random.default_rng(seed)
+    parts = []
+    for number in range(blocks):
+        W = rng.normal(size=(30, 4))
+        W[:, 3] *= number == 0
+        parts.append(one_joint_information(W, rng.normal(size=30)))
+    return Equations(tuple(parts), 30 * blocks), np.zeros(4)
+
+
+def test_what_one_block_alone_tells_has_no_deviation() -> None:
+    for seed in range(12):
+        gathered, _ = few_blocks(seed, 10)
+        found = uncertainty(gathered, ordinary_least_squares(gathered.total))
+        np.testing.assert_array_equal(np.isinf(np.diag(found.covariance)), np.arange(4) == 3)
+
+
+def test_no_deviation_is_below_that_of_white_residuals() -> None:
+    for seed in range(12):
+        gathered, _ = few_blocks(seed, 4)
+        fit = ordinary_least_squares(gathered.total)
+        deviations = np.sqrt(np.diag(uncertainty(gathered, fit).covariance))
+        assert (deviations >= fit.standard_deviations * (1.0 - 1e-12)).all()
+
+
+@pytest.mark.parametrize("blocks", [4, 12, 24])
+def test_degrees_of_freedom_are_those_of_the_variances(blocks: int) -> None:
+    """The variance of a variance is 2 V^2 / degrees where errors are white, as it is of a chi-squared variable."""
+    rng, repetitions = np.random.default_rng(blocks), 700
+    W = rng.normal(size=(20 * blocks, 3))
+    claimed = np.zeros((repetitions, 3))
+    for repetition in range(repetitions):
+        noise = rng.normal(size=len(W))
+        parts = [
+            one_joint_information(*pair) for pair in zip(np.split(W, blocks), np.split(noise, blocks), strict=True)
+        ]
+        gathered = Equations(tuple(parts), len(W))
+        fit = ordinary_least_squares(gathered.total)
+        found = uncertainty(gathered, replace(fit, standard_deviations=np.zeros(3)))
+        claimed[repetition] = np.diag(found.covariance)
+    empirical = 2.0 * claimed.mean(axis=0) ** 2 / claimed.var(axis=0)
+    np.testing.assert_allclose(found.degrees / empirical, 1.0, rtol=0, atol=0.25)
+
+
+def test_a_deviation_from_few_blocks_counts_for_more() -> None:
+    one = np.array([1.0])
+    assert verdicts(one, 0.09 * one, ("N m",)) == ("identified",)
+    assert verdicts(one, 0.09 * one, ("N m",), 40.0 * one) == ("identified",)
+    assert verdicts(one, 0.09 * one, ("N m",), 4.0 * one) == ("weak",)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,8 @@ from ident_service.errors import RecordingError
 from ident_service.estimation.delay import Delay, estimate_delay, with_delay
 from ident_service.estimation.direction import direction
 from ident_service.estimation.equations import equations
-from ident_service.estimation.friction_fit import fit_friction, with_friction
+from ident_service.estimation.friction_fit import at_the_edge, fit_friction, with_friction
+from ident_service.estimation.identify import identify
 from ident_service.estimation.least_squares import torque_error, weighted_least_squares
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters, base_parameters
@@ -215,3 +216,23 @@ def test_the_rate_and_other_options_come_back_untouched() -> None:
     after = fit_friction([rubbed(model, delta, PRESLIDING)], model, base).config.identification
     assert after.model_copy(update={"friction": before.friction}) == before
     assert model.config.identification is before
+
+
+def test_a_number_at_the_end_of_its_search_is_said() -> None:
+    shape = FrictionShape(presliding=(0.05, 0.01), stribeck_velocity=(0.8, 0.02))
+    assert at_the_edge(shape, ("shoulder", "elbow"), ("coulomb", "stribeck")) == (
+        "shoulder: its pre-sliding distance of 0.05 is the largest that is searched",
+        "shoulder: its Stribeck velocity of 0.8 is the largest that is searched",
+        "elbow: its Stribeck velocity of 0.02 is the smallest that is searched",
+    )
+    assert len(at_the_edge(shape, ("shoulder", "elbow"), ("coulomb",))) == 1
+
+
+@pytest.mark.slow
+def test_the_edge_is_a_remark_of_the_estimate() -> None:
+    model, _, delta = rubbing(FIT)
+    estimate = identify(model, [rubbed(model, delta, np.array([0.2, 0.01]))])
+    assert estimate.remarks[0].startswith(f"{model.chain.names[0]}: its ")
+    assert estimate.remarks[0].endswith(" is the largest that is searched")
+    given = rubbing(FrictionShape(presliding=0.05, stribeck_velocity=0.8))[0]
+    assert identify(given, [rubbed(model, delta, PRESLIDING)]).remarks == ()

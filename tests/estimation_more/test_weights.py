@@ -143,7 +143,7 @@ def test_without_outliers_huber_is_weighted_least_squares_nearly() -> None:
     recording = with_noise(0.0)
     total = equations(recording, model, base).total
     fit = weighted_least_squares(total)
-    robust, gathered = huber([recording], model, base, fit)
+    robust, gathered, _ = huber([recording], model, base, fit)
     assert np.all(np.abs(robust.beta - fit.beta) < 1.5 * fit.standard_deviations)
     np.testing.assert_allclose(robust.standard_deviations, fit.standard_deviations, rtol=0.25)
     np.testing.assert_array_equal(gathered.total.rows, total.rows)
@@ -153,7 +153,7 @@ def test_huber_solves_its_own_condition() -> None:
     # At the estimate, the sum of regressor times clipped residual vanishes.
     model, base, _ = three_links()
     recording = with_noise(0.02)
-    fit, gathered = huber([recording], model, base, weighted_least_squares(equations(recording, model, base).total))
+    fit, gathered, _ = huber([recording], model, base, weighted_least_squares(equations(recording, model, base).total))
     scores = gathered.total.scores(fit.beta)
     assert np.all(np.abs(fit.inverse.T @ scores) < 1e-6 * np.linalg.norm(fit.rho1))
 
@@ -204,3 +204,13 @@ def test_every_method_finds_the_parameters(estimates: dict[str, np.ndarray]) -> 
     assert off(estimates["wls"]) < off(estimates["ols"])
     assert len({tuple(beta) for beta in estimates.values()}) == 4
     assert off(base.K @ delta) < 1e-9 * whole
+
+
+def test_weights_that_do_not_settle_give_the_best_round_and_say_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, _, _ = three_links()
+    monkeypatch.setattr("ident_service.estimation.robust._MOST_ROUNDS", 2)
+    estimate = identify(model, [with_noise(0.02)], method="huber")
+    assert np.isfinite(estimate.beta).all()
+    assert "Huber's weights did not settle: of all rounds the one is used" in estimate.remarks[0]
+    monkeypatch.undo()
+    assert identify(model, [with_noise(0.02)], method="huber").remarks == ()

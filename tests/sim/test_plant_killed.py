@@ -76,7 +76,7 @@ def at_a_random_time(tmp_path, mode, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", ["virtual", "real"])
+@pytest.mark.parametrize("mode", ["virtual", pytest.param("real", marks=pytest.mark.campaign)])
 def test_the_wam_with_its_client_killed_at_most_creeps(tmp_path, mode):
     # Without brakes a joint near the top of its swing sinks for minutes: j7 does, at a hundredth of its velocity limit.
     config, status = killed_story(tmp_path, 0.5, name="wam7_sim", time=mode)

@@ -34,6 +34,7 @@ class Solution:
         seconds: inside the solver, over all attempts.
         tolerance: of gap and feasibility, relative, that the solver was asked for and reached.
         attempts: how many times the problem was posed, 1 unless the solver stopped early.
+        bound: of each link's tr(P) [kg] that the problem was posed with, see `posing.py`.
     """
 
     x: Array
@@ -43,6 +44,7 @@ class Solution:
     seconds: float
     tolerance: float = 1e-9
     attempts: int = 1
+    bound: float = np.inf
 
 
 @dataclass(frozen=True)

@@ -45,6 +45,8 @@ class FeasibleEstimate:
         iterations: of the solver.
         solver_seconds: inside the solver.
         prior_distance: divergence from the prior, before its weight; 0 without one.
+        bound: of each link's tr(P) [kg] within which it was sought, see `posing.py`; infinite for none.
+        penalty: value of the penalty of `constraints.custom`; None without one.
     """
 
     beta: Array
@@ -55,6 +57,8 @@ class FeasibleEstimate:
     iterations: int
     solver_seconds: float
     prior_distance: float = 0.0
+    bound: float = np.inf
+    penalty: float | None = None
 
     def centred(self, base: BaseParameters, conditions: FeasibleSet) -> FeasibleEstimate:
         """Return the same base parameters with the most central link parameters, see `central.py`."""
@@ -186,6 +190,7 @@ def nearest(
                 tight=() if at_target else pressing(conditions, solution.duals[1:]),
                 iterations=solution.iterations,
                 solver_seconds=solution.seconds,
+                bound=solution.bound,
             )
         if solution.attempts == 1 and solution.iterations <= HARD:
             break

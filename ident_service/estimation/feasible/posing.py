@@ -9,6 +9,7 @@ feasibility test asks whether any body exists; it is bounded only where it canno
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -80,15 +81,13 @@ def minimise(
         SolverError: no optimum within any reach, or none that is acceptable.
     """
     T, d = to_delta
-    trace = traces(conditions)
-    numbers = (np.abs(block.f).max(initial=0.0) for block in conditions.blocks)
-    largest = max(1.0, size, *map(float, numbers))
+    trace, top = traces(conditions), largest(conditions, size)
     status = ""
     for reach in reaches:
         bounded = problem
         if np.isfinite(reach):
             bounded = problem.copy()
-            bounded.nonnegative(-trace @ T / reach, largest - trace @ d / reach)
+            bounded.nonnegative(-trace @ T / reach, top - trace @ d / reach)
         try:
             solution = bounded.minimise(objective, name, quadratic)
         except SolverError as error:
@@ -98,9 +97,20 @@ def minimise(
             status = status or error.status
             continue
         if accept(solution.x):
-            return solution
+            return replace(solution, bound=reach * top)
         status = status or "outside the set"
     raise SolverError(name, status)
+
+
+def largest(conditions: FeasibleSet, size: float) -> float:
+    """Return the largest base parameter or bound, at least 1, which a reach is multiplied by.
+
+    Args:
+        conditions: whose bounds.
+        size: of the largest base parameter.
+    """
+    numbers = (np.abs(block.f).max(initial=0.0) for block in conditions.blocks)
+    return max(1.0, size, *map(float, numbers))
 
 
 def traces(conditions: FeasibleSet) -> Array:

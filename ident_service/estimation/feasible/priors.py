@@ -176,6 +176,7 @@ def towards_prior(fit: LeastSquares, base: BaseParameters, conditions: FeasibleS
         iterations=solution.iterations,
         solver_seconds=solution.seconds,
         prior_distance=prior.divergence(delta),
+        bound=solution.bound,
     )
 
 

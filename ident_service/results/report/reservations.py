@@ -80,6 +80,8 @@ def reservations(evidence: Evidence, parameters: ParameterFile) -> list[str]:
     found = [f"Must not be used: {reason}." for reason in parameters.content.get("unusable", [])]
     if parameters.content.get("feasibility", {}).get("margin", 1.0) <= 0.0:
         found.append("No real body has these parameters.")
+    if not parameters.content.get("second_opinion", {}).get("agrees", True):
+        found.append("A second solution of the constrained problem predicts other torques (report.txt).")
     poor = poor_joints(evidence, parameters)
     if moving := [one for one in poor if one.in_motion]:
         found.append(f"Off by more than {POOR:g} % of their own torque: {joints_in_words(moving)}.")

@@ -61,6 +61,9 @@ def _feasibility(evidence: Evidence, parameters: ParameterFile) -> list[str]:
             sentences.append(_CERTIFIED)
         else:
             sentences.append("They lie too close to the boundary for a certificate in exact arithmetic.")
+        if (custom := parameters.content.get("custom")) is not None:
+            name = shortened(custom["function"])
+            sentences.append(f"They were also held to what {name} says, a function that no certificate is about.")
         if tight:
             sentences.append(f"{active_conditions(evidence, parameters)}, which the data pull against: {tight}.")
         return [*sentences, how]

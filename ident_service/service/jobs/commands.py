@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from ident_service.config.load import arm_from_json
 from ident_service.errors import UsageError
 from ident_service.motion.controls import HOLD_TO_RUN_SECONDS, LEASE_SECONDS
 from ident_service.service.acceptance import ARM, PARAMETERS, accepted_set
@@ -113,6 +114,23 @@ def command(db: Database, state: Path, asked: Asked) -> Command:
     )
 
 
+def accepted_description(state: Path, arm: str, number: int) -> Path:
+    """Return the file of the description that an acceptance keeps.
+
+    Raises:
+        UsageError: there is no such acceptance; or its description names code, which only a terminal may run. An upload
+            cannot name any, but a folder that was imported can.
+        ParameterError: what was accepted was changed on the disk.
+    """
+    path = accepted_set(state, arm, number)[1] / ARM
+    if (code := arm_from_json(path).constraints.custom) is not None:
+        raise UsageError(
+            f"what was accepted for {arm} was identified with code (constraints.custom: {code}), which a daemon does "
+            "not run; use `ident reidentify` at a terminal"
+        )
+    return path
+
+
 def _words(db: Database, state: Path, asked: Asked, arm: KnownArm) -> list[str]:
     path = str(arm.path)
     if isinstance(asked, Design):
@@ -122,7 +140,7 @@ def _words(db: Database, state: Path, asked: Asked, arm: KnownArm) -> list[str]:
         judged = [f"--validate={one}" for one in _recordings(db, state, asked.validate_on)]
         chosen = {"method": asked.method, "feasible-set": asked.feasible_set, "prior": asked.prior}
         if asked.as_accepted is not None:
-            path = str(accepted_set(state, arm.name, asked.as_accepted)[1] / ARM)
+            path = str(accepted_description(state, arm.name, asked.as_accepted))
         return [*recordings, "--arm", path, *judged, *_given(chosen)]
     if isinstance(asked, Simulate):
         motion = [] if asked.motion is None else [f"--motion={motion_path(db, state, asked.motion)}"]

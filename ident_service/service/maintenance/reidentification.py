@@ -25,7 +25,7 @@ from ident_service.config.schema import ArmConfig
 from ident_service.errors import IdentError, MotionRefused, UnknownId, UsageError
 from ident_service.service.acceptance import ARM, accepted_set
 from ident_service.service.jobs.asked import Asked, Check, Identify, Judge, RecordingOf, Run
-from ident_service.service.jobs.commands import JOBS
+from ident_service.service.jobs.commands import JOBS, accepted_description
 from ident_service.service.jobs.engine import Engine
 from ident_service.service.jobs.outcome import said
 from ident_service.service.jobs.recovery import UNTOLD
@@ -177,6 +177,7 @@ class Reidentifications:
         if wanted.unattended:
             _require_allowed(config)
         against = require_comparable(self._state, config)
+        accepted_description(self._state, config.name, against)  # told here, before anything moves
         name, stops = new_id(wanted.arm), self._engine.live.stops(wanted.arm)
 
         def enter(job: Row) -> None:

@@ -1,0 +1,295 @@
+"""The constrained least squares posed a second time, in cvxpy: for `constraints.custom`, and as a second opinion.
+
+The problem is that of `nearest.py` and `priors.py`: the same blocks with the same inset, the same equalities, the same
+bound of each link's tr(P) = m + tr(L)/2, the same residual and prior. The formulation is another one: the variable is
+delta itself in reference scales (`blocks.py`), and cvxpy makes the cones.
+
+With a penalty p(delta), what is minimised is |R_1 beta - rho_1|^2 / sigma^2 + p (+ the prior's term): p is measured in
+residual variances, as -2 log of a prior density would be. cvxpy is loaded when a problem is posed, not before.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ident_service.errors import SolverError, UsageError
+from ident_service.estimation.custom import CustomError, CustomFunction
+from ident_service.estimation.feasible.blocks import Block, reference
+from ident_service.estimation.feasible.conic import triangle_entries
+from ident_service.estimation.feasible.consistency import ConditionsError, contradiction
+from ident_service.estimation.feasible.feasible_set import FeasibleSet
+from ident_service.estimation.feasible.nearest import FeasibleEstimate
+from ident_service.estimation.feasible.posing import EPSILON, MULTIPLIER, OF_ESTIMATES, check, largest, project, traces
+from ident_service.estimation.feasible.priors import Prior, residual_deviation
+from ident_service.estimation.least_squares import LeastSquares, unit_columns
+from ident_service.model.base import BaseParameters
+
+if TYPE_CHECKING:
+    import cvxpy as cp
+
+SOLVER = "clarabel"
+_NAME = "constrained least squares in cvxpy"
+_WEIGHT = 8.0  # of the residual norm, as in `nearest.py`: multipliers are then comparable
+_ACCURATE = ("optimal", "optimal_inaccurate")
+# In turn, until the solver reaches an optimum. Other solvers are asked with their own defaults.
+_OPTIONS: dict[str, tuple[dict[str, Any], ...]] = {
+    "CLARABEL": tuple(
+        {"tol_gap_abs": tol, "tol_gap_rel": tol, "tol_feas": tol, "max_iter": 200, "max_threads": 1}
+        for tol in (1e-9, 1e-8, 1e-7)
+    ),
+    # Accelerated, SCS now and then wanders for as long as it is let, on one processor and not on another.
+    "SCS": ({"eps_abs": 1e-7, "eps_rel": 1e-7, "max_iters": 100_000, "acceleration_lookback": 0},),
+}
+
+
+@dataclass(frozen=True)
+class ConvexEstimate:
+    """An optimum found through cvxpy.
+
+    Attributes:
+        estimate: the parameters.
+        solver: that found them, lower case.
+        status: cvxpy's word: `optimal`, or `optimal_inaccurate` where the solver stopped early.
+    """
+
+    estimate: FeasibleEstimate
+    solver: str
+    status: str
+
+
+def available_solvers() -> tuple[str, ...]:
+    """List the installed solvers that solve semidefinite problems, lower case."""
+    import cvxpy as cp
+    from cvxpy.reductions.solvers.defines import SOLVER_MAP_CONIC
+
+    return tuple(
+        name.lower()
+        for name in cp.installed_solvers()
+        if name in SOLVER_MAP_CONIC
+        and any("PSD" in kind.__name__ for kind in SOLVER_MAP_CONIC[name].SUPPORTED_CONSTRAINTS)
+    )
+
+
+def require_solver(solver: str) -> str:
+    """Return the name that cvxpy knows a solver by.
+
+    Raises:
+        UsageError: it is not installed, or solves no semidefinite problems.
+    """
+    names = available_solvers()
+    if solver.lower() not in names:
+        raise UsageError(
+            f"the solver {solver!r} is not installed, or solves no semidefinite problems; here are {', '.join(names)}"
+        )
+    return solver.upper()
+
+
+def convex_least_squares(
+    fit: LeastSquares,
+    base: BaseParameters,
+    conditions: FeasibleSet,
+    *,
+    prior: Prior | None = None,
+    custom: CustomFunction | None = None,
+    solver: str = SOLVER,
+    bound: float | None = None,
+    inside: bool = True,
+) -> ConvexEstimate:
+    """Find the feasible base parameters that explain the torques best, through cvxpy.
+
+    Args:
+        fit: the unconstrained least squares.
+        base: grouping of the parameters.
+        conditions: the feasible set.
+        prior: what the estimate is drawn to.
+        custom: further knowledge.
+        solver: any that `available_solvers` names.
+        bound: of each link's tr(P) [kg]; those of `posing.py` in turn when None, none with a prior.
+        inside: whether the parameters must have a positive margin; a solver of first order may miss the inset of 1e-6.
+
+    Raises:
+        UsageError: the solver is not installed.
+        ParameterError: shapes or names do not fit, or the residual has no variance to weigh a penalty against.
+        CustomError: `custom` raises, returns what is not convex, or contradicts the conditions.
+        ConditionsError: no parameters at all fulfil the conditions.
+        SolverError: the solver stopped without an optimum.
+    """
+    check(fit.beta, base, conditions)
+    name = require_solver(solver)
+    if prior is not None and prior.weight == 0.0:
+        prior = None
+    posed = _Posed(fit, base, conditions, prior, custom)
+    size = float(np.max(np.abs(fit.beta), initial=0.0))
+    reaches = OF_ESTIMATES if prior is None else (np.inf,)
+    bounds = [reach * largest(conditions, size) for reach in reaches] if bound is None else [bound]
+    statuses = []
+    for limit in bounds:
+        for options in _OPTIONS.get(name, ({},)):
+            status = posed.solve(name, options, limit)
+            statuses.append(status)
+            if status in _ACCURATE and ((found := posed.found(limit)).margin > 0.0 or not inside):
+                return ConvexEstimate(found, solver.lower(), status)
+            if status.startswith("infeasible"):
+                break
+    if statuses[0].startswith("infeasible"):
+        if blocks := contradiction(conditions):
+            raise ConditionsError(_NAME, statuses[0], blocks)
+        if custom is not None:
+            raise CustomError(
+                f"{custom.name} contradicts the rest of the description, or asks for links of more than "
+                f"{bounds[-1]:.3g} kg: no parameters fulfil both"
+            )
+    status = statuses[0] if statuses[0] not in _ACCURATE else f"{statuses[0]} but outside the set; try another solver"
+    raise SolverError(f"{_NAME} by {solver.lower()}", status)
+
+
+def objective(fit: LeastSquares, found: FeasibleEstimate, prior: Prior | None) -> float:
+    """Return what an estimate minimises: |R_1 beta - rho_1|, or the sum of squares with what is added to it.
+
+    Args:
+        fit: the unconstrained least squares.
+        found: the estimate.
+        prior: that it was drawn to.
+
+    Raises:
+        ParameterError: the residual has no variance.
+    """
+    drawn = prior is not None and prior.weight > 0.0
+    if not drawn and found.penalty is None:
+        return found.objective
+    added = prior.weight * found.prior_distance if prior is not None else 0.0
+    return (found.objective / _sigma(fit, prior)) ** 2 + added + (found.penalty or 0.0)
+
+
+def _sigma(fit: LeastSquares, prior: Prior | None) -> float:
+    return residual_deviation(fit) if prior is None or prior.sigma is None else prior.sigma
+
+
+class _Posed:
+    """One problem, to be solved with several options and bounds."""
+
+    def __init__(
+        self,
+        fit: LeastSquares,
+        base: BaseParameters,
+        conditions: FeasibleSet,
+        prior: Prior | None,
+        custom: CustomFunction | None,
+    ) -> None:
+        import cvxpy as cp
+
+        self._fit, self._base, self._conditions, self._prior = fit, base, conditions, prior
+        self._custom = custom
+        self._scales = np.array([reference(name) for name in base.names])
+        self._x = cp.Variable(len(base.names))
+        delta = cp.multiply(self._scales, self._x)
+        self._blocks = [self._block(block) for block in conditions.blocks]
+        E, e = conditions.equality_rows()
+        self._equalities = [(E * self._scales) @ self._x + e == 0.0] if len(e) else []
+        self._known: Sequence[cp.Constraint] = ()
+        self._penalty: cp.Expression | None = None
+        if custom is not None:
+            beta = base.K @ delta
+            link = {name: delta[index] for index, name in enumerate(base.names)}
+            grouped = {text: beta[index] for index, text in enumerate(base.expressions)}
+            self._known, self._penalty = custom.constraints(link, grouped)
+        self._objective = cp.Minimize(self._cost())
+        self._iterations, self._seconds = 0, 0.0
+
+    def _block(self, block: Block) -> cp.Constraint:
+        """State a condition with the inset of eq. 21."""
+        import cvxpy as cp
+
+        entries = (block.F * self._scales) @ self._x + (block.f - EPSILON * block.identity())
+        if block.size == 0:
+            return entries >= 0.0
+        places = {pair: k for k, pair in enumerate(triangle_entries(block.size))}
+        order = range(block.size)
+        return cp.bmat([[entries[places[min(i, j), max(i, j)]] for j in order] for i in order]) >> 0
+
+    def _cost(self) -> cp.Expression:
+        import cvxpy as cp
+
+        unit, seen = unit_columns(self._fit.R1)
+        metric = np.where(seen, self._fit.R1, 0.0) @ (self._base.K * self._scales)
+        if self._prior is None and self._penalty is None:
+            scale = float(unit[seen].max(initial=np.finfo(float).tiny))
+            return _WEIGHT * cp.norm(metric / scale @ self._x - self._fit.rho1 / scale)
+        sigma = _sigma(self._fit, self._prior)
+        cost = cp.sum_squares(metric / sigma @ self._x - self._fit.rho1 / sigma)
+        weight = 0.0
+        if self._prior is not None:
+            weight = self._prior.weight
+            cost += weight * self._divergence(self._prior)
+        if self._penalty is not None:
+            cost += self._penalty
+        return cost / (1.0 + weight)
+
+    def _divergence(self, prior: Prior) -> cp.Expression:
+        import cvxpy as cp
+
+        columns = prior.euclidean
+        total = cp.sum_squares(self._x[columns] - (prior.delta / self._scales)[columns])
+        if prior.kind == "entropic":
+            for block in prior.whitened:
+                entries = (block.F * self._scales) @ self._x
+                places = {pair: k for k, pair in enumerate(triangle_entries(4))}
+                Q = cp.bmat([[entries[places[min(i, j), max(i, j)]] for j in range(4)] for i in range(4)])
+                total += cp.trace(Q) - 4.0 - cp.log_det(Q)
+        return total
+
+    def solve(self, name: str, options: dict[str, Any], bound: float) -> str:
+        """Solve and return cvxpy's status, or a solver's own words where it fails."""
+        import cvxpy as cp
+
+        constraints = [*self._blocks, *self._equalities, *self._known]
+        if np.isfinite(bound):
+            constraints.append((traces(self._conditions) * self._scales / bound) @ self._x <= 1.0)
+        problem = cp.Problem(self._objective, constraints)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # what they say is in the status
+                problem.solve(solver=name, **options)
+        except Exception as error:  # noqa: BLE001 - every solver raises its own errors (no licence, say)
+            return f"failed ({type(error).__name__}: {' '.join(str(error).split())[:200]})"
+        self._iterations += int(problem.solver_stats.num_iters or 0)
+        self._seconds += float(problem.solver_stats.solve_time or 0.0)
+        return str(problem.status)
+
+    def found(self, bound: float) -> FeasibleEstimate:
+        """Return the parameters of the last solution."""
+        delta = project(self._scales * np.asarray(self._x.value), self._conditions)
+        beta = self._base.K @ delta
+        return FeasibleEstimate(
+            beta=beta,
+            delta=delta,
+            objective=float(np.linalg.norm(self._fit.R1 @ beta - self._fit.rho1)),
+            margin=self._conditions.margin(delta)[0],
+            tight=self._active(),
+            iterations=self._iterations,
+            solver_seconds=self._seconds,
+            prior_distance=0.0 if self._prior is None else self._prior.divergence(delta),
+            bound=bound,
+            penalty=None if self._penalty is None else float(self._penalty.value),
+        )
+
+    def _active(self) -> tuple[str, ...]:
+        """Name what has a multiplier that counts, as `posing.pressing` does, the custom constraints among it."""
+        named = [(block.name, one) for block, one in zip(self._conditions.blocks, self._blocks, strict=True)]
+        if self._custom is not None:
+            named += [(f"{self._custom.name}, constraint {k}", one) for k, one in enumerate(self._known, 1)]
+        weights = {name: _multiplier(one) for name, one in named}
+        floor = max(MULTIPLIER, 1e-3 * max(weights.values(), default=0.0))
+        return tuple(sorted((name for name in weights if weights[name] > floor), key=lambda name: -weights[name]))
+
+
+def _multiplier(constraint: cp.Constraint) -> float:
+    """Return the largest entry of a constraint's multipliers; cones of several parts have several."""
+    return max(
+        (float(np.abs(dual.value).max()) for dual in constraint.dual_variables if dual.value is not None), default=0.0
+    )
