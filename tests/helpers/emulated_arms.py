@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from drivers.canopen.bus_errors import BusError
 from drivers.canopen.frame import Frame
 from drivers.canopen.profile import SYNC
 from drivers.clock import Clock
@@ -23,6 +24,7 @@ class Tapped:
         sent: by the host.
         loses: which frames get lost.
         misses: which frames of the drives the host does not hear.
+        full_until_ns: before it the transmit queue is full, so that no frame can be sent.
     """
 
     def __init__(self, link: LockStepLink) -> None:
@@ -32,6 +34,7 @@ class Tapped:
         self.sent: list[Frame] = []
         self.loses: Callable[[Frame], bool] = lambda frame: False
         self.misses: Callable[[Frame], bool] = lambda frame: False
+        self.full_until_ns = 0
 
     @property
     def clock(self) -> Clock:
@@ -49,6 +52,8 @@ class Tapped:
         self._in_cycle = list(frames)
 
     def send(self, frame: Frame) -> None:
+        if self.clock.now_ns() < self.full_until_ns:
+            raise BusError("full", "tapped")
         self.sent.append(frame)
         if frame.identifier == SYNC:
             self._foreign, self._in_cycle = [*self._foreign, *self._in_cycle], []

@@ -35,8 +35,9 @@ FOREIGN: dict[str, Frame] = {
     "foreign_nmt": Frame(0x000, bytes([0x01, 0x01])),
     "foreign_heartbeat": Frame(0x77F, b"\x05"),
 }
+QUICK_STOP = bytes([0x02, 0x00, 10])  # control word and mode
 NOTICE = Frame(0x081, bytes.fromhex("01 ff 00 00 00 00 00 00"))  # without a bit of the error register
-WIRE = ("lost_torques", "lost_status", "notice", *FOREIGN)
+WIRE = ("lost_torques", "lost_status", "notice", *FOREIGN, "full_queue")
 # Two cycles: a fault may come after the answers of the cycle before which it was handed over.
 SOON = 3
 # Cycles that are waited for heartbeats, for torque frames, and for status reports.
@@ -74,6 +75,7 @@ CANOPEN_PROMISES: dict[str, Promise] = {
     ),
     "notice": Promise({"drive_notice"}, warns="drive_notice", words=("FF01h",)),
     **{kind: Promise({"second_host"}, within=SOON, words=("somebody else",)) for kind in FOREIGN},
+    "full_queue": Promise({"driver"}, duration=5, within=SOON, words=("the transmit queue is full",)),
 }
 
 
@@ -84,6 +86,7 @@ class EmulatedArm(WatchedArm):
         behind: the drives.
         taps: on the buses, as opened last.
         states: of the drives, after they have been left alone.
+        told_to_brake: drives that had been told to when they were left alone.
     """
 
     def __init__(
@@ -93,6 +96,7 @@ class EmulatedArm(WatchedArm):
         self.behind.emulator.observer = observer
         self.taps: list[Tapped] = []
         self.states: tuple[str, ...] = ()
+        self.told_to_brake = 0
         self._config, self._strike = config, strike
         super().__init__(CanopenArm(config, self._links))
         self.before_exchange = self._break
@@ -116,6 +120,10 @@ class EmulatedArm(WatchedArm):
         strike = self._strike
         if strike is None or cycle != strike.at_cycle or strike.kind in ("lost_torques", "lost_status"):
             return
+        if strike.kind == "full_queue":
+            for tap in self.taps:
+                tap.full_until_ns = self.clock.now_ns() + round((strike.duration or 1) * PERIOD * 1e9)
+            return
         if strike.kind == "notice":
             self.taps[0].disturb([NOTICE], drives_hear=False)
             return
@@ -130,6 +138,8 @@ class EmulatedArm(WatchedArm):
 
     def left_alone(self) -> None:
         """Longer than the drives wait for torque frames, and for a ramp."""
+        told = [{frame.identifier for frame in tap.sent if frame.data == QUICK_STOP} for tap in self.taps]
+        self.told_to_brake = sum(len(nodes) for nodes in told)
         self.behind.settle(self.clock.now_ns() + 50_000_000)
         self.states = self.behind.emulator.states
 

@@ -92,6 +92,8 @@ def let_go(case: Case, outcome: Outcome) -> None:
     stuck = case.joint if case.kind == "stuck_torque" else None
     motors = arm.behind.emulator.body.motors
     assert not [k for k, motor in enumerate(motors) if motor.power is Power.TORQUE and k != stuck]
+    if outcome.fault is not None and case.kind == "full_queue":
+        assert arm.told_to_brake == DRIVES[case.arm]
     if outcome.fault is not None and outcome.fault.code in TOLD and case.joint is not None:
         assert f"node {case.joint + 1}:" in str(outcome.fault) or any(
             subject(case.arm).model.chain.names[k] in str(outcome.fault)
