@@ -52,7 +52,8 @@ def summary(estimate: Estimate, unusable: Sequence[str] = ()) -> str:
         "",
         ", ".join(f"{count} {word}" for word, count in counts.items())
         + f" (standard deviation below {IDENTIFIED_BELOW:.0%}, below {WEAK_BELOW:.0%}, above)",
-        "  of the larger of the parameter's size and the reference of its unit, below which it is as good as zero",
+        "  of the larger of the parameter's size and the reference of its unit, below which it is as good as zero;",
+        "  a deviation from few blocks counts for more, by Student's t",
     ]
     doubtful = [i for i, verdict in enumerate(estimate.verdicts) if verdict != "identified"]
     for i in doubtful:
