@@ -69,7 +69,8 @@ def verdict_rule() -> str:
     return (
         f"Identified: \u03c3 is below {100 * IDENTIFIED_BELOW:g} % of the larger of the parameter's size and the "
         f"reference of its unit, below which it is as good as zero ({references}); weak: below {100 * WEAK_BELOW:g} %; "
-        "unidentified: above. A \u03c3 from few blocks counts for more, by Student's t. \u03c3 is that of the unconstrained fit, also beside a value that a feasible set holds: "
+        "unidentified: above. A \u03c3 from few blocks counts for more, by Student's t. "
+        "\u03c3 is that of the unconstrained fit, also beside a value that a feasible set holds: "
         "it says how far the recordings alone tell the parameter, not how far the value may be off inside the set."
     )
 
