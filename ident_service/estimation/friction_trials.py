@@ -106,7 +106,7 @@ class _Travel:
 
 
 class FrictionTrials:
-    """What recordings say about the base parameters, for any pre-sliding and Stribeck velocities."""
+    """Keep recordings as equations whose pre-sliding and Stribeck velocities can be exchanged."""
 
     @one_blas_thread()
     def __init__(self, recordings: Sequence[Recording], model: ArmModel, base: BaseParameters) -> None:

@@ -79,7 +79,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class CustomKnowledge:
-    """What `constraints.custom` did to an estimate.
+    """Record the function of `constraints.custom` and the torque errors with and without it.
 
     Attributes:
         function: that was called.

@@ -105,7 +105,8 @@ def _driving_friction(estimate: Estimate, deviations: float) -> list[tuple[str, 
     Coulomb, Stribeck and viscous terms explain each other's torque, so only their sum at a speed has a sign. The usual
     speed is the root mean square of the velocity, which is the viscous column's, of the rows that were fitted to.
     """
-    layout, base, total = estimate.model.layout, estimate.base, estimate.fitted.total
+    # Not those that were fitted: a robust method multiplies their rows.
+    layout, base, total = estimate.model.layout, estimate.base, estimate.prepared.equations.total
     place = {int(column): index for index, column in enumerate(base.base)}
     coupling, found = estimate.model.chain.coupling, []
     for drive, viscous in enumerate(layout.term_columns("viscous")):
@@ -164,7 +165,7 @@ def _of_joint(name: str, seen: JointQuality, model: ArmModel, *, revolute: bool)
 
 
 def _weight(joints: Sequence[JointQuality], model: ArmModel) -> Iterator[str]:
-    """Whether holding this arm up can take such torques."""
+    """Compare the largest torque with what could hold an arm of this size."""
     chain = model.chain
     # Where the first joint stands is not part of the arm.
     offsets = np.concatenate([chain.translation[1:], chain.link_translation])

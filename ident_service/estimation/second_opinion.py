@@ -45,12 +45,12 @@ class SecondOpinion:
 
     @property
     def agrees(self) -> bool:
-        """Whether the two predict the same torques, to a thousandth."""
+        """Tell if the two predict the same torques, to a thousandth."""
         return self.torque_percent < AGREED_BELOW
 
     @property
     def conclusive(self) -> bool:
-        """Whether the comparison says something: a second solver that stopped early proves nobody wrong."""
+        """Tell if the second solver reached its optimum; one that stopped early disproves nothing."""
         return self.agrees or (self.status == "optimal" and self.margin > 0.0)
 
 

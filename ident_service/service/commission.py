@@ -173,6 +173,7 @@ def simulate(
         write_results(staging, estimate, unusable=unusable, described=config if described is None else described)
         write_atomically(staging / "score.json", json.dumps(score_document(scored), indent=1) + "\n")
         warnings = [f"{one.path.name}: {line}" for one, seen in found for line in seen.warnings()]
+        warnings += estimate.remarks
         write_report(staging, estimate, recordings[:1], recordings[1:], warnings)
         write_manifest(staging)
     return Commissioning(folder, estimate, (reports[0], reports[1]), scored, unusable)

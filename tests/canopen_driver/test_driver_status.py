@@ -1,4 +1,4 @@
-"""What drives tell beside their positions: status reports that stay away, and emergencies that only inform."""
+"""Test status reports that stay away, and emergencies that only inform."""
 
 from __future__ import annotations
 

@@ -639,7 +639,7 @@ def test_expressions_of_an_arm_may_stand_in_another_order(made: Made) -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_an_ellipsoid_of_any_direction_is_one(made: Made, seed: int) -> None:
-    """What a description's ellipsoid becomes is recognised, and nothing that differs in one of its numbers."""
+    """Recognise a description's ellipsoid, and nothing that differs in one of its numbers."""
     rng = np.random.default_rng(seed)
     axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     config = load_arm(made.description)

@@ -1,4 +1,4 @@
-"""Who else is on the machine reads nothing of the state folder and blocks nothing in it."""
+"""Keep other users of the machine from reading the state folder and from blocking in it."""
 
 from __future__ import annotations
 

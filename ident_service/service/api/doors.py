@@ -1,4 +1,4 @@
-"""What every request meets before anything looks at it: its Host, its Origin, its size, and how many there are.
+"""Check Host, Origin, size and number of requests before any route sees them.
 
 Every answer gets its security headers here.
 
