@@ -250,8 +250,8 @@ def _reduced(recorded: Equations, beta: Array, T: Array) -> Equations:
         supports = tuple(np.arange(T.shape[1]) for _ in factors)
         return Information(supports, tuple(factors), information.rows.copy(), T.shape[1])
 
-    left_out = None if recorded.left_out is None else one(recorded.left_out)
-    return Equations(tuple(one(block) for block in recorded.blocks), recorded.samples, left_out)
+    blocks, near = (tuple(one(block) for block in part) for part in (recorded.blocks, recorded.near))
+    return Equations(blocks, recorded.samples, near)
 
 
 def _dependence(information: Information, T: Array, fit: LeastSquares) -> Array:

@@ -12,8 +12,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ident_service.config.schema import JointTerm
+from ident_service.estimation.feasible.feasibility import constrained_least_squares
 from ident_service.estimation.identify import Candidate, Estimate
-from ident_service.estimation.least_squares import TorqueError
+from ident_service.estimation.least_squares import TorqueError, ordinary_least_squares, torque_error
 from ident_service.model.arm_model import ArmModel
 from ident_service.record.quality import JointQuality
 
@@ -22,6 +23,8 @@ MUCH_WORSE, WORSE_FROM = 4.0, 10.0  # times the error on what was fitted to, and
 CONSTRAINED_WORSE, CONSTRAINED_FROM = 1.8, 2.0  # times the unconstrained error, and percent from which that counts
 WRONG_SIGN = 8.0  # deviations by which friction is negative
 CONSTRAINED_WORSE_WITH_SIGN, PERHAPS_WRONG_SIGN = 1.3, 4.0  # both together
+MIRRORED_FROM, MIRRORED_WORSE = 20.0, 1.4  # percent, and times the unconstrained error, from which a joint is turned
+MIRRORED = 1.3  # times smaller is its error with the torque negated, and again near the unconstrained one
 _OUTSIDE = 0.1  # of a joint's range: what limits of a description may be off
 _TURNS = 100.0  # rad, for joints without limits
 _TOO_FAST, _TOO_STRONG = 4.0, 4.0  # times the limit of the description
@@ -92,11 +95,34 @@ def _against_the_unconstrained(estimate: Estimate) -> Iterator[str]:
             f"the torque, or the position, may have the wrong sign at {which}: without conditions, the friction of"
             f" {name} drives it ({torque:.3g} +- {deviation:.2g} at its usual speed)" + (f"; {words}" if much else "")
         )
+    elif mirrored := _mirrored(estimate) if held else "":
+        yield f"{mirrored}; {words}"
     elif much:
         yield (
             f"{words}: gravity, signs, order or units of the columns, or the description's bodies, contradict the"
             " recording"
         )
+
+
+def _mirrored(estimate: Estimate) -> str:
+    """Name the joint whose torques the conditions of a real body allow better with the other sign; none is empty."""
+    free, own = (estimate.candidates[place].moving.joint_relative_percent for place in (0, estimate.chosen))
+    information, weights = estimate.information, estimate.fit.weights
+    for joint, name in enumerate(estimate.model.chain.names):
+        if own[joint] < max(MIRRORED_FROM, MIRRORED_WORSE * free[joint]):
+            continue
+        signs = np.ones(information.joints)
+        signs[joint] = -1.0
+        fit = ordinary_least_squares(information.with_torques_times(signs), weights)
+        beta = constrained_least_squares(fit, estimate.base, estimate.conditions).beta
+        turned = torque_error(estimate.prepared.equations.total.with_torques_times(signs), beta)
+        error = turned.joint_relative_percent[joint]
+        if MIRRORED * error < own[joint] and error < MIRRORED_WORSE * free[joint]:
+            return (
+                f"the torque, or the position, may have the wrong sign at {name}: its torque error is"
+                f" {own[joint]:.0f} %, and {error:.0f} % with the torque negated"
+            )
+    return ""
 
 
 def _driving_friction(estimate: Estimate, deviations: float) -> list[tuple[str, float, float]]:

@@ -190,7 +190,7 @@ def parameters_document(estimate: Estimate, described: ArmConfig | None = None) 
             "condition_number": estimate.fit.condition_number if np.isfinite(estimate.fit.condition_number) else None,
             **_errors(own.identification, model.chain.names),
         },
-        "information": information_document(estimate.prepared.equations.total),
+        "information": information_document(estimate.information),
         "validation": [
             {"recording": s.recording, "sha256": s.sha256, **_errors(s.error, model.chain.names)}
             for s in own.validation

@@ -103,7 +103,7 @@ def spike(position: np.ndarray, torque: np.ndarray) -> None:
     [
         (degrees, "lwr_0_joint is recorded from -56.73 to 56.73 rad, .* degrees"),
         (swapped, "lwr_1_joint is recorded from -38.05"),
-        (two_joints, "its torque error is 6. % where joints move on recording_2"),
+        (two_joints, "its torque error is 8. % where joints move on recording_2"),
         (negated, "the torque, or the position, may have the wrong sign at lwr_0_joint"),
         (one_negated, "the torque, or the position, may have the wrong sign at lwr_5_joint"),
         (thousandfold, "the torque of lwr_1_joint reaches 3.936e.04, 224 times its limit of 176"),
