@@ -1,6 +1,7 @@
 """Reads CSV recordings: header `t,q1..qN,tau1..tauN`, optional `dq1..dqN`, in any order, plain or gzip.
 
-Time `t` is in seconds and becomes integer nanoseconds by decimal arithmetic, so that a UTC time keeps all its digits.
+Time `t` becomes integer nanoseconds by decimal arithmetic, so that a UTC time keeps all its digits. A column map
+(`RecordingFormat.columns`) reads other names and units, and no other columns than those it names.
 Torque counts as sampled at its stamp. A CSV file has no end mark: a row that does not fit is an error, not a tear.
 """
 
@@ -15,6 +16,7 @@ from typing import IO, Final, cast
 
 import numpy as np
 
+from ident_service.config.recording import Column
 from ident_service.errors import RecordingError
 from ident_service.record.assemble import assemble
 from ident_service.record.csv_header import CsvColumns, parse_header
@@ -47,13 +49,13 @@ class CsvRecording:
     torn = False
 
     def __init__(
-        self, path: Path | str, *, columns: Mapping[str, str] | None = None, joints: Sequence[str] | None = None
+        self, path: Path | str, *, columns: Mapping[str, Column] | None = None, joints: Sequence[str] | None = None
     ) -> None:
         """Open the file and read its header.
 
         Args:
             path: the file.
-            columns: for a file with another header, its name for each of `t`, `q1`, `tau1`, ...; columns that are
+            columns: for a file with another header, its column for each of `t`, `q1`, `tau1`, ...; columns that are
                 not named here are then left out.
             joints: names of the joints 1..N, where they are known.
 
@@ -113,28 +115,36 @@ class CsvRecording:
         if any(row.count(b",") != separators for row in rows):
             self._explain(rows, first)
         try:
-            fields = b",".join(rows).decode("ascii").split(",")
-            values = np.array(list(map(float, fields))).reshape(len(rows), columns.fields)
+            fields = b",".join(rows).decode("utf-8", errors="replace").split(",")
+            values = np.zeros((len(rows), columns.fields))
+            for index in columns.used:
+                values[:, index] = list(map(float, fields[index :: columns.fields]))
         except ValueError:
             self._explain(rows, first)
-        # Python reads 1_000 as a number; in a data file it is a slip.
-        if any(b"_" in row for row in rows):
+        # Python reads 1_000 as a number, and digits of other scripts; in a data file they are slips.
+        if not all(row.isascii() and b"_" not in row for row in rows):
             self._explain(rows, first)
         times = fields[columns.time :: columns.fields]
-        bad = ~(np.abs(values[:, columns.time]) < _MAX_SECONDS)
+        bad = ~(np.abs(values[:, columns.time]) * float(columns.nanoseconds) < _MAX_SECONDS * 1e9)
         if bad.any():
             index = int(np.argmax(bad))
-            raise RecordingError(self.path, f"line {first + index}: time t is {times[index].strip()}; not in seconds?")
+            raise RecordingError(
+                self.path,
+                f"line {first + index}: time t is {times[index].strip()}; not in seconds? "
+                "Name its unit: recording.columns: {t: {column: NAME, unit: ns}}",
+            )
         try:
-            stamps = np.array([round(Decimal(time) * 1_000_000_000) for time in times], np.int64)
+            stamps = np.array([round(Decimal(time) * columns.nanoseconds) for time in times], np.int64)
         except ArithmeticError as error:
             raise RecordingError(self.path, f"line {first} or later: a time t is beyond all exponents") from error
+        if columns.scale is not None:
+            values *= columns.scale
         velocity = None if columns.velocity is None else values[:, columns.velocity]
         return Block(stamps, values[:, columns.position], values[:, columns.torque], velocity)
 
     def _explain(self, rows: list[bytes], first: int) -> None:
-        """Raise for the first row that does not fit."""
-        names = self._columns.names
+        """Raise for the first row that does not fit; return where none of the columns that are read is wrong."""
+        names, used = self._columns.names, set(self._columns.used)
         for line, row in enumerate(rows, first):
             if not row.strip():
                 raise RecordingError(self.path, f"line {line}: is empty; a row is missing, remove the line")
@@ -145,8 +155,8 @@ class CsvRecording:
                     f"line {line}: has {len(fields)} fields but the header has {len(names)}; "
                     "the row is torn or malformed, remove it if it is the last one",
                 )
-            for name, field in zip(names, fields, strict=True):
-                if not _is_number(field):
+            for index, (name, field) in enumerate(zip(names, fields, strict=True)):
+                if index in used and not _is_number(field):
                     raise RecordingError(self.path, f"line {line}: {name} is {field[:40]!r}, not a number")
 
     def _lines(self) -> Iterator[list[bytes]]:
