@@ -167,19 +167,21 @@ class Transmission(Section):
 
 
 class RecordingFormat(Section):
-    """How an arm's recordings are read; `columns`, `joint_names`, `topic`, `side` are for the files of others only.
+    """How an arm's recordings are read; `columns`, `joint_names`, `topic`, sides are for the files of others only.
 
     `columns` gives a CSV file's own name for each of `t`, `q1`, `tau1` and optionally `dq1`, or that name with unit and
-    factor (`Column`); `joint_names` a JointState's own name for a joint of the arm. `side` says where positions and
-    torques were measured. Irregular `stamps` are either when each sample was taken (`sampled`), or when the sample
-    arrived (`arrival`) although it was taken on time: then the samples count as evenly spaced between gaps. `trim` [s]
-    is cut off at start and end; a step of more than `gap` usual periods is a gap; `rate` [Hz] resamples.
+    factor (`Column`); `joint_names` a JointState's own name for a joint of the arm. `side` says where positions,
+    velocities and torques were measured, `torque_side` where torques were if elsewhere. Irregular `stamps` are either
+    when each sample was taken (`sampled`), or when the sample arrived (`arrival`) although it was taken on time: then
+    the samples count as evenly spaced between gaps. `trim` [s] is cut off at start and end; a step of more than `gap`
+    usual periods is a gap; `rate` [Hz] resamples.
     """
 
     columns: dict[ColumnName, Column] = Field(default_factory=dict)
     joint_names: dict[str, str] = Field(default_factory=dict)
     topic: Annotated[str, Field(min_length=1)] = "/joint_states"
     side: Literal["joint", "motor"] = "joint"
+    torque_side: Literal["joint", "motor"] | None = None
     stamps: Literal["sampled", "arrival"] = "sampled"
     trim: tuple[NonNegative, NonNegative] = (0.0, 0.0)
     gap: Annotated[float, Field(gt=1, strict=True)] = 3.0
@@ -209,6 +211,18 @@ class RecordingFormat(Section):
             raise ValueError("; ".join(wrong))
         return columns
 
+    @model_serializer(mode="wrap")
+    def _unless_default(self, serialized: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # Descriptions without these keys keep the hash that results have named them by.
+        document: dict[str, Any] = serialized(self)
+        later = {"torque_side": None}
+        return {key: value for key, value in document.items() if key not in later or value != later[key]}
+
+    @property
+    def motor_sides(self) -> tuple[bool, bool]:
+        """Return for positions (with velocities) and for torques whether they were measured at the motors."""
+        return self.side == "motor", (self.torque_side or self.side) == "motor"
+
     @field_validator("joint_names")
     @classmethod
     def _distinct(cls, joint_names: dict[str, str]) -> dict[str, str]:
@@ -236,11 +250,12 @@ def units_of_other_joints(form: RecordingFormat, joints: Sequence[str], revolute
         joints: names of the arm's joints.
         revolute: for each, whether it turns.
     """
-    if form.side == "motor":
-        return
+    positions, torques = form.motor_sides
     for name, one in form.columns.items():
         match = _NUMBERED.fullmatch(name)
         if match is None or one.unit is None or int(match[2]) > len(joints):
+            continue
+        if torques if match[1] == "tau" else positions:
             continue
         joint, quantity = int(match[2]) - 1, _QUANTITIES[match[1]]
         if one.unit in (_SLIDING if revolute[joint] else _TURNING)[quantity]:
@@ -261,8 +276,9 @@ def disagreements(
         transmission: the section `transmission`.
         joints: names of the arm's joints; none where the file does not name them.
     """
-    if form.side == "motor" and transmission is None:
-        yield ("recording", "side"), "recording.side: motor, but there is no transmission"
+    for key, motors in zip(("side", "torque_side"), form.motor_sides, strict=True):
+        if motors and transmission is None and getattr(form, key) == "motor":
+            yield ("recording", key), f"recording.{key}: motor, but there is no transmission"
     if not joints:
         return
     if transmission is not None and len(transmission.ratios) != len(joints):

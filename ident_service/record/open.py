@@ -61,8 +61,9 @@ def open_recording(
         raise RecordingError(path, "is neither MCAP nor CSV (plain or gzip)")
     else:
         recording = CsvRecording(path, columns=fmt.columns or None, joints=joints)
-    if fmt.side == "joint":
+    if not any(fmt.motor_sides):
         return recording
     if transmission is None:
         raise UsageError(f"{path}: recorded on the motor side, but no transmission leads from there to the joints")
-    return JointSideRecording(recording, transmission)
+    positions, torques = fmt.motor_sides
+    return JointSideRecording(recording, transmission, positions=positions, torques=torques)
