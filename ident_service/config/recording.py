@@ -174,7 +174,8 @@ class RecordingFormat(Section):
     velocities and torques were measured, `torque_side` where torques were if elsewhere. Irregular `stamps` are either
     when each sample was taken (`sampled`), or when the sample arrived (`arrival`) although it was taken on time: then
     the samples count as evenly spaced between gaps. `trim` [s] is cut off at start and end; a step of more than `gap`
-    usual periods is a gap; `rate` [Hz] resamples.
+    usual periods is a gap; `rate` [Hz] resamples. Samples with a `missing` value (NaN, an empty field) are refused, or
+    left out and counted.
     """
 
     columns: dict[ColumnName, Column] = Field(default_factory=dict)
@@ -186,6 +187,7 @@ class RecordingFormat(Section):
     trim: tuple[NonNegative, NonNegative] = (0.0, 0.0)
     gap: Annotated[float, Field(gt=1, strict=True)] = 3.0
     rate: Positive | None = None
+    missing: Literal["refuse", "skip"] = "refuse"
 
     @field_validator("columns")
     @classmethod
@@ -215,7 +217,7 @@ class RecordingFormat(Section):
     def _unless_default(self, serialized: SerializerFunctionWrapHandler) -> dict[str, Any]:
         # Descriptions without these keys keep the hash that results have named them by.
         document: dict[str, Any] = serialized(self)
-        later = {"torque_side": None}
+        later = {"torque_side": None, "missing": "refuse"}
         return {key: value for key, value in document.items() if key not in later or value != later[key]}
 
     @property

@@ -30,6 +30,7 @@ MAX_RATIO: Final = 200
 _STEP: Final = 1 << 20
 _RATIO_FROM: Final = 64 << 20
 _MAX_SECONDS: Final = 9.2e9
+_MISSING: Final = frozenset({"", "nan", "na", "n/a", "null", "none"})
 _FIRST_ROW: Final = 2  # line numbers count from 1, and the header is line 1
 
 
@@ -49,7 +50,12 @@ class CsvRecording:
     torn = False
 
     def __init__(
-        self, path: Path | str, *, columns: Mapping[str, Column] | None = None, joints: Sequence[str] | None = None
+        self,
+        path: Path | str,
+        *,
+        columns: Mapping[str, Column] | None = None,
+        joints: Sequence[str] | None = None,
+        skip_missing: bool = False,
     ) -> None:
         """Open the file and read its header.
 
@@ -58,6 +64,8 @@ class CsvRecording:
             columns: for a file with another header, its column for each of `t`, `q1`, `tau1`, ...; columns that are
                 not named here are then left out.
             joints: names of the joints 1..N, where they are known.
+            skip_missing: whether to leave out rows in which a value other than the time is missing (an empty field,
+                `nan`, `NA`, `null`).
 
         Raises:
             UsageError: no such file.
@@ -73,6 +81,7 @@ class CsvRecording:
             header = first[0].decode("utf-8-sig")
         except UnicodeDecodeError as error:
             raise RecordingError(self.path, "line 1: the header is not text") from error
+        self._skip_missing = skip_missing
         self._columns: CsvColumns = parse_header(self.path, header, columns)
         self.joints = self._columns.joints
         self.joint_names: tuple[str, ...] = tuple(joints or ())
@@ -87,7 +96,14 @@ class CsvRecording:
                 runs backwards or repeats with other values, a damaged or oversized gzip file; names the line.
         """
         names = self.joint_names or [str(joint + 1) for joint in range(self.joints)]
-        return assemble(self._pieces(), samples, self.path, names, place=lambda index: f"line {index + _FIRST_ROW}")
+        return assemble(
+            self._pieces(),
+            samples,
+            self.path,
+            names,
+            place=lambda index: f"line {index + _FIRST_ROW}",
+            skip_missing=self._skip_missing,
+        )
 
     def _pieces(self) -> Iterator[Block]:
         line = 1
@@ -118,7 +134,10 @@ class CsvRecording:
             fields = b",".join(rows).decode("utf-8", errors="replace").split(",")
             values = np.zeros((len(rows), columns.fields))
             for index in columns.used:
-                values[:, index] = list(map(float, fields[index :: columns.fields]))
+                words = fields[index :: columns.fields]
+                if self._skip_missing and index != columns.time:
+                    words = ["nan" if _is_missing(word) else word for word in words]
+                values[:, index] = list(map(float, words))
         except ValueError:
             self._explain(rows, first)
         # Python reads 1_000 as a number, and digits of other scripts; in a data file they are slips.
@@ -156,8 +175,10 @@ class CsvRecording:
                     "the row is torn or malformed, remove it if it is the last one",
                 )
             for index, (name, field) in enumerate(zip(names, fields, strict=True)):
-                if index in used and not _is_number(field):
-                    raise RecordingError(self.path, f"line {line}: {name} is {field[:40]!r}, not a number")
+                missing = _is_missing(field) and index != self._columns.time
+                if index in used and not _is_number(field) and not (missing and self._skip_missing):
+                    hint = " (recording.missing: skip leaves such rows out)" if missing else ""
+                    raise RecordingError(self.path, f"line {line}: {name} is {field[:40]!r}, not a number{hint}")
 
     def _lines(self) -> Iterator[list[bytes]]:
         """The file's lines, some at a time, without their ends."""
@@ -190,6 +211,10 @@ class CsvRecording:
         except (EOFError, zlib.error, OSError) as error:
             # gzip's own BadGzipFile is an OSError.
             raise RecordingError(self.path, f"cannot be read beyond {total} bytes of text: {error}") from error
+
+
+def _is_missing(field: str) -> bool:
+    return field.strip().lower() in _MISSING
 
 
 def _is_number(field: str) -> bool:

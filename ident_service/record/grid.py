@@ -56,6 +56,7 @@ class Grid:
         last_ns: stamp of the last sample [ns].
         samples: their number, repeated ones not counted.
         repeats: number of samples left out because they repeat the one before.
+        skipped: number of samples left out because a value is missing.
         regular: whether all steps but gaps are `own_period_s` to 0.1 %.
         resampled: whether uniform samples have to be read off curves between the recorded ones.
         jitter_std_s: standard deviation of the steps, gaps excepted, from the usual step [s].
@@ -70,6 +71,7 @@ class Grid:
     last_ns: int
     samples: int
     repeats: int
+    skipped: int
     regular: bool
     resampled: bool
     jitter_std_s: float
@@ -101,11 +103,17 @@ def grid(recording: Recording, fmt: RecordingFormat) -> Grid:
             that is too far from the recording's own; and whatever reading the blocks raises.
     """
     steps = _Steps()
-    first_ns = last_ns = samples = repeats = 0
+    first_ns = last_ns = samples = repeats = skipped = 0
+    lost: list[tuple[int, int]] = []
     for block in trimmed(recording.blocks(), fmt.trim):
         stamps = block.stamp_ns
         first_ns = first_ns if samples else int(stamps[0])
-        steps.add(stamps if samples == 0 else np.concatenate([[last_ns], stamps]))
+        run = stamps if samples == 0 else np.concatenate([[last_ns], stamps])
+        steps.add(run)
+        if block.skipped is not None:
+            skipped += int(block.skipped.sum())
+            behind = np.flatnonzero(block.skipped) + len(run) - len(stamps)
+            lost += [(int(run[index - 1]), int(run[index])) for index in behind[behind > 0]]
         last_ns = int(stamps[-1])
         samples += len(stamps)
         repeats += block.repeats
@@ -122,6 +130,15 @@ def grid(recording: Recording, fmt: RecordingFormat) -> Grid:
             f"more than {MAX_GAPS} steps longer than {gap * 1e-6:.4g} ms, where {own * 1e-6:.4g} ms are usual; "
             "find out where the samples went, or raise recording.gap",
         )
+    if fmt.stamps == "arrival" and lost:
+        # Samples that are spaced evenly must not close up over one that was left out.
+        longer = np.unique(np.concatenate([longer, np.array(lost, np.int64)]), axis=0)
+        if len(longer) > MAX_GAPS:
+            raise RecordingError(
+                recording.path,
+                f"samples that lack a value leave more than {MAX_GAPS} gaps in stamps of arrival; set recording.stamps: "
+                "sampled if each stamp says when its sample was taken",
+            )
     edges = [first_ns, *(int(stamp) for pair in longer for stamp in pair), last_ns]
     period = _period(recording, fmt, own)
     furthest = max(high - own, own - low)
@@ -133,6 +150,7 @@ def grid(recording: Recording, fmt: RecordingFormat) -> Grid:
         last_ns=last_ns,
         samples=samples,
         repeats=repeats,
+        skipped=skipped,
         regular=regular,
         resampled=period != own or not (regular or fmt.stamps == "arrival"),
         jitter_std_s=deviation * 1e-9,

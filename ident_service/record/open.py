@@ -60,7 +60,8 @@ def open_recording(
     elif not start.startswith(GZIP_MAGIC) and b"\x00" in start:
         raise RecordingError(path, "is neither MCAP nor CSV (plain or gzip)")
     else:
-        recording = CsvRecording(path, columns=fmt.columns or None, joints=joints)
+        skip = fmt.missing == "skip"
+        recording = CsvRecording(path, columns=fmt.columns or None, joints=joints, skip_missing=skip)
     if not any(fmt.motor_sides):
         return recording
     if transmission is None:

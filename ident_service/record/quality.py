@@ -84,6 +84,7 @@ class Quality:
         torn: whether the file was cut off or damaged.
         first_ns: stamp of the first sample [ns].
         joints: in order.
+        skipped: samples left out because a value is missing.
     """
 
     samples: int
@@ -100,6 +101,7 @@ class Quality:
     torn: bool
     first_ns: int
     joints: tuple[JointQuality, ...]
+    skipped: int = 0
 
     def warnings(self) -> tuple[str, ...]:
         """What a person should know, in words; empty for a good recording."""
@@ -113,6 +115,9 @@ class Quality:
             found.append(f"{count}, the longest {self.longest_gap_s:.4g} s, {after:.4g} s after the first sample")
         if self.repeats:
             found.append(f"{self.repeats} samples repeat the one before; they are left out")
+        if self.skipped:
+            share = 100.0 * self.skipped / (self.samples + self.skipped)
+            found.append(f"{self.skipped} samples ({share:.2g} %) lack a value; they are left out")
         if self.jitter_std_s * self.rate_hz > MUCH_JITTER:
             found.append(
                 f"stamps jitter by {self.jitter_std_s * 1e3:.3g} ms, "
@@ -174,6 +179,7 @@ def quality(
         torn=recording.torn,
         first_ns=stamps.first_ns,
         joints=joints.result(),
+        skipped=stamps.skipped,
     )
 
 

@@ -64,7 +64,7 @@ class JointSideRecording:
             for array in (position, torque, velocity):
                 if array is not None:
                     array.flags.writeable = False
-            yield Block(block.stamp_ns, position, torque, velocity, block.repeats)
+            yield Block(block.stamp_ns, position, torque, velocity, block.repeats, block.skipped)
 
     def _turned(self, motors: Matrix) -> Matrix:
         """Turns of the motors as turns of the joints, shape (samples, joints)."""
