@@ -175,7 +175,7 @@ class RecordingFormat(Section):
     when each sample was taken (`sampled`), or when the sample arrived (`arrival`) although it was taken on time: then
     the samples count as evenly spaced between gaps. `trim` [s] is cut off at start and end; a step of more than `gap`
     usual periods is a gap; `rate` [Hz] resamples. Samples with a `missing` value (NaN, an empty field) are refused, or
-    left out and counted.
+    left out and counted; `standstill` at the ends is kept, or cut.
     """
 
     columns: dict[ColumnName, Column] = Field(default_factory=dict)
@@ -188,6 +188,7 @@ class RecordingFormat(Section):
     gap: Annotated[float, Field(gt=1, strict=True)] = 3.0
     rate: Positive | None = None
     missing: Literal["refuse", "skip"] = "refuse"
+    standstill: Literal["keep", "cut"] = "keep"
 
     @field_validator("columns")
     @classmethod
@@ -217,7 +218,7 @@ class RecordingFormat(Section):
     def _unless_default(self, serialized: SerializerFunctionWrapHandler) -> dict[str, Any]:
         # Descriptions without these keys keep the hash that results have named them by.
         document: dict[str, Any] = serialized(self)
-        later = {"torque_side": None, "missing": "refuse"}
+        later = {"torque_side": None, "missing": "refuse", "standstill": "keep"}
         return {key: value for key, value in document.items() if key not in later or value != later[key]}
 
     @property

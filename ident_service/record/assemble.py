@@ -156,7 +156,7 @@ class _Check:
         if finite.all():
             return None
         index, joint = (int(i) for i in np.argwhere(~finite)[0])
-        hint = " (recording.missing: skip leaves such samples out)" if np.isnan(values[index, joint]) else ""
+        hint = "; recording.missing: skip leaves such samples out" if np.isnan(values[index, joint]) else ""
         return index, f"{what} of joint {self._joints[joint]} is {values[index, joint]}{hint}"
 
 

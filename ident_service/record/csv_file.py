@@ -177,7 +177,7 @@ class CsvRecording:
             for index, (name, field) in enumerate(zip(names, fields, strict=True)):
                 missing = _is_missing(field) and index != self._columns.time
                 if index in used and not _is_number(field) and not (missing and self._skip_missing):
-                    hint = " (recording.missing: skip leaves such rows out)" if missing else ""
+                    hint = "; recording.missing: skip leaves such rows out" if missing else ""
                     raise RecordingError(self.path, f"line {line}: {name} is {field[:40]!r}, not a number{hint}")
 
     def _lines(self) -> Iterator[list[bytes]]:

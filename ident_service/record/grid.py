@@ -136,8 +136,8 @@ def grid(recording: Recording, fmt: RecordingFormat) -> Grid:
         if len(longer) > MAX_GAPS:
             raise RecordingError(
                 recording.path,
-                f"samples that lack a value leave more than {MAX_GAPS} gaps in stamps of arrival; set recording.stamps: "
-                "sampled if each stamp says when its sample was taken",
+                f"samples that lack a value leave more than {MAX_GAPS} gaps in stamps of arrival; set "
+                "recording.stamps: sampled if each stamp says when its sample was taken",
             )
     edges = [first_ns, *(int(stamp) for pair in longer for stamp in pair), last_ns]
     period = _period(recording, fmt, own)

@@ -32,7 +32,8 @@ from ident_service.record.recorder_process import RecorderProcess
 from ident_service.results.files import appearing_folder, write_atomically
 from ident_service.results.report_files import write_report
 from ident_service.results.run_folder import write_manifest, write_results
-from ident_service.service.identification import recording_quality, unusable_because
+from ident_service.service.identification import unusable_because
+from ident_service.service.recordings import recording_quality
 from ident_service.service.score import Score, score, true_parameters
 from sim_backend.arm import SimulatedArm, Truth
 from sim_backend.remote_arm import RemoteArm

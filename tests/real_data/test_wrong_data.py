@@ -23,7 +23,8 @@ from ident_service.estimation.identify import identify
 from ident_service.model.arm_model import arm_model
 from ident_service.record.open import open_recording
 from ident_service.record.recording import Block, Recording
-from ident_service.service.identification import recording_quality, unusable_because
+from ident_service.service.identification import unusable_because
+from ident_service.service.recordings import recording_quality
 
 pytestmark = [pytest.mark.usefixtures("shared")]
 
