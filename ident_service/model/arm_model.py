@@ -49,9 +49,9 @@ def arm_model(config: ArmConfig) -> ArmModel:
         from ident_service.model.rigid_body import read_mjcf, read_urdf
 
         if kinematics.urdf is not None:
-            chain, inertias = read_urdf(kinematics.urdf, config.gravity)
+            chain, inertias = read_urdf(kinematics.urdf, config.gravity, kinematics)
         elif kinematics.mjcf is not None:
-            chain, inertias = read_mjcf(kinematics.mjcf, config.gravity)
+            chain, inertias = read_mjcf(kinematics.mjcf, config.gravity, kinematics)
         else:
             raise ModelError(f"{config.name}: no kinematics")
     offsets = np.maximum(np.abs(chain.translation), np.abs(chain.link_translation)).max(axis=1)
