@@ -17,6 +17,7 @@ from ident_service.estimation.custom import CustomFunction
 from ident_service.estimation.equations import equations
 from ident_service.estimation.feasible.feasible_set import SetName
 from ident_service.estimation.identify import Estimate, identify
+from ident_service.estimation.plausibility import remarks_on_limits
 from ident_service.excitation.excitation import Excitation
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import ArmModel, arm_model
@@ -174,6 +175,7 @@ def simulate(
         write_results(staging, estimate, unusable=unusable, described=config if described is None else described)
         write_atomically(staging / "score.json", json.dumps(score_document(scored), indent=1) + "\n")
         warnings = [f"{one.path.name}: {line}" for one, seen in found for line in seen.warnings()]
+        warnings += [line for one, seen in found for line in remarks_on_limits(one.path.name, seen.joints, model)]
         warnings += estimate.remarks
         write_report(staging, estimate, recordings[:1], recordings[1:], warnings)
         write_manifest(staging)

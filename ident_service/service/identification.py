@@ -19,7 +19,7 @@ from ident_service.estimation.feasible.convex import convex_least_squares
 from ident_service.estimation.feasible.feasible_set import SetName
 from ident_service.estimation.identify import Estimate, identify
 from ident_service.estimation.least_squares import LeastSquares
-from ident_service.estimation.plausibility import reasons_against, reasons_in_recording
+from ident_service.estimation.plausibility import reasons_against, reasons_in_recording, remarks_on_limits
 from ident_service.estimation.proof.sdpa import bpfc_sdpa, bpft_sdpa, fbpe_sdpa
 from ident_service.model.arm_model import arm_model
 from ident_service.model.chain import Array
@@ -135,6 +135,8 @@ def identify_files(request: Request, folder: Path, tell: Callable[[str], None] =
             for reason in reasons_in_recording(recording.path.name, seen.joints, model):
                 raise RecordingError(recording.path, reason) from error
         raise
+    for recording, seen in found:
+        warnings += remarks_on_limits(recording.path.name, seen.joints, model)
     warnings += estimate.remarks
     unusable = unusable_because(estimate, found)
     more: dict[str, Any] = {"recording_quality": [_quality_document(recording, seen) for recording, seen in found]}

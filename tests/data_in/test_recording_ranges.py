@@ -41,6 +41,15 @@ def written(
     return path
 
 
+def described(folder: Path) -> str:
+    """Describe an arm whose rows can be counted: none are left out but those at the ends, 0.5 s each."""
+    (folder / "arm.yaml").write_text(
+        f"extends: {Path('configs/planar2.yaml').resolve()}\n"
+        "identification: {method: ols, smoothing: {cutoff: 8, decimate: 1}, edge: 0.5}\n"
+    )
+    return str(folder / "arm.yaml")
+
+
 def planar() -> ArmConfig:
     return load_arm("planar2")
 
@@ -96,22 +105,23 @@ def test_a_range_beyond_the_end_says_how_long_the_recording_is(tmp_path: Path) -
 
 def test_one_file_to_fit_and_to_validate(tmp_path: Path) -> None:
     path = written(tmp_path / "run.csv")
-    found = identify_files(Request("planar2", (Path(f"{path}@0:8"),), (Path(f"{path}@8:15"),)), tmp_path / "out")
+    arm, out = described(tmp_path), tmp_path / "out"
+    found = identify_files(Request(arm, (Path(f"{path}@0:8"),), (Path(f"{path}@8:15"),)), out)
     assert found.estimate.recordings == (("run.csv@0:8", open_recording(path).sha256),)
     assert [score.recording for score in found.estimate.candidates[0].validation] == ["run.csv@8:15"]
     assert found.estimate.samples == 1600 - EDGES
     for ours, theirs in (("@0:8.01", "@8:15"), ("@0:8", ""), ("", "@8:15"), ("", "")):
         with pytest.raises(UsageError, match="a recording that is fitted to cannot validate the fit"):
-            identify_files(Request("planar2", (Path(f"{path}{ours}"),), (Path(f"{path}{theirs}"),)), tmp_path / "out")
+            identify_files(Request(arm, (Path(f"{path}{ours}"),), (Path(f"{path}{theirs}"),)), out)
     with pytest.raises(UsageError, match=r"run\.csv@7:9: the same recording twice"):
-        identify_files(Request("planar2", (Path(f"{path}@0:8"), Path(f"{path}@7:9"))), tmp_path / "out")
+        identify_files(Request(arm, (Path(f"{path}@0:8"), Path(f"{path}@7:9"))), out)
 
 
 @pytest.mark.parametrize("noise", [0.0, 3e-4])
 def test_standstill_at_the_ends_is_left_out_and_said(tmp_path: Path, noise: float) -> None:
     path = written(tmp_path / "run.csv", still=(700, 460), noise=noise)
     said: list[str] = []
-    found = identify_files(Request("planar2", (path,), cut_standstill=True), tmp_path / "out", said.append)
+    found = identify_files(Request(described(tmp_path), (path,), cut_standstill=True), tmp_path / "out", said.append)
     # Half a second of it stays, as long as the edges that are not used, and what a tenth of a second cannot tell.
     assert said == ["run.csv: standstill left out, 2.90 s at the start and 1.70 s at the end"]
     left_out = round((2.9 + 1.7) / PERIOD)
@@ -178,6 +188,6 @@ def test_a_daemon_is_asked_for_the_same_range() -> None:
 
 
 def test_the_description_may_say_that_standstill_is_cut(tmp_path: Path) -> None:
-    config = planar().model_copy(update={"recording": RecordingFormat(standstill="cut")})
+    config = load_arm(described(tmp_path)).model_copy(update={"recording": RecordingFormat(standstill="cut")})
     path = written(tmp_path / "run.csv", still=(400, 0))
     assert len(whole(open_for(path, arm_model(config))).stamp_ns) == 3400 - 280
