@@ -76,7 +76,7 @@ def _stamp(first_ns: int, seconds: float) -> np.int64:
     return np.int64(min(first_ns + round(seconds * 1e9), bounds.max))
 
 
-def _first_stamp(recording: Recording) -> int:
+def first_stamp(recording: Recording) -> int:
     """Return the first stamp of the whole file [ns]."""
     whole = recording.whole if isinstance(recording, RangeRecording) else recording
     for block in whole.blocks(1):
@@ -107,7 +107,7 @@ def without_standstill(recording: Recording, margin: float) -> RangeRecording:
     Raises:
         RecordingError: no joint moves; and whatever reading the blocks raises.
     """
-    file_ns, first_ns, last_ns = _first_stamp(recording), 0, 0
+    file_ns, first_ns, last_ns = first_stamp(recording), 0, 0
     bins: list[int] = []
     counts: list[int] = []
     sums: list[Matrix] = []

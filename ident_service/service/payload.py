@@ -29,7 +29,7 @@ from ident_service.results.payload_document import (
 )
 from ident_service.results.run_folder import ARM, MANIFEST, PARAMETERS, URDF, VERIFIER, write_manifest, write_verifier
 from ident_service.service.comparison import write_comparison_files
-from ident_service.service.recordings import open_for
+from ident_service.service.recordings import open_for, require_no_fault
 
 DOCUMENT, TEXT = "payload.json", "payload.txt"
 
@@ -66,7 +66,7 @@ def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_off
 
     Raises:
         UsageError, ConfigError, ParameterError: the folder cannot be used, or is no folder of results.
-        RecordingError: a recording cannot be used.
+        RecordingError: a recording cannot be used, or ended in a fault.
         SolverError: the solver stopped without an optimum.
     """
     require_place(out)
@@ -78,6 +78,8 @@ def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_off
     arm = known_arm(side)
     opened = [open_for(path, arm.model) for path in recordings]
     _require_new(side, opened)
+    for path, recording in zip(recordings, opened, strict=True):
+        require_no_fault(path, recording)
     scales = np.array(side.content.get("torque_scales", np.ones(arm.model.chain.joints)), dtype=float)
     recorded = gather(opened, arm.model, arm.base).with_torques_times(scales)
     payload = identify_payload(arm, recorded, refit_offsets=refit_offsets)
@@ -115,7 +117,10 @@ def known_arm(side: Side) -> KnownArm:
         raise ParameterError(f"{side.path}: its parameters have no covariance; identify the arm again")
     model = arm_model(side.config)
     file = read_parameters(side.path / PARAMETERS, model.layout.names)
-    return KnownArm(model, file.base, file.values, side.covariance, side.content.get("fit", {}).get("blocks"))
+    fit = side.content.get("fit", {})
+    residual = np.array([one["rms"] for one in fit.get("per_joint", [])], dtype=float)
+    known = residual if residual.shape == (model.chain.joints,) else None
+    return KnownArm(model, file.base, file.values, side.covariance, fit.get("blocks"), known)
 
 
 def _require_new(side: Side, recordings: Sequence[Recording]) -> None:

@@ -9,16 +9,19 @@ import numpy as np
 
 from ident_service.config.load import load_recording_format
 from ident_service.config.recording import RecordingFormat, disagreements, units_of_other_joints
-from ident_service.errors import UsageError
+from ident_service.errors import RecordingError, UsageError
 from ident_service.model.arm_model import ArmModel
 from ident_service.record.files import split_range
 from ident_service.record.kept import KeptRecording
+from ident_service.record.mcap_file import McapRecording
+from ident_service.record.mcap_records import MAGIC
 from ident_service.record.open import open_recording
-from ident_service.record.part import RangeRecording, without_standstill
+from ident_service.record.part import RangeRecording, first_stamp, time_range, without_standstill
 from ident_service.record.quality import Quality, quality
 from ident_service.record.recording import Recording
 
 # What of a format says how all recordings become samples, and not how one file is laid out.
+_STOPPING = 40  # level of the events that tell of a fault which stopped the arm (`motion/faults.py`)
 _OF_ALL = ("trim", "gap", "stamps", "rate")
 
 
@@ -96,6 +99,35 @@ def own_formats(
 def standstill_left_out(recording: Recording) -> tuple[float, float]:
     """Return how much standstill was left out at the start and at the end [s]."""
     return recording.standstill if isinstance(recording, RangeRecording) else (0.0, 0.0)
+
+
+def require_no_fault(path: Path, recording: Recording) -> None:
+    """Refuse a recording of our own in which a fault stopped the arm, unless its range ends before.
+
+    Args:
+        path: as it was named.
+        recording: what was opened for it.
+
+    Raises:
+        RecordingError: names the fault and when it was.
+    """
+    file, _ = file_and_range(path)
+    with file.open("rb") as stream:
+        if stream.read(len(MAGIC)) != MAGIC:
+            return
+    log = McapRecording(file)
+    if not log.own:
+        return
+    start, end = time_range(recording)
+    first = first_stamp(recording)
+    for event in log.read_extras().events:
+        seconds = (event.stamp_ns - first) * 1e-9
+        if event.level >= _STOPPING and start <= seconds < end:
+            raise RecordingError(
+                recording.path,
+                f"ended in a fault {seconds:.6g} s after its first sample: {event.message}; what it recorded is not the"
+                f" motion of the arm with its load alone. Record again, or give a part before: {file.name}@0:SECONDS",
+            )
 
 
 def recording_quality(recording: Recording, model: ArmModel) -> Quality:
