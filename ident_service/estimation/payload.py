@@ -285,7 +285,7 @@ def _as_zero(motion: Motion, base: BaseParameters, beta: Array) -> Array:
     of_units = np.array([min(REFERENCE.get(unit, 0.0), near.get(unit, np.inf)) for unit in base.units])
     changes = np.array([motion.change(one) for one in np.eye(base.size)])
     shares = (changes / np.maximum(motion.torque, np.finfo(float).tiny)).max(axis=1)
-    return np.minimum(of_units, RELEVANT_TORQUE / np.maximum(shares, np.finfo(float).tiny))
+    return np.asarray(np.minimum(of_units, RELEVANT_TORQUE / np.maximum(shares, np.finfo(float).tiny)))
 
 
 def _dependence(information: Information, T: Array, fit: LeastSquares) -> Array:

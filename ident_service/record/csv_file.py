@@ -21,7 +21,7 @@ from ident_service.errors import RecordingError
 from ident_service.record.assemble import assemble
 from ident_service.record.csv_header import CsvColumns, parse_header
 from ident_service.record.files import require_file, sha256
-from ident_service.record.recording import BLOCK_SAMPLES, Block
+from ident_service.record.recording import BLOCK_SAMPLES, Block, Matrix
 
 GZIP_MAGIC: Final = b"\x1f\x8b"
 MAX_EXPANDED: Final = 4 << 30
@@ -130,18 +130,17 @@ class CsvRecording:
         separators = columns.fields - 1
         if any(row.count(b",") != separators for row in rows):
             self._explain(rows, first)
+        text = b",".join(rows)
         try:
-            fields = b",".join(rows).decode("utf-8", errors="replace").split(",")
-            values = np.zeros((len(rows), columns.fields))
-            for index in columns.used:
-                words = fields[index :: columns.fields]
-                if self._skip_missing and index != columns.time:
-                    words = ["nan" if _is_missing(word) else word for word in words]
-                values[:, index] = list(map(float, words))
+            fields = text.decode("utf-8", errors="replace").split(",")
+            if len(columns.used) == columns.fields and not self._skip_missing:
+                values = np.array(list(map(float, fields))).reshape(len(rows), columns.fields)
+            else:
+                values = self._values(fields, len(rows))
         except ValueError:
             self._explain(rows, first)
         # Python reads 1_000 as a number, and digits of other scripts; in a data file they are slips.
-        if not all(row.isascii() and b"_" not in row for row in rows):
+        if not text.isascii() or b"_" in text:
             self._explain(rows, first)
         times = fields[columns.time :: columns.fields]
         bad = ~(np.abs(values[:, columns.time]) * float(columns.nanoseconds) < _MAX_SECONDS * 1e9)
@@ -160,6 +159,17 @@ class CsvRecording:
             values *= columns.scale
         velocity = None if columns.velocity is None else values[:, columns.velocity]
         return Block(stamps, values[:, columns.position], values[:, columns.torque], velocity)
+
+    def _values(self, fields: Sequence[str], rows: int) -> Matrix:
+        """Numbers of the columns that are read, NaN for missing ones, shape (rows, fields); zeros in the others."""
+        columns = self._columns
+        values = np.zeros((rows, columns.fields))
+        for index in columns.used:
+            words = fields[index :: columns.fields]
+            if self._skip_missing and index != columns.time:
+                words = ["nan" if _is_missing(word) else word for word in words]
+            values[:, index] = list(map(float, words))
+        return values
 
     def _explain(self, rows: list[bytes], first: int) -> None:
         """Raise for the first row that does not fit; return where none of the columns that are read is wrong."""
