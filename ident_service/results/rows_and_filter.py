@@ -16,13 +16,9 @@ def rows_and_filter(options: Identification) -> tuple[str, ...]:
     smoothing, reversal = options.smoothing, options.reversal
     thinned = f", every {_said(smoothing.decimate)}th" if smoothing.decimate != 1 else ""
     rows = f"All rows: every sample of a recording but {options.edge:g} s at its ends and at gaps{thinned}."
-    if reversal.speed or reversal.window:
-        slow = f"slower than {reversal.speed:g} rad/s (or m/s)"
-        near = f"within {reversal.window:g} s of turning round"
-        moving = " or ".join(words for words, used in ((slow, reversal.speed), (near, reversal.window)) if used)
-        rows_moving = f"Away from standstill: without rows in which that joint is {moving}."
-    else:
-        rows_moving = "Away from standstill: the same rows, as none are left out near standstill."
+    slow = f"is not faster than {reversal.speed:g} rad/s (or m/s)" if reversal.speed else "stands still"
+    near = f", and without those within {reversal.window:g} s of them" if reversal.window else ""
+    rows_moving = f"Away from standstill: without rows in which a drive of that joint {slow}{near}."
     if smoothing.method == "butterworth":
         low_pass = f"a zero-phase Butterworth low-pass of order {smoothing.order} at {_said(smoothing.cutoff)} Hz"
     else:

@@ -32,9 +32,9 @@ def said(**changes: Any) -> str:
     [
         ({}, "every sample of a recording but 0.5 s at its ends and at gaps."),
         ({"smoothing": {"decimate": 25}}, "at its ends and at gaps, every 25th."),
-        ({}, "without rows in which that joint is slower than 0.05 rad/s (or m/s) or within 0.2 s of turning round."),
-        ({"reversal": {"speed": 0.1, "window": 0}}, "in which that joint is slower than 0.1 rad/s (or m/s)."),
-        ({"reversal": {"speed": 0, "window": 0}}, "the same rows, as none are left out near standstill."),
+        ({}, "of that joint is not faster than 0.05 rad/s (or m/s), and without those within 0.2 s of them."),
+        ({"reversal": {"speed": 0.1, "window": 0}}, "a drive of that joint is not faster than 0.1 rad/s (or m/s)."),
+        ({"reversal": {"speed": 0, "window": 0}}, "without rows in which a drive of that joint stands still."),
         ({}, "through a zero-phase Butterworth low-pass of order 3 at 8 Hz. Measured torque: as recorded, so that"),
         ({"smoothing": {"filter_torque": True}}, "Measured torque: through the same low-pass."),
         (
