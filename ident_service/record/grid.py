@@ -109,10 +109,14 @@ def grid(recording: Recording, fmt: RecordingFormat) -> Grid:
         stamps = block.stamp_ns
         first_ns = first_ns if samples else int(stamps[0])
         run = stamps if samples == 0 else np.concatenate([[last_ns], stamps])
-        steps.add(run)
-        if block.skipped is not None:
+        if block.skipped is None:
+            steps.add(run)
+        else:
+            # A step over what was left out says nothing of how evenly samples were taken.
             skipped += int(block.skipped.sum())
             behind = np.flatnonzero(block.skipped) + len(run) - len(stamps)
+            for part in np.split(run, behind):
+                steps.add(part)
             lost += [(int(run[index - 1]), int(run[index])) for index in behind[behind > 0]]
         last_ns = int(stamps[-1])
         samples += len(stamps)
@@ -120,6 +124,9 @@ def grid(recording: Recording, fmt: RecordingFormat) -> Grid:
     if samples < 2:
         cause = f"after trimming {fmt.trim[0]:g} s and {fmt.trim[1]:g} s " if any(fmt.trim) else ""
         raise RecordingError(recording.path, f"holds no samples {cause}".rstrip() + "; record the motion again")
+    if steps.none:  # no two samples without one between them that was left out
+        for pair in lost:
+            steps.add(np.array(pair, np.int64))
     own = steps.usual()
     gap = fmt.gap * own
     low, high, deviation = steps.spread(own, gap)
@@ -130,19 +137,20 @@ def grid(recording: Recording, fmt: RecordingFormat) -> Grid:
             f"more than {MAX_GAPS} steps longer than {gap * 1e-6:.4g} ms, where {own * 1e-6:.4g} ms are usual; "
             "find out where the samples went, or raise recording.gap",
         )
-    if fmt.stamps == "arrival" and lost:
-        # Samples that are spaced evenly must not close up over one that was left out.
-        longer = np.unique(np.concatenate([longer, np.array(lost, np.int64)]), axis=0)
+    # Samples that are spaced evenly must not close up over one that was left out.
+    apart = [pair for pair in lost if fmt.stamps == "arrival" or pair[1] - pair[0] > gap]
+    if apart:
+        longer = np.unique(np.concatenate([longer, np.array(apart, np.int64)]), axis=0)
         if len(longer) > MAX_GAPS:
             raise RecordingError(
                 recording.path,
-                f"samples that lack a value leave more than {MAX_GAPS} gaps in stamps of arrival; set "
-                "recording.stamps: sampled if each stamp says when its sample was taken",
+                f"samples that lack a value leave more than {MAX_GAPS} gaps; raise recording.gap, or, if each stamp "
+                "says when its sample was taken, set recording.stamps: sampled",
             )
     edges = [first_ns, *(int(stamp) for pair in longer for stamp in pair), last_ns]
     period = _period(recording, fmt, own)
     furthest = max(high - own, own - low)
-    regular = furthest <= REGULAR * own
+    regular = furthest <= REGULAR * own and len(apart) == len(lost)
     return Grid(
         period_s=period * 1e-9,
         own_period_s=own * 1e-9,
@@ -227,6 +235,11 @@ class _Steps:
         last = order[-(MAX_GAPS + 1) :]
         pairs = np.concatenate([self._longest, np.column_stack([stamps[last], stamps[last + 1]])])
         self._longest = pairs[np.argsort(pairs[:, 1] - pairs[:, 0], kind="stable")[-(MAX_GAPS + 1) :]]
+
+    @property
+    def none(self) -> bool:
+        """Whether there was no step."""
+        return not self._count.any()
 
     def usual(self) -> float:
         """The usual step [ns]."""

@@ -58,7 +58,14 @@ def test_rows_are_left_out_and_counted(tmp_path: Path) -> None:
         assert block.skipped.sum() == len(lost)
     seen = quality(recording, SKIP)
     assert seen.skipped == len(lost)
-    assert "7 samples (0.47 %) lack a value; they are left out" in seen.warnings()
+    assert seen.warnings() == ("7 samples (0.47 %) lack a value; they are left out",)
+    assert seen.resampled
+
+
+def test_every_other_row_may_lack_a_value(tmp_path: Path) -> None:
+    stamps = grid(open_recording(written(tmp_path, set(range(1, 1500, 2))), fmt=SKIP), SKIP)
+    assert (stamps.samples, stamps.skipped, len(stamps.segments)) == (750, 750, 1)
+    assert stamps.own_period_s == pytest.approx(2.0 * PERIOD)
 
 
 def test_a_short_loss_is_spanned_and_a_long_one_is_a_gap(tmp_path: Path) -> None:
