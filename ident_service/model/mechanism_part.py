@@ -32,10 +32,20 @@ class Mimic:
 
 
 def mimics(file: TextFile) -> dict[str, Mimic]:
-    """Read the `<mimic>` elements of a URDF that pinocchio has accepted, by the name of their joint."""
-    found = {}
-    # Entities were refused, and numbers checked, before.
-    for joint in ET.fromstring(file.text).findall("joint"):  # noqa: S314
+    """Read the `<mimic>` elements of a URDF that pinocchio has accepted, by the name of their joint.
+
+    Raises:
+        ModelError: XML that pinocchio's lenient reader accepts and a strict one does not.
+    """
+    found: dict[str, Mimic] = {}
+    if "mimic" not in file.text:
+        return found
+    try:
+        robot = ET.fromstring(file.text)  # noqa: S314 - entities were refused before
+    except ET.ParseError as error:
+        raise ModelError(f"{file.name}: not well-formed XML: {error}") from None
+    # Numbers were checked by pinocchio's reader.
+    for joint in robot.findall("joint"):
         if (mimic := joint.find("mimic")) is not None:
             scale, offset = float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0"))
             found[joint.get("name", "")] = Mimic(mimic.get("joint", ""), scale, offset)

@@ -57,12 +57,12 @@ def read_mjcf(
 
 
 def urdf_model(file: TextFile, kinematics: Kinematics | None = None) -> pin.Model:
-    """The arm in a URDF as pinocchio reads it; see `read_urdf`."""
+    """Read the arm in a URDF as a pinocchio model; see `read_urdf`."""
     return urdf_part(file, kinematics)[0]
 
 
 def urdf_part(file: TextFile, kinematics: Kinematics | None = None) -> tuple[pin.Model, dict[str, float]]:
-    """The arm in a URDF as `urdf_model` gives it, and where all other movable joints are held [rad or m]."""
+    """Read the arm in a URDF as `urdf_model` does, and where all other movable joints are held [rad or m]."""
     _refuse_foreign(file, "URDF")
     whole = _built(file, "URDF", lambda: pin.buildModelFromXML(file.text))
     return arm_part(whole, kinematics or Kinematics(urdf=file), mimics(file), file.name)

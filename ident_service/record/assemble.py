@@ -171,7 +171,7 @@ def _same_as_before(run: Block) -> NDArray[np.bool_]:
 
 
 def _selected(piece: Block, kept: NDArray[np.intp], repeats: int) -> Block:
-    """Some samples of a piece; what was skipped before the others counts before the next one that is kept."""
+    """Select samples of a piece; what was skipped before the others counts before the next one that is kept."""
     velocity = None if piece.velocity is None else piece.velocity[kept]
     skipped = None if piece.skipped is None else np.diff(np.cumsum(piece.skipped)[kept], prepend=0)
     return Block(piece.stamp_ns[kept], piece.position[kept], piece.torque[kept], velocity, repeats, skipped)

@@ -161,7 +161,7 @@ class CsvRecording:
         return Block(stamps, values[:, columns.position], values[:, columns.torque], velocity)
 
     def _values(self, fields: Sequence[str], rows: int) -> Matrix:
-        """Numbers of the columns that are read, NaN for missing ones, shape (rows, fields); zeros in the others."""
+        """Parse the columns that are read, shape (rows, fields): NaN for missing values, zeros in other columns."""
         columns = self._columns
         values = np.zeros((rows, columns.fields))
         for index in columns.used:

@@ -238,7 +238,7 @@ class _Steps:
 
     @property
     def none(self) -> bool:
-        """Whether there was no step."""
+        """Tell whether no step was counted."""
         return not self._count.any()
 
     def usual(self) -> float:

@@ -38,7 +38,7 @@ def rows_and_filter(options: Identification) -> tuple[str, ...]:
 
 
 def rows_and_filter_text(options: Identification) -> list[str]:
-    """The same in lines for a terminal."""
+    """Wrap the sentences of `rows_and_filter` into lines for a terminal."""
     return [
         line for sentence in rows_and_filter(options) for line in textwrap.wrap(sentence, 100, subsequent_indent="  ")
     ]

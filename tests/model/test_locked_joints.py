@@ -258,6 +258,11 @@ def test_a_follower_of_the_arm_is_refused_unless_locked_by_name() -> None:
     )
 
 
+def test_xml_that_only_pinocchio_accepts_is_told() -> None:
+    with pytest.raises(ModelError, match=r"arm\.urdf: not well-formed XML: unbound prefix"):
+        arm(PANDA.replace(' xmlns:xacro="http://www.ros.org/wiki/xacro"', "").replace("</robot>", "<xacro:x/></robot>"))
+
+
 def test_the_description_says_what_it_means() -> None:
     with pytest.raises(ValidationError, match="base, tip and lock are of urdf and mjcf"):
         Kinematics.model_validate({"dh": {"convention": "standard", "joints": {"a": {}}}, "lock": {"a": 0}})

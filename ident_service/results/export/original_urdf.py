@@ -146,7 +146,7 @@ def _origin(element: Element | None, name: str) -> tuple[Array, Array]:
 
 
 def _moved_by(joint: Element, position: float, name: str) -> tuple[Array, Array]:
-    """Rotation, shape (3, 3), and translation [m], shape (3,), of a joint at a position [rad or m]."""
+    """Return rotation, shape (3, 3), and translation [m], shape (3,), of a joint at a position [rad or m]."""
     element = joint.first("axis")
     axis = _numbers("1 0 0" if element is None else element.attributes.get("xyz", "1 0 0"), name)
     axis = axis / np.linalg.norm(axis)
