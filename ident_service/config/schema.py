@@ -20,6 +20,7 @@ from pydantic import (
 
 from ident_service.config.design import Design
 from ident_service.config.drivers import Driver
+from ident_service.config.kinematics import Kinematics
 from ident_service.config.quantities import (
     UPLOAD,
     Angle,
@@ -31,7 +32,6 @@ from ident_service.config.quantities import (
     Positive,
     Section,
     Seed,
-    TextBeside,
     Vector3,
 )
 from ident_service.config.recording import RecordingFormat, Transmission
@@ -43,51 +43,6 @@ Method = Literal["ols", "wls", "huber", "iv"]
 
 
 _FUNCTION = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
-_LARGEST_ANGLE = 6.3  # rad
-_LONGEST_LINK = 20.0  # m; the largest arms that move torque-controlled joints are a tenth of it
-
-
-class DHRow(Section):
-    """One row of a Denavit-Hartenberg table (table 2); the joint variable adds to theta or, if prismatic, to d."""
-
-    type: Literal["revolute", "prismatic"] = "revolute"
-    theta: Angle = 0.0
-    d: Number = 0.0
-    a: Number = 0.0
-    alpha: Angle = 0.0
-
-    @model_validator(mode="after")
-    def _of_an_arm(self) -> DHRow:
-        for name, angle in (("theta", self.theta), ("alpha", self.alpha)):
-            if abs(angle) > _LARGEST_ANGLE:
-                raise ValueError(
-                    f"{name}: {angle:g} rad is more than a turn; numbers are rad, degrees are written '{angle:g} deg'"
-                )
-        for name, length in (("d", self.d), ("a", self.a)):
-            if abs(length) > _LONGEST_LINK:
-                raise ValueError(f"{name}: {length:g} m is longer than the link of any arm; in mm? lengths are metres")
-        return self
-
-
-class DHTable(Section):
-    """A serial chain, standard (distal frames, `Rz(theta) Tz(d) Tx(a) Rx(alpha)`) or modified (Craig) convention."""
-
-    convention: Literal["standard", "modified"]
-    joints: Annotated[dict[str, DHRow], Field(min_length=1)]
-
-
-class Kinematics(Section):
-    """Exactly one description of the mechanism."""
-
-    dh: DHTable | None = None
-    urdf: TextBeside | None = None
-    mjcf: TextBeside | None = None
-
-    @model_validator(mode="after")
-    def _one(self) -> Kinematics:
-        if sum(source is not None for source in (self.dh, self.urdf, self.mjcf)) != 1:
-            raise ValueError("give exactly one of dh, urdf, mjcf")
-        return self
 
 
 class Box(Section):

@@ -39,6 +39,7 @@ from ident_service.model.base import BaseParameters, base_parameters
 from ident_service.model.chain import Array
 from ident_service.model.information import Information
 from ident_service.model.threads import one_blas_thread
+from ident_service.record.part import overlap
 from ident_service.record.recording import Recording
 
 _HELD_OUT = 1.0 / 3.0
@@ -297,12 +298,10 @@ def _check(method: str, recordings: Sequence[Recording], validation: Sequence[Re
         raise UsageError(f"method {method!r} is not one of {', '.join(METHODS)}")
     if not recordings:
         raise UsageError("give at least one recording to identify from")
-    fitted: set[str] = set()
-    for recording in recordings:
-        if recording.sha256 in fitted:
+    for index, recording in enumerate(recordings):
+        if any(overlap(recording, other) for other in recordings[:index]):
             raise UsageError(f"{recording.path}: the same recording twice would make the doubt too small")
-        fitted.add(recording.sha256)
-    if seen := [str(recording.path) for recording in validation if recording.sha256 in fitted]:
+    if seen := [str(one.path) for one in validation if any(overlap(one, other) for other in recordings)]:
         raise UsageError(f"{', '.join(seen)}: a recording that is fitted to cannot validate the fit")
 
 

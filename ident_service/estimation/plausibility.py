@@ -26,6 +26,7 @@ CONSTRAINED_WORSE_WITH_SIGN, PERHAPS_WRONG_SIGN = 1.3, 4.0  # both together
 MIRRORED_FROM, MIRRORED_WORSE = 20.0, 1.4  # percent, and times the unconstrained error, from which a joint is turned
 MIRRORED = 1.3  # times smaller is its error with the torque negated, and again near the unconstrained one
 _OUTSIDE = 0.1  # of a joint's range: what limits of a description may be off
+_NOISE = 1e-3  # of a joint's range: what an encoder's noise at a limit may be
 _TURNS = 100.0  # rad, for joints without limits
 _TOO_FAST, _TOO_STRONG = 4.0, 4.0  # times the limit of the description
 _JUMP = 20.0  # times the usual step between samples
@@ -57,6 +58,37 @@ def reasons_in_recording(recording: str, joints: Sequence[JointQuality], model: 
         for reason in _of_joint(model.chain.names[index], seen, model, revolute=model.chain.revolute[index])
     ]
     return (*found, *(f"{recording}: {reason}" for reason in _weight(joints, model)))
+
+
+def remarks_on_limits(recording: str, joints: Sequence[JointQuality], model: ArmModel) -> tuple[str, ...]:
+    """Name joints that leave their position limits by less than what makes a recording unusable.
+
+    Args:
+        recording: its name, for the words.
+        joints: what was seen of its joints.
+        model: the arm and its limits.
+    """
+    found = []
+    for name, seen, revolute in zip(model.chain.names, joints, model.chain.revolute, strict=True):
+        described = model.config.joints.get(name)
+        limits = None if described is None else described.position
+        if limits is None:
+            continue
+        span = limits[1] - limits[0]
+        excess = max(limits[0] - seen.position[0], seen.position[1] - limits[1])
+        if _NOISE * span < excess <= _OUTSIDE * span:
+            value, when = _farthest(seen, limits)
+            found.append(
+                f"{recording}: {name} is at {value:.4g} {'rad' if revolute else 'm'} {when:.4g} s after the first"
+                f" sample, outside its limits of {limits[0]:.4g} and {limits[1]:.4g}: correct the limits, or the offset"
+            )
+    return tuple(found)
+
+
+def _farthest(seen: JointQuality, limits: tuple[float, float]) -> tuple[float, float]:
+    """Return the position farthest outside [rad or m], and when it was [s]."""
+    side = int(seen.position[1] - limits[1] > limits[0] - seen.position[0])
+    return seen.position[side], seen.position_at[side]
 
 
 def _errors(own: Candidate) -> Iterator[str]:
@@ -163,9 +195,11 @@ def _of_joint(name: str, seen: JointQuality, model: ArmModel, *, revolute: bool)
     if limits is not None:
         room = _OUTSIDE * (limits[1] - limits[0])
         if low < limits[0] - room or high > limits[1] + room:
+            _, when = _farthest(seen, limits)
             yield (
-                f"{name} is recorded from {low:.4g} to {high:.4g} {unit}, and its limits are {limits[0]:.4g} and"
-                f" {limits[1]:.4g}: are the positions in {small}, or those of another joint?"
+                f"{name} is recorded from {low:.4g} to {high:.4g} {unit}, farthest outside its limits of"
+                f" {limits[0]:.4g} and {limits[1]:.4g} at {when:.4g} s after the first sample: are the positions in"
+                f" {small}, or those of another joint?"
             )
             return
     elif revolute and max(-low, high) > _TURNS:
