@@ -171,7 +171,7 @@ def _exit_code(estimate: Estimate, unusable: Sequence[str]) -> int:
 
 def _estimate_document(estimate: Estimate, unusable: Sequence[str]) -> dict[str, Any]:
     from ident_service.results.parameter_file import convex_document
-    from ident_service.results.rows_and_filter import rows_and_filter
+    from ident_service.results.rows_and_filter import how_fitted
 
     own = estimate.candidates[estimate.chosen]
     return {
@@ -181,7 +181,7 @@ def _estimate_document(estimate: Estimate, unusable: Sequence[str]) -> dict[str,
         "feasible": estimate.feasible,
         "margin": estimate.margin,
         "relative_error_percent": own.identification.relative_percent,
-        "rows_and_filter": list(rows_and_filter(estimate.model.config.identification)),
+        "rows_and_filter": list(how_fitted(estimate)),
         "validation": [
             {"recording": score.recording, "relative_error_percent": score.error.relative_percent}
             for score in own.validation

@@ -237,8 +237,8 @@ class Identification(Section):
 
     `method` is the estimator, by default the one of `wls` and `huber` that predicts held-out parts of the recordings
     better; `edge` [s] is left out at both ends of every recording, two periods of the cut-off by default; `block` [s]
-    is what doubt is computed from; `delay` [s] is how much later the torque's stamps are than the position's; `period` [s]
-    averages a periodic motion over its periods, without the filters of the torque.
+    is what doubt is computed from; `delay` [s] is how much later the stamps of the torque are than the position's;
+    `period` [s] averages a periodic motion over its periods, without the filters of the torque.
     """
 
     method: Method | Literal["choose"] = "choose"

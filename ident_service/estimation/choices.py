@@ -29,7 +29,7 @@ class Choice:
 
     def __str__(self) -> str:
         others = ", ".join(f"{name} {error:.3g} %" for name, error in self.held_out.items())
-        return f"{self.option}: {self.value} was chosen; torque error on held-out thirds of the recordings: {others}"
+        return f"{self.option} {self.value}; torque error on held-out thirds of the recordings: {others}"
 
 
 def chosen(option: str, held_out: Mapping[str, float]) -> Choice:

@@ -89,6 +89,11 @@ class Equations:
         """All rows, those near standstill too: what an estimate is judged on (eq. 84)."""
         return self.total if self.left_out is None else self.total.merged(self.left_out)
 
+    @property
+    def moving(self) -> Information:
+        """All rows in motion, or all rows where the motion turns round too often for any."""
+        return self.total if self.total.rows.any() else self.everything
+
     def with_torques_times(self, scales: Array) -> Equations:
         """The same equations with each joint's torque multiplied, `scales` of shape (joints,)."""
         blocks, near = (tuple(one.with_torques_times(scales) for one in part) for part in (self.blocks, self.near))
@@ -143,7 +148,10 @@ def equations(
         weights = None if row_weights is None else row_weights(rows)
         for begin, end in zip([0, *starts], [*starts, len(rows.time)], strict=True):
             part = slice(begin, end)
-            kinds = [(blocks, rows.keep[part], None), (near, ~rows.keep[part], None)]
+            kinds: list[tuple[list[Information], NDArray[np.bool_], Array | None]] = [
+                (blocks, rows.keep[part], None),
+                (near, ~rows.keep[part], None),
+            ]
             if weights is not None:
                 kinds = [(blocks, np.ones_like(rows.keep[part]), weights[part])]
             for found, which, weighted in kinds:

@@ -21,7 +21,7 @@ from ident_service.errors import RecordingError
 from ident_service.estimation.doubt import Verdict, uncertainty, verdicts
 from ident_service.estimation.equations import Equations, Rows, bounded, equation_rows
 from ident_service.estimation.least_squares import ordinary_least_squares
-from ident_service.estimation.spectra import USUAL
+from ident_service.estimation.spectra import EDGE, USUAL
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import base_parameters
 from ident_service.model.chain import Array
@@ -74,7 +74,7 @@ class GrowingInformation:
         smoothing = options.smoothing
         if smoothing.cutoff == "choose":  # windows of a few seconds do not say what the motion is
             smoothing = smoothing.model_copy(update={"cutoff": USUAL})
-        self._edge = 2.0 / USUAL if options.edge == "choose" else options.edge
+        self._edge = EDGE / USUAL if options.edge == "choose" else options.edge
         options = options.model_copy(update={"period": None, "smoothing": smoothing, "edge": self._edge})
         config = model.config.model_copy(update={"identification": options, "recording": RecordingFormat()})
         self._model = replace(model, config=config)

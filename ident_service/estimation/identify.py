@@ -124,6 +124,7 @@ class Estimate:
         recordings: name and hash of what it was fitted to.
         candidates: the estimates of table 8, this one's among them.
         chosen: index of this estimate among the candidates.
+        standstill_shares: what rows near standstill were multiplied by in the fit, shape (joints,).
         choices: what the configuration left to be chosen, and by how much it was better.
         remarks: what a person should know of how it was found, in words.
         custom: further knowledge in the estimate, where the description names some and it is constrained; neither
@@ -154,6 +155,7 @@ class Estimate:
     recordings: tuple[tuple[str, str], ...]
     candidates: tuple[Candidate, ...]
     chosen: int
+    standstill_shares: Array
     choices: tuple[Choice, ...] = ()
     remarks: tuple[str, ...] = ()
     custom: CustomKnowledge | None = None
@@ -233,15 +235,15 @@ def identify(
     if prior is None and custom is None:
         held[kind] = held[kind].centred(base, conditions)
 
-    everything, total = prepared.equations.everything, prepared.equations.total
+    everything, moving = prepared.equations.everything, prepared.equations.moving
     label = found.method.upper()
 
     def candidate(name: str, beta: Array, margin: float) -> Candidate:
         scores = tuple(
-            Scored(one.path.name, one.sha256, torque_error(rows.everything, beta), torque_error(rows.total, beta))
+            Scored(one.path.name, one.sha256, torque_error(rows.everything, beta), torque_error(rows.moving, beta))
             for one, rows in unseen
         )
-        return Candidate(name, beta, margin, torque_error(everything, beta), torque_error(total, beta), scores)
+        return Candidate(name, beta, margin, torque_error(everything, beta), torque_error(moving, beta), scores)
 
     def tested(name: FeasibleSetName, estimate: FeasibleEstimate) -> float:
         return estimate.margin if name == kind else feasibility_test(estimate.beta, base, conditions).margin
@@ -279,6 +281,7 @@ def identify(
         recordings=tuple((recording.path.name, recording.sha256) for recording in recordings),
         candidates=tuple(candidates),
         chosen=chosen,
+        standstill_shares=found.shares,
         choices=(*prepared.choices, *found.choices),
         remarks=(*found.remarks, *_remarks_on_friction(model, prepared.model)),
         custom=None if free else knowledge,

@@ -147,7 +147,7 @@ def _mirrored(estimate: Estimate) -> str:
         signs[joint] = -1.0
         fit = ordinary_least_squares(information.with_torques_times(signs), weights)
         beta = constrained_least_squares(fit, estimate.base, estimate.conditions).beta
-        turned = torque_error(estimate.prepared.equations.total.with_torques_times(signs), beta)
+        turned = torque_error(estimate.prepared.equations.moving.with_torques_times(signs), beta)
         error = turned.joint_relative_percent[joint]
         if MIRRORED * error < own[joint] and error < MIRRORED_WORSE * free[joint]:
             return (
@@ -164,7 +164,7 @@ def _driving_friction(estimate: Estimate, deviations: float) -> list[tuple[str, 
     speed is the root mean square of the velocity, which is the viscous column's, of the rows that were fitted to.
     """
     # Not those that were fitted: a robust method multiplies their rows.
-    layout, base, total = estimate.model.layout, estimate.base, estimate.prepared.equations.total
+    layout, base, total = estimate.model.layout, estimate.base, estimate.prepared.equations.moving
     place = {int(column): index for index, column in enumerate(base.base)}
     coupling, found = estimate.model.chain.coupling, []
     for drive, viscous in enumerate(layout.term_columns("viscous")):

@@ -29,7 +29,7 @@ _ABOVE_NOISE = 3.0  # power that is no noise, of the noise's
 _NOISE = 1e-3  # of the acceleration's power; 3 % of its size
 _HIGHEST = 0.2  # of the sampling rate; above half of it there is nothing
 _KEPT = 10.0  # samples a period of the cut-off
-_EDGE = 2.0  # periods of the cut-off at the ends, where the filter has one side to look at
+EDGE = 2.0  # periods of the cut-off at the ends, where the filter has one side to look at
 _WINDOW_S = 20.0
 _SAMPLES = 16384
 
@@ -78,7 +78,7 @@ def with_filter(
         cutoff, rate = smoothing.cutoff, min(1.0 / grid(recording, fmt).period_s for recording in recordings)
     keep = smoothing.decimate if smoothing.decimate != "choose" else max(1, int(rate / (_KEPT * cutoff)))
     chosen = smoothing.model_copy(update={"cutoff": cutoff, "decimate": keep})
-    edge = options.edge if options.edge != "choose" else _EDGE / min(cutoff, smoothing.regressor_cutoff or cutoff)
+    edge = options.edge if options.edge != "choose" else EDGE / min(cutoff, smoothing.regressor_cutoff or cutoff)
     return options.model_copy(update={"smoothing": chosen, "edge": edge})
 
 
@@ -116,14 +116,14 @@ def spectrum(recording: Recording, fmt: RecordingFormat) -> Spectrum:
     if windows == 0:
         return Spectrum(1.0 / period, 0.0, 0.5 / period)  # what follows says that it is too short
     frequency = np.fft.rfftfreq(length - 1, period)[1:]
-    ends = [_ends(joint, frequency, period) for joint in (power[1:] / windows).T if joint.any()]
+    ends = [_ends(joint, frequency, period) for joint in power[1:].T / windows if joint.any()]
     if not ends:
         return Spectrum(1.0 / period, 0.0, 0.5 / period)
     motion, noise = np.array(ends).T
     return Spectrum(1.0 / period, float(motion.max()), float(np.median(noise)))
 
 
-def _ends(power: Array, frequency: Array, period: float) -> tuple[float, float]:
+def _ends(power: NDArray[np.floating], frequency: Array, period: float) -> tuple[float, float]:
     """Give the frequencies [Hz] that a joint's motion ends at and its noise matters from; `power` is of its rates."""
     # A difference multiplies power by this.
     difference = (2.0 * np.sin(np.pi * frequency * period)) ** 2

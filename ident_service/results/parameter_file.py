@@ -29,7 +29,7 @@ from ident_service.model.expressions import parse_expression
 from ident_service.model.notation import NOTATIONS, Notation, regrouped, translate
 from ident_service.results.files import write_atomically
 from ident_service.results.information_document import information_document
-from ident_service.results.rows_and_filter import rows_and_filter
+from ident_service.results.rows_and_filter import how_fitted
 from ident_service.results.schemas import require_schema
 from ident_service.results.strict_json import strict_json
 
@@ -190,7 +190,12 @@ def parameters_document(estimate: Estimate, described: ArmConfig | None = None) 
             "blocks": len(estimate.fitted.blocks),
             "condition_number": estimate.fit.condition_number if np.isfinite(estimate.fit.condition_number) else None,
             **_errors(own.identification, model.chain.names),
-            "rows_and_filter": list(rows_and_filter(options)),
+            "rows_and_filter": list(how_fitted(estimate)),
+            "standstill_shares": estimate.standstill_shares.tolist(),
+            "choices": [
+                {"option": one.option, "value": one.value, "held_out_error_percent": dict(one.held_out)}
+                for one in estimate.choices
+            ],
         },
         "information": information_document(estimate.information),
         "validation": [

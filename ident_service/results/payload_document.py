@@ -25,7 +25,7 @@ from ident_service.model.chain import Array
 from ident_service.model.layout import INERTIAL
 from ident_service.results.files import write_atomically
 from ident_service.results.information_document import information_document
-from ident_service.results.rows_and_filter import rows_and_filter_text
+from ident_service.results.rows_and_filter import rows_and_filter, wrapped
 from ident_service.results.schemas import require_schema
 
 _WORDS: Mapping[Word, tuple[str, str]] = {
@@ -163,7 +163,7 @@ def payload_text(payload: Payload, arm: KnownArm) -> str:
         ]
         body = zip(payload.base.names, rounded(payload.body.delta[: len(INERTIAL)]), strict=False)
         lines.append("  " + "  ".join(f"{name} {value:.4g}" for name, value in body))
-    lines += ["", *rows_and_filter_text(arm.model.config.identification)]
+    lines += ["", *wrapped(rows_and_filter(arm.model.config.identification))]
     return "\n".join(lines) + "\n"
 
 

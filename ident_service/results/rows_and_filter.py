@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Iterable
 
 from ident_service.config.schema import Identification
+from ident_service.estimation.identify import Estimate
 
 
 def rows_and_filter(options: Identification) -> tuple[str, ...]:
@@ -14,8 +16,11 @@ def rows_and_filter(options: Identification) -> tuple[str, ...]:
         options: with which the equations were made.
     """
     smoothing, reversal = options.smoothing, options.reversal
+    if "choose" in (smoothing.cutoff, smoothing.decimate, options.edge):
+        chosen = "Rows and filter: chosen for each recording from the spectra of its positions; its ends are left out."
+        return (chosen,)
     thinned = f", every {_said(smoothing.decimate)}th" if smoothing.decimate != 1 else ""
-    rows = f"All rows: every sample of a recording but {options.edge:g} s at its ends and at gaps{thinned}."
+    rows = f"All rows: every sample of a recording but {_said(options.edge)} s at its ends and at gaps{thinned}."
     slow = f"is not faster than {reversal.speed:g} rad/s (or m/s)" if reversal.speed else "stands still"
     near = f", and without those within {reversal.window:g} s of them" if reversal.window else ""
     rows_moving = f"Away from standstill: without rows in which a drive of that joint {slow}{near}."
@@ -37,11 +42,21 @@ def rows_and_filter(options: Identification) -> tuple[str, ...]:
     return rows, rows_moving, position, torque, both
 
 
-def rows_and_filter_text(options: Identification) -> list[str]:
-    """Wrap the sentences of `rows_and_filter` into lines for a terminal."""
-    return [
-        line for sentence in rows_and_filter(options) for line in textwrap.wrap(sentence, 100, subsequent_indent="  ")
-    ]
+def how_fitted(estimate: Estimate) -> tuple[str, ...]:
+    """Describe how an estimate's rows and filters came about, one sentence each: what was given, chosen and weighed."""
+    shares = estimate.standstill_shares
+    low, high = (f"{share:.2g}" for share in (shares.min(), shares.max()))
+    weighed = f"{low} to {high}" if low != high else low
+    return (
+        *rows_and_filter(estimate.model.config.identification),
+        f"Rows near standstill: multiplied in the fit by {weighed}, as their own residuals have it.",
+        *(f"Chosen: {choice}." for choice in estimate.choices),
+    )
+
+
+def wrapped(sentences: Iterable[str]) -> list[str]:
+    """Wrap sentences into lines for a terminal."""
+    return [line for sentence in sentences for line in textwrap.wrap(sentence, 100, subsequent_indent="  ")]
 
 
 def _said(value: float | str) -> str:

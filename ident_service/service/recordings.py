@@ -10,6 +10,7 @@ import numpy as np
 from ident_service.config.load import load_recording_format
 from ident_service.config.recording import RecordingFormat, disagreements, units_of_other_joints
 from ident_service.errors import RecordingError, UsageError
+from ident_service.estimation.spectra import EDGE, USUAL
 from ident_service.model.arm_model import ArmModel
 from ident_service.record.files import split_range
 from ident_service.record.kept import KeptRecording
@@ -55,7 +56,8 @@ def open_for(path: Path, model: ArmModel, form: RecordingFormat | None = None) -
         recording = RangeRecording(recording, *seconds, label=path.name.removeprefix(file.name))
     if form.standstill == "cut":
         # Rows near the ends are not used, for want of neighbours; standstill may well be those.
-        recording = without_standstill(recording, model.config.identification.edge)
+        edge = model.config.identification.edge
+        recording = without_standstill(recording, EDGE / USUAL if edge == "choose" else edge)
     return recording
 
 

@@ -23,5 +23,5 @@ FRICTION = {
 
 
 def with_known_friction(model: ArmModel) -> ArmModel:
-    """A real arm whose friction has the known shape, so that its identification takes a second instead of ten."""
+    """A real arm whose friction has the known shape, so that nothing is searched for."""
     return with_friction(model, FRICTION[model.config.name])
