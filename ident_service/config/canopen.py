@@ -23,7 +23,7 @@ from ident_service.config.quantities import (
     TextBeside,
 )
 from ident_service.config.recording import Transmission
-from ident_service.config.simulation import SimulatedFault
+from ident_service.config.simulation import SimulatedFault, WindingsOff
 
 NodeId = Annotated[int, Field(strict=True, ge=1, le=127)]
 Seconds = Annotated[float, Field(strict=True, ge=0.001, le=60.0)]  # whole ms of 16 bits in the drive
@@ -142,12 +142,16 @@ class StatusReports(Section):
 
 
 class Emulation(Section):
-    """What stands behind emulated drives: an arm with true parameters, noise and faults, as `SimulatedDriver` has."""
+    """What stands behind emulated drives: an arm with true parameters, noise and faults, as `SimulatedDriver` has.
+
+    A drive whose power stage is off leaves its motor coasting, or braked where `windings_off` is `shorted`.
+    """
 
     seed: Seed = 0
     truth: ParameterTable | None = None
     torque_noise: PerJoint = 0.0
     braking: PerJoint | None = None
+    windings_off: WindingsOff = "open"
     faults: tuple[SimulatedFault, ...] = ()
 
 

@@ -143,7 +143,8 @@ class Joint(Section):
     """Limits, gains and body of one joint; what a motion needs may be left out of an arm that is only identified.
 
     `drive_inertia` [kg m^2 or kg] is what its rotors have at the joint by data sheet, the least that is there.
-    Margins of the gains are stated with it where the prior, a CAD model of the links, lacks it.
+    Margins of the gains are stated with it where the prior, a CAD model of the links, lacks it. `brake` says that the
+    joint's drive has a holding brake, which closes whenever its power stage is off.
     """
 
     position: Interval | None = None
@@ -156,7 +157,14 @@ class Joint(Section):
     kp: Positive | None = None
     kd: Positive | None = None
     drive_inertia: NonNegative | None = None
+    brake: bool = False
     body: Body = Body()
+
+    @model_serializer(mode="wrap")
+    def _unless_without(self, serialized: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # Motions that were designed before brakes could be described stay valid.
+        document: dict[str, Any] = serialized(self)
+        return {key: value for key, value in document.items() if key != "brake" or value}
 
     @model_validator(mode="after")
     def _home_inside(self) -> Joint:

@@ -2,7 +2,8 @@
 
 `TRANSITIONS` is the standard's table, `_LEAVING` says what the motor does when the drive function ends. A quick stop,
 and a fault reaction by ramp, brake with shorted windings for as long as the configured deceleration would take; this
-drive has no other way to slow down.
+drive has no other way to slow down. After that, and without power, the motor coasts, unless its description says that
+the drive leaves the windings shorted or that the joint has a brake.
 
 Boundary: states and what the power stage does in them; torque while enabled is `torque.py`.
 """
@@ -147,7 +148,8 @@ class PowerStage:
         if self.state in (*_FAULTS, PowerState.NOT_READY):
             return
         if coasting or self._node.objects.number(0x605E) == 0:
-            self._motor.coast(self._node.now_ns)
+            end = self._motor.fail if coasting else self._motor.switch_off
+            end(self._node.now_ns)
             self._node.stop(_RAMP)
             self.state = PowerState.FAULT
         elif self.state in (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE):
@@ -157,10 +159,10 @@ class PowerStage:
             self.state = PowerState.FAULT
 
     def supply(self, on: bool) -> None:
-        """Power comes, or is taken from outside: the relay then shorts the windings."""
+        """Power comes, or is taken from outside."""
         self.voltage = on
         if not on:
-            self._motor.brake(self._node.now_ns)
+            self._motor.switch_off(self._node.now_ns)
             if self.state in POWERED:
                 self._node.stop(_RAMP)
                 faulty = self.state is PowerState.FAULT_REACTION_ACTIVE
@@ -171,8 +173,10 @@ class PowerStage:
         if name != _RAMP:
             return
         if self.state is PowerState.FAULT_REACTION_ACTIVE:
-            self.state = PowerState.FAULT  # 14; the windings stay shorted
+            self._motor.switch_off(self._node.now_ns)
+            self.state = PowerState.FAULT  # 14
         elif self.state is PowerState.QUICK_STOP_ACTIVE and not self._stays():
+            self._motor.switch_off(self._node.now_ns)
             self.state = PowerState.SWITCH_ON_DISABLED  # 12
 
     def _stays(self) -> bool:
@@ -185,9 +189,9 @@ class PowerStage:
             if option is not None and self._node.objects.number(option):
                 self._motor.brake(self._node.now_ns)
             else:
-                self._motor.coast(self._node.now_ns)
+                self._motor.switch_off(self._node.now_ns)
         elif self.state is PowerState.QUICK_STOP_ACTIVE and target is PowerState.SWITCH_ON_DISABLED:
-            self._motor.coast(self._node.now_ns)
+            self._motor.switch_off(self._node.now_ns)
         self.state = target
 
     def _brake(self) -> None:

@@ -25,8 +25,8 @@ PUCK_FAULTS: dict[str, FaultRule] = {
     "torque_sign": FaultRule("the opposite torque acts, and the drive does not say so", stays=True),
     "torque_saturation": FaultRule("torque held below the limit; the drive says so", "share of the limit", stays=True),
     "drive_fault": FaultRule("the power stage fails: emergency message, fault, the motor coasts", stays=True),
-    "node_silent": FaultRule("no frames, and the motor brakes; the node boots when the fault ends", stays=True),
-    "emergency_stop": FaultRule("the motors' power is taken; they brake", of_joint=False, stays=True),
+    "node_silent": FaultRule("no frames, and no power for the motor; the node boots when the fault ends", stays=True),
+    "emergency_stop": FaultRule("the motors' power is taken", of_joint=False, stays=True),
     "load_attached": FaultRule("a point mass on the last link", "mass [kg]", of_joint=False, stays=True),
     "bus_gone": FaultRule("no frame gets through, in either direction", of_joint=False, stays=True),
     # Only drives on a bus can have these.

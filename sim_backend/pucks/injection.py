@@ -152,7 +152,7 @@ class Injection:
             case "reboot", True:
                 return face.reboot(now_ns)
             case "node_silent", True:
-                face.motor.brake(now_ns)
+                face.motor.switch_off(now_ns)
             case "node_silent", False:
                 face.power_up(now_ns)
         return []
