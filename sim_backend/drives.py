@@ -2,9 +2,9 @@
 
 A drive is on, off, or idle. Off, an axis coasts, unless its windings are shorted then or it has a brake. Idle, its
 windings are shorted and brake it like viscous friction, `tau = -b dq`; after the ramp of a quick stop it is as when it
-is off, and so it is at once where the power was taken from outside. Without a torque frame for the watchdog's time, whatever the host believes, all drives
-go idle and stay so until they are enabled again. A drive's own fault and an emergency stop stay latched until `reset`,
-which leaves their axes idle.
+is off, and so it is at once where the power was taken from outside. Without a torque frame for the watchdog's time,
+whatever the host believes, all drives go idle and stay so until they are enabled again. A drive's own fault and an
+emergency stop stay latched until `reset`, which leaves their axes idle.
 
 Boundary: torques only, period by period; who may send one is `arm.py`, what a drive can make of it `imperfections.py`.
 """

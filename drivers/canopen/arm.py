@@ -25,7 +25,7 @@ from drivers.canopen import dictionary as od
 from drivers.canopen.buses import Buses
 from drivers.canopen.codec import Drive, Emergency
 from drivers.canopen.coordinates import Coordinates, coordinates, unwrapped
-from drivers.canopen.enabling import Enabling, Resetting
+from drivers.canopen.enabling import Enabling, Resetting, hold
 from drivers.canopen.events import MissedReports, axis_events
 from drivers.canopen.link import Link, open_links
 from drivers.canopen.lock import BusLock
@@ -33,7 +33,7 @@ from drivers.canopen.looking import LookingArm
 from drivers.canopen.profile import bus_profiles
 from drivers.canopen.sdo import Objects
 from drivers.canopen.session_log import SessionLog, logged_links, require_format
-from drivers.canopen.setup import Setup, configure, identify, released
+from drivers.canopen.setup import Setup, configure, identify, quick_stop_option, released
 from drivers.canopen.stopping import StopCommand
 from drivers.canopen.words import NmtCommand, joint_status
 from drivers.canopen.zero import zeros_of
@@ -71,6 +71,7 @@ class CanopenArm(Arm):
         self._look_every = min(max(1, cycles), _MOST_UNLOOKED)
         self._coordinates: Coordinates = coordinates(config.driver, config.transmission)
         self._zeros = zeros_of(config)
+        self._quick_stop = quick_stop_option(config)
         self._limits = np.array([np.inf if j.torque is None else j.torque for j in config.joints.values()])
         if len(self._limits) != len(config.driver.drives):
             raise DriverError(f"{config.name}: joints must name all {len(config.driver.drives)} joints")
@@ -179,18 +180,22 @@ class CanopenArm(Arm):
     def enable(self) -> None:
         """Energise all drives together with zero torque, through the states of CiA 402.
 
+        Drives that hold the arm in quick stop (605Ah of 5 to 8) go on holding it until all others are ready, too.
+
         Raises:
-            DriverError: not open, a drive has a fault, or does not follow in time; none stays energised.
+            DriverError: not open, a drive has a fault, or does not follow in time; only what held the arm still does.
         """
         buses = self._open()
+        held = hold(buses.drives)
         self._no_torque()
         self._streaming, self._stop = True, StopCommand()
         try:
             reports = self._driver.status.inhibit, self._driver.status.period
-            steps = Enabling(buses.drives, self._names, self._driver.bring_up, self.clock.now_ns(), reports)
+            now_ns, option = self.clock.now_ns(), self._quick_stop
+            steps = Enabling(buses.drives, self._names, self._driver.bring_up, now_ns, reports, option)
             self._through(buses, steps)
         except BaseException:
-            self.stop(StopKind.TORQUE_OFF)
+            self.stop(StopKind.QUICK_STOP if held else StopKind.TORQUE_OFF)
             raise
         buses.forget_events()  # of the states that drives went through
         self._enabled = True
@@ -245,9 +250,11 @@ class CanopenArm(Arm):
         """Torque off, drives as they were powered up, buses free; any number of times.
 
         A quick stop is not cut short by it: drives that are told to let go in the midst of one would let the arm fall.
+        The same holds for drives that were found holding the arm in quick stop, unless they have been told to let go.
         """
         if not self._stop.braking:
-            self.stop(StopKind.TORQUE_OFF)
+            held = not self._stops and self._buses is not None and hold(self._buses.drives)
+            self.stop(StopKind.QUICK_STOP if held else StopKind.TORQUE_OFF)
         if self._buses is not None:
             self._leave(self._buses)
             self._buses.close()
@@ -302,7 +309,8 @@ class CanopenArm(Arm):
             objects = buses.objects(number)
             identity = identify(objects, drive.identity)
             self._begun = number + 1
-            configure(objects, Setup(drive, buses.profile(number), self._driver.reactions, limits[number]))
+            reactions = self._driver.reactions, self._quick_stop
+            configure(objects, Setup(drive, buses.profile(number), *reactions, limits[number]))
             if self._zeros is not None:
                 counts = self._coordinates.zero[number]
                 if not self._zeros.keep_on(objects, number, counts, buses.restarted(number)):

@@ -127,9 +127,15 @@ class Heartbeats(Section):
 
 
 class Reactions(Section):
-    """What a drive does by itself: option codes of CiA 402, as its manual numbers them."""
+    """What a drive does by itself: option codes of CiA 402, as its manual numbers them.
 
-    quick_stop: Annotated[int, Field(strict=True)] = 2  # 605Ah: ramp, then switch-on disabled
+    Left out, `quick_stop` is 2, or 6 for an arm whose `control.after_stop` is `hold` or `lower`: it has no brakes, and
+    stays in quick stop, where the drive goes on holding the motor.
+    """
+
+    quick_stop: Annotated[int, Field(strict=True)] | None = (
+        None  # 605Ah: 2 and 6 ramp, then switch-on disabled, or stay
+    )
     fault: Annotated[int, Field(strict=True)] = 2  # 605Eh: quick-stop ramp
     abort_connection: Annotated[int, Field(strict=True)] = 3  # 6007h: quick stop
 

@@ -18,6 +18,7 @@ from pydantic import (
     model_validator,
 )
 
+from ident_service.config.control import Control
 from ident_service.config.design import Design
 from ident_service.config.drivers import Driver
 from ident_service.config.quantities import (
@@ -220,13 +221,6 @@ class Constraints(Section):
                     f"torque_constant of {joint}: lower bound {lower:g} is not below upper bound {upper:g}"
                 )
         return self
-
-
-class Control(Section):
-    """The computed-torque loop (eq. 76): rate [Hz] and cut-off of the velocity low-pass [Hz]."""
-
-    rate: Positive = 1000.0
-    velocity_cutoff: Positive = 30.0
 
 
 class Smoothing(Section):

@@ -84,9 +84,7 @@ FAULT_RULES: dict[FaultKind, FaultRule] = {
         "as lost feedback, and no torque until enabled again, which no sample says",
         stays=True,
     ),
-    FaultKind.EMERGENCY_STOP: FaultRule(
-        "no torque until reset; status says so", of_joint=False, stays=True
-    ),
+    FaultKind.EMERGENCY_STOP: FaultRule("no torque until reset; status says so", of_joint=False, stays=True),
     # What happens to the plant.
     FaultKind.LOAD_ATTACHED: FaultRule("a point mass on the last link", "mass [kg]", of_joint=False, stays=True),
     # What happens on the way.

@@ -1,8 +1,8 @@
 """One emulated motor with its encoder and power stage, as the firmware in front of it sees it.
 
 A power stage makes a torque, leaves the windings open (the motor coasts), or shorts them (it brakes, as idle WAM pucks
-do). Without power a holding brake, where there is one, has the shaft. Boundary: no protocol; the firmware says what the power stage does, `body.py` moves the rotor, and `faults.py`
-sets the defects.
+do). Without power a holding brake, where there is one, has the shaft. Boundary: no protocol; the firmware says what the
+power stage does, `body.py` moves the rotor, and `faults.py` sets the defects.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Power(Enum):
     COAST = "coasts"
     BRAKE = "brakes"
     TORQUE = "has torque"
-    HELD = "is held by its brake"
+    HELD = "is held, by its brake or by the drive's own loop"
 
 
 class Rotor(Protocol):
@@ -146,6 +146,10 @@ class Motor:
     def switch_off(self, now_ns: int) -> None:
         """Take the power away: windings open or shorted, as this drive leaves them, or the brake closed."""
         self._do(self._unpowered, 0.0, now_ns)
+
+    def hold(self, now_ns: int) -> None:
+        """Hold the shaft by the drive's own loop, which creeps no more than a closed brake."""
+        self._do(Power.HELD, 0.0, now_ns)
 
     def fail(self, now_ns: int) -> None:
         """Open the windings: a power stage that failed does not short them; a brake closes without it."""
