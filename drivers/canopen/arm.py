@@ -26,10 +26,11 @@ from drivers.canopen.buses import Buses
 from drivers.canopen.codec import Drive, Emergency
 from drivers.canopen.coordinates import Coordinates, coordinates, unwrapped
 from drivers.canopen.enabling import Enabling, Resetting, hold
-from drivers.canopen.events import MissedReports, axis_events
+from drivers.canopen.events import Reports
 from drivers.canopen.link import Link, open_links
 from drivers.canopen.lock import BusLock
 from drivers.canopen.looking import LookingArm
+from drivers.canopen.measured import MeasuredTorque
 from drivers.canopen.profile import bus_profiles
 from drivers.canopen.sdo import Objects
 from drivers.canopen.session_log import SessionLog, logged_links, require_format
@@ -39,7 +40,6 @@ from drivers.canopen.words import NmtCommand, joint_status
 from drivers.canopen.zero import zeros_of
 from drivers.canopen.zeroing import ZeroingArm
 from drivers.clock import Clock, RealClock, VirtualClock
-from drivers.status import AxisEvent
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError, PositionUnknown
@@ -104,7 +104,9 @@ class CanopenArm(Arm):
         self._told: list[tuple[int | None, Emergency | None]] = []
         self._status: tuple[int, ...] = ()
         self._cycle = self._begun = 0  # drives whose configuration has begun, the first ones
-        self._missed = MissedReports()
+        first = {k: joints[0] for k, joints in self._joints_of.items()}
+        self._reports = Reports(self._driver, first, self._look_every)
+        self._measured = MeasuredTorque(self._coordinates, 1e9 / self._period_ns)
         self._identities: tuple[str, ...] = ()
 
     def look(self) -> Arm:
@@ -231,6 +233,7 @@ class CanopenArm(Arm):
         # Enabled, an exchange that only looks is no torque frame: drives that count them must notice.
         idle = self._stop.counts(self._counts) if self._streaming and not self._enabled else None
         stamp_ns = buses.cycle(idle if torque is None else self._counts)
+        self._measured.cycle(self._counts, buses.drives)
         sample = self._sample(buses, stamp_ns)
         self._cycle += 1
         return sample
@@ -359,7 +362,9 @@ class CanopenArm(Arm):
             buses.lost,
             self._statuses(drives),
             max(drive.status_age for drive in drives),
-            tuple(self._events(buses)),
+            tuple(self._reports.new(buses.codecs, self._cycle, self.clock.now_ns())),
+            measured_torque=self._measured.torque,
+            torque_difference=self._measured.difference if self._enabled else None,
         )
 
     def _statuses(self, drives: Sequence[Drive]) -> tuple[int, ...]:
@@ -369,17 +374,6 @@ class CanopenArm(Arm):
             self._told = told
             self._status = tuple(int(joint_status(drives[k].axis_status for k in needed)) for needed in self._drives_of)
         return self._status
-
-    def _events(self, buses: Buses) -> list[AxisEvent]:
-        found: list[AxisEvent] = []
-        for codec in buses.codecs:
-            events = codec.take_events()
-            look = self._cycle % self._look_every == 0
-            if events or look:
-                joints = {self._driver.drives[k].node: self._joints_of[k][0] for k in codec.profile.drives}
-                found += axis_events(events, codec, joints)
-                found += self._missed.new(codec, self.clock.now_ns(), joints) if look else []
-        return found
 
 
 def from_config(config: ArmConfig, clock: Clock | None = None) -> CanopenArm:

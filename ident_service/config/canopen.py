@@ -15,6 +15,7 @@ from pydantic import Field, model_validator
 
 from ident_service.config.quantities import (
     Count,
+    GrownSection,
     ParameterTable,
     PerJoint,
     Positive,
@@ -147,7 +148,7 @@ class StatusReports(Section):
     inhibit: InhibitTime = 0.05
 
 
-class Emulation(Section):
+class Emulation(GrownSection):
     """What stands behind emulated drives: an arm with true parameters, noise and faults, as `SimulatedDriver` has.
 
     A drive whose power stage is off leaves its motor coasting, or braked where `windings_off` is `shorted`.
@@ -158,10 +159,11 @@ class Emulation(Section):
     torque_noise: PerJoint = 0.0
     braking: PerJoint | None = None
     windings_off: WindingsOff = "open"
+    later = frozenset({"windings_off"})
     faults: tuple[SimulatedFault, ...] = ()
 
 
-class CanopenDriver(Section):
+class CanopenDriver(GrownSection):
     """Drives in cyclic synchronous torque mode.
 
     `torque_frames` says whether up to four drives share a frame, by dummy mapping, or each has its own.
@@ -169,7 +171,9 @@ class CanopenDriver(Section):
     without its position a joint counts as gone (FIELDBUS.md: 3 to 5). `bring_up` [s] is how long all
     drives together may take for one step to `operation enabled`. `zero` says whether encoders know where they stand
     (`absolute`), or count from where they were when power came; then a person leads the arm to the joints' `home` and
-    says so, `ident home ARM --zero`, after every loss of power.
+    says so, `ident home ARM --zero`, after every loss of power. `measured_torque` says whether drives report the torque
+    that they measure (6077h): with their positions, in every cycle (`cyclic`), with their status (`status`), or not at
+    all; left out, with their status where the EDS has the object.
     """
 
     kind: Literal["canopen"]
@@ -181,6 +185,8 @@ class CanopenDriver(Section):
     lost_cycles: Annotated[int, Field(ge=3, le=5)] = 3
     bring_up: Positive = 0.5
     zero: Literal["absolute", "at_home"] = "absolute"
+    measured_torque: Literal["cyclic", "status", "none"] | None = None
+    later = frozenset({"measured_torque"})
     heartbeats: Heartbeats = Heartbeats()
     reactions: Reactions = Reactions()
     status: StatusReports = StatusReports()
@@ -190,6 +196,13 @@ class CanopenDriver(Section):
     def watchdog(self) -> float:
         """How long a drive goes on without torque frames [s]."""
         return self.torque_deadline
+
+    @property
+    def torque_reports(self) -> Literal["cyclic", "status", "none"]:
+        """With what drives report the torque that they measure."""
+        if self.measured_torque is not None:
+            return self.measured_torque
+        return "status" if has_object(self.eds.text, 0x6077) else "none"
 
     @property
     def report_delay(self) -> float:
@@ -231,6 +244,17 @@ def maps_dummies(eds: str) -> bool:
         return section is not None and int(parser.get(section, "Dummy0003", fallback="0"), 0) == 1
     except (configparser.Error, ValueError):
         return False
+
+
+@lru_cache(maxsize=8)
+def has_object(eds: str, index: int) -> bool:
+    """Return whether an EDS (CiA 306-1) lists an object; one that cannot be read lists none."""
+    parser = configparser.ConfigParser(strict=False, interpolation=None)
+    try:
+        parser.read_string(eds)
+    except configparser.Error:
+        return False
+    return any(name.upper() == f"{index:04X}" for name in parser.sections())
 
 
 @lru_cache(maxsize=8)
@@ -288,6 +312,11 @@ def disagreements(
             ("driver", "eds"),
             f"driver.eds: {driver.eds.name} has no Dummy0003=1 under [DummyUsage], so that these drives cannot share"
             " torque frames; set driver.torque_frames to single, at a rate that it fits",
+        )
+    elif driver.measured_torque in ("cyclic", "status") and not has_object(driver.eds.text, 0x6077):
+        yield (
+            ("driver", "measured_torque"),
+            f"driver.measured_torque: {driver.eds.name} has no 6077h, so that these drives do not tell their torque",
         )
     if joints and len(joints) != len(driver.drives):
         yield ("driver", "drives"), f"{len(driver.drives)} drives for {len(joints)} joints"

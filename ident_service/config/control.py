@@ -5,14 +5,12 @@ Boundary: data only; what it does is `motion/`.
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
-from pydantic import SerializerFunctionWrapHandler, model_serializer
-
-from ident_service.config.quantities import Number, Positive, Section
+from ident_service.config.quantities import GrownSection, Number, Positive
 
 
-class Control(Section):
+class Control(GrownSection):
     """The computed-torque loop (eq. 76): rate [Hz] and cut-off of the velocity low-pass [Hz].
 
     `after_stop` says what follows a stop: `brake` for drives with brakes, and for arms that gravity does not move,
@@ -24,9 +22,4 @@ class Control(Section):
     velocity_cutoff: Positive = 30.0
     after_stop: Literal["brake", "hold", "lower"] | None = None
     floor: Number | None = None
-
-    @model_serializer(mode="wrap")
-    def _unless_none(self, serialized: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # Motions that were designed before this could be described stay valid.
-        document: dict[str, Any] = serialized(self)
-        return {key: value for key, value in document.items() if value is not None}
+    later = frozenset({"after_stop", "floor"})

@@ -7,14 +7,12 @@ SI units; angles in radians. Tables 2, 4, 5 and 7 and eqs. 25, 26, 28 of Sousa &
 from __future__ import annotations
 
 import hashlib
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import (
     Field,
-    SerializerFunctionWrapHandler,
     ValidationInfo,
     field_validator,
-    model_serializer,
     model_validator,
 )
 
@@ -25,6 +23,7 @@ from ident_service.config.quantities import (
     UPLOAD,
     Angle,
     Count,
+    GrownSection,
     Interval,
     NonNegative,
     Number,
@@ -140,7 +139,7 @@ class Body(Section):
     symmetry: tuple[Literal["xy", "yz", "xz"], ...] = ()
 
 
-class Joint(Section):
+class Joint(GrownSection):
     """Limits, gains and body of one joint; what a motion needs may be left out of an arm that is only identified.
 
     `drive_inertia` [kg m^2 or kg] is what its rotors have at the joint by data sheet, the least that is there.
@@ -159,13 +158,8 @@ class Joint(Section):
     kd: Positive | None = None
     drive_inertia: NonNegative | None = None
     brake: bool = False
+    later = frozenset({"brake"})
     body: Body = Body()
-
-    @model_serializer(mode="wrap")
-    def _unless_without(self, serialized: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # Motions that were designed before brakes could be described stay valid.
-        document: dict[str, Any] = serialized(self)
-        return {key: value for key, value in document.items() if key != "brake" or value}
 
     @model_validator(mode="after")
     def _home_inside(self) -> Joint:
@@ -185,7 +179,7 @@ class Mass(Section):
     upper: Positive | None = None
 
 
-class Constraints(Section):
+class Constraints(GrownSection):
     """Physical knowledge about the whole arm (eqs. 25, 28).
 
     `torque_constant` bounds, per joint, what its measured torque must be multiplied by to be true; 1 elsewhere.
@@ -197,6 +191,7 @@ class Constraints(Section):
     positive: tuple[Literal["drive_inertia", "viscous", "coulomb"], ...] = ("drive_inertia", "viscous", "coulomb")
     torque_constant: dict[str, tuple[Positive, Positive]] = Field(default_factory=dict)
     custom: Annotated[str, Field(pattern=_FUNCTION)] | None = None
+    later = frozenset({"custom"})
 
     @field_validator("custom")
     @classmethod
@@ -206,12 +201,6 @@ class Constraints(Section):
                 "a description that is sent names no code; leave it out, or run `ident identify` at a terminal"
             )
         return value
-
-    @model_serializer(mode="wrap")
-    def _unless_none(self, serialized: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # Descriptions without it keep the hash that results have named them by.
-        document: dict[str, Any] = serialized(self)
-        return {key: value for key, value in document.items() if key != "custom" or value is not None}
 
     @model_validator(mode="after")
     def _ordered(self) -> Constraints:
@@ -268,12 +257,13 @@ class PriorPull(Section):
     weight: NonNegative | Literal["held_out"] = "held_out"
 
 
-class Identification(Section):
+class Identification(GrownSection):
     """How a recording becomes equations, and equations an estimate.
 
     `method` is the estimator; `edge` [s] is left out at both ends of every recording; `block` [s] is what doubt is
     computed from; `delay` [s] is how much later the torque's stamps are than the position's; `period` [s] averages a
-    periodic motion over its periods.
+    periodic motion over its periods. `torque` is the one to identify from: what drives measured or what they were told;
+    left out, what they measured where a recording has it in every sample.
     """
 
     method: Method = "ols"
@@ -285,6 +275,8 @@ class Identification(Section):
     block: Positive = 1.0
     delay: Number | Literal["estimate"] = 0.0
     period: Positive | None = None
+    torque: Literal["measured", "commanded"] | None = None
+    later = frozenset({"torque"})
 
 
 class FourierJoint(Section):

@@ -14,6 +14,7 @@ from pydantic import Field, model_validator
 
 from ident_service.config.quantities import (
     Count,
+    GrownSection,
     NonNegative,
     Number,
     ParameterTable,
@@ -142,7 +143,7 @@ class SimulatedFault(Section):
         return self
 
 
-class SimulatedDriver(Section):
+class SimulatedDriver(GrownSection):
     """The simulated arm: true parameters and imperfections, all per joint or one number for all.
 
     `process` says where its plant lives; `bus` names a separate one that other processes may ask for, `status` the file
@@ -166,6 +167,7 @@ class SimulatedDriver(Section):
     watchdog: Positive = 0.01
     braking: PerJoint | None = None
     windings_off: WindingsOff = "open"
+    later = frozenset({"windings_off"})
     faults: tuple[SimulatedFault, ...] = ()
 
 

@@ -313,6 +313,7 @@ class Loop:
                     sample.valid,
                     sample.age,
                     sample.lost,
+                    sample.measured_torque,
                 )
             )
             why = "" if kept else self.sink.error or "the recorder cannot keep up"

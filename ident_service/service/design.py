@@ -28,9 +28,9 @@ from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.information import Information
 from ident_service.motion.surroundings import touching_stop
-from ident_service.record.open import open_recording
 from ident_service.results.files import appearing_folder, require_place, write_atomically
 from ident_service.results.parameter_file import read_parameters
+from ident_service.service.identification import open_for
 from ident_service.service.motion_drawings import DRAWINGS, drawings
 from ident_service.service.preview import Preview, preview, preview_document, recorded_noise
 from ident_service.service.preview_text import preview_text
@@ -185,13 +185,7 @@ def known_information(model: ArmModel, base: BaseParameters, knowledge: Knowledg
     """Information of the recordings, whitened by `noise` of shape (joints,), shape (base, base); None without any."""
     if not knowledge.recordings:
         return None
-    config = model.config
-    parts = [
-        equations(
-            open_recording(path, model.chain.names, fmt=config.recording, transmission=config.transmission), model, base
-        ).total
-        for path in knowledge.recordings
-    ]
+    parts = [equations(open_for(path, model), model, base).total for path in knowledge.recordings]
     R = reduce(Information.merged, parts).stacked(1.0 / noise)[:-1, :-1]
     return np.asarray(R.T @ R)
 

@@ -208,7 +208,8 @@ def open_for(path: Path, model: ArmModel) -> Recording:
         path, start, end = Path(match["path"]), float(match["start"]), float(match["end"])
     form, gears = model.config.recording, model.config.transmission
     # Quality, friction, equations and evidence each read it.
-    recording = KeptRecording(open_recording(path, model.chain.names, fmt=form, transmission=gears))
+    torque = model.config.identification.torque
+    recording = KeptRecording(open_recording(path, model.chain.names, fmt=form, transmission=gears, torque=torque))
     return TrimmedRecording(recording, start, end) if start or end else recording
 
 

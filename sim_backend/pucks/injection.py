@@ -181,4 +181,6 @@ class Injection:
                     found.reversed = not found.reversed
                 case "torque_saturation":
                     found.torque_share = min(found.torque_share, fault.size)
+                case "torque_fraction":
+                    found.torque_fraction = min(found.torque_fraction, fault.size)
         return found

@@ -48,6 +48,7 @@ class Defects:
         reversed: the torque acts the other way round.
         stuck: the power stage goes on doing what it does.
         torque_share: of the largest torque, which is all the power stage can make.
+        torque_fraction: of what it is told, which is what the power stage makes; only what it measures says so.
         frozen: the encoder shows what it showed.
         mirrored: the encoder counts the wrong way.
         shift: counts added to what the encoder shows.
@@ -57,6 +58,7 @@ class Defects:
     reversed: bool = False
     stuck: bool = False
     torque_share: float = 1.0
+    torque_fraction: float = 1.0
     frozen: bool = False
     mirrored: bool = False
     shift: int = 0
