@@ -226,12 +226,21 @@ class Loop:
             return False
         if not self._waiting:
             self._waiting, self._anchor = True, Anchor(self.limits, self.control.position)
-            self.controls.wait_for_support()
+            self._asked_controls(self.controls.wait_for_support, stamp_ns)
             self.tell(Severity.WARNING, stamp_ns, WAITS)
-        elif self.controls.supported:
+        elif self._asked_controls(lambda: self.controls.supported, stamp_ns):
             self.tell(Severity.WARNING, stamp_ns, LOWERS)
             self._lower(stamp_ns)
         return False
+
+    def _asked_controls(self, ask: Callable[[], object], stamp_ns: int) -> bool:
+        """Ask the controls about a held arm, which must not fall because they fail."""
+        try:
+            return bool(ask())
+        except Exception as error:  # noqa: BLE001 - whatever they died of
+            what = f"reading the controls failed ({error!r})"
+            self._react(self.guard.findings.found("controls_failed", what), stamp_ns)
+            return False
 
     def _is_lowered(self, lowering: Lowering, stamp_ns: int, since: float) -> bool:
         """Go on lowering; whether the arm rests or is at its floor.

@@ -263,3 +263,35 @@ def test_a_run_ends_where_it_was_supported() -> None:
     assert rig.run(stop=10**9).state is State.DONE
     assert rig.arm.stops == [StopKind.TORQUE_OFF]
     assert (np.abs(rig.truth[-1].position - rig.truth[LOOKED].position) < 0.05).all()
+
+
+def test_controls_that_fail_do_not_let_a_held_arm_fall() -> None:
+    rig = Rig(loose("hold"))
+    rig.arm.open()
+    failures = 0
+
+    class Failing(Person):
+        @property  # type: ignore[override]
+        def supported(self) -> bool:
+            nonlocal failures
+            if self.waiting and failures < 200:
+                failures += 1
+                raise OSError("gone")
+            return failures >= 200
+
+        @supported.setter
+        def supported(self, wanted: bool) -> None:
+            pass
+
+    with pytest.raises(ArmFault, match="controls_failed"):
+        run(
+            rig.arm,
+            rig.model,
+            excitation(rig.model, "identification"),
+            rig.story,
+            Failing(rig.arm),
+            latch=rig.latch,
+            hold_seconds=HOLD,
+        )
+    assert rig.arm.stops == [StopKind.TORQUE_OFF]
+    assert rig.told(LOWERS) - rig.told(WAITS) >= 200
