@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 import pinocchio as pin
 
+from ident_service.config.kinematics import Kinematics
 from ident_service.config.quantities import TextFile
 from ident_service.config.schema import Joint
 from ident_service.errors import ModelError
@@ -137,13 +138,24 @@ def _set_limits(model: pin.Model, arm: ArmModel) -> None:
         model.velocityLimit, model.effortLimit = speed, torque
 
 
-def read_back(file: TextFile, kind: Literal["urdf", "mjcf"], gravity: tuple[float, float, float]) -> WrittenArm:
+def read_back(
+    file: TextFile,
+    kind: Literal["urdf", "mjcf"],
+    gravity: tuple[float, float, float],
+    kinematics: Kinematics | None = None,
+) -> WrittenArm:
     """Read a file that was written, for comparison.
+
+    Args:
+        file: what was written.
+        kind: of file.
+        gravity: in the base frame [m/s^2].
+        kinematics: which part of the file is the arm; all of it when None.
 
     Raises:
         ModelError: it cannot be read.
     """
-    model = urdf_model(file) if kind == "urdf" else mjcf_model(file)
-    chain, bodies = (read_urdf if kind == "urdf" else read_mjcf)(file, gravity)
+    model = (urdf_model if kind == "urdf" else mjcf_model)(file, kinematics)
+    chain, bodies = (read_urdf if kind == "urdf" else read_mjcf)(file, gravity, kinematics)
     dry = model.upperDryFrictionLimit if hasattr(model, "upperDryFrictionLimit") else model.friction
     return WrittenArm(chain, bodies, np.array(model.armature), np.array(model.damping), np.array(dry))

@@ -17,51 +17,66 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
+from ident_service.config.kinematics import Kinematics
 from ident_service.config.quantities import TextFile
 from ident_service.errors import ModelError
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.layout import TERM_SYMBOLS, Layout
+from ident_service.model.mechanism_part import arm_part, mimics
 
 _SUPPORTED = ("JointModelR", "JointModelP")
 _UNSUPPORTED = ("JointModelPlanar",)
-_FORBIDDEN_XML = re.compile(r"<!\s*(DOCTYPE|ENTITY)|<\s*(include|mimic)\b|\bxi:include\b", re.IGNORECASE)
+_FORBIDDEN_XML = re.compile(r"<!\s*(DOCTYPE|ENTITY)|<\s*include\b|\bxi:include\b", re.IGNORECASE)
 
 
-def read_urdf(file: TextFile, gravity: tuple[float, float, float]) -> tuple[Chain, Array]:
-    """Chain and link inertias of a URDF; fixed joints are merged into their parents.
+def read_urdf(
+    file: TextFile, gravity: tuple[float, float, float], kinematics: Kinematics | None = None
+) -> tuple[Chain, Array]:
+    """Chain and link inertias of a URDF; fixed joints, and those held still, are merged into their parents.
+
+    Args:
+        file: the URDF.
+        gravity: in the base frame [m/s^2].
+        kinematics: which part of it is the arm; all of it when None.
 
     Returns:
         The chain, and the ten inertial parameters per link (eq. 13) in SI units, shape (joints, 10).
 
     Raises:
-        ModelError: not a URDF, entities or includes, or a joint that is neither revolute, continuous nor prismatic.
+        ModelError: not a URDF, entities or includes, a joint that is neither revolute, continuous nor prismatic, or
+            one that mimics a joint of the arm; no such base, tip or locked joint.
     """
-    return _chain(urdf_model(file), gravity, file.name)
+    return _chain(urdf_model(file, kinematics), gravity, file.name)
 
 
-def read_mjcf(file: TextFile, gravity: tuple[float, float, float]) -> tuple[Chain, Array]:
+def read_mjcf(
+    file: TextFile, gravity: tuple[float, float, float], kinematics: Kinematics | None = None
+) -> tuple[Chain, Array]:
     """As `read_urdf`, for an MJCF file of hinge and slide joints."""
-    return _chain(mjcf_model(file), gravity, file.name)
+    return _chain(mjcf_model(file, kinematics), gravity, file.name)
 
 
-def urdf_model(file: TextFile) -> pin.Model:
-    """A URDF as pinocchio reads it.
+def urdf_model(file: TextFile, kinematics: Kinematics | None = None) -> pin.Model:
+    """Read the arm in a URDF as a pinocchio model; see `read_urdf`."""
+    return urdf_part(file, kinematics)[0]
 
-    Raises:
-        ModelError: not a URDF, or entities or includes in it.
-    """
+
+def urdf_part(file: TextFile, kinematics: Kinematics | None = None) -> tuple[pin.Model, dict[str, float]]:
+    """Read the arm in a URDF as `urdf_model` does, and where all other movable joints are held [rad or m]."""
     _refuse_foreign(file, "URDF")
-    return _built(file, "URDF", lambda: pin.buildModelFromXML(file.text))
+    whole = _built(file, "URDF", lambda: pin.buildModelFromXML(file.text))
+    return arm_part(whole, kinematics or Kinematics(urdf=file), mimics(file), file.name)
 
 
-def mjcf_model(file: TextFile) -> pin.Model:
+def mjcf_model(file: TextFile, kinematics: Kinematics | None = None) -> pin.Model:
     """As `urdf_model`, for an MJCF file."""
     _refuse_foreign(file, "MJCF")
     with tempfile.TemporaryDirectory() as folder:
         # Pinocchio reads MJCF from a path only; alone in a folder, the file cannot reach any other.
         path = Path(folder) / "arm.xml"
         path.write_text(file.text, encoding="utf-8")
-        return _built(file, "MJCF", lambda: pin.buildModelFromMJCF(str(path)))
+        whole = _built(file, "MJCF", lambda: pin.buildModelFromMJCF(str(path)))
+    return whole if kinematics is None else arm_part(whole, kinematics, {}, file.name)[0]
 
 
 def _refuse_foreign(file: TextFile, kind: str) -> None:

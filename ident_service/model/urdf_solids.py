@@ -12,25 +12,29 @@ from collections.abc import Iterator
 import numpy as np
 import pinocchio as pin
 
-from ident_service.config.quantities import TextFile
+from ident_service.config.kinematics import Kinematics
 from ident_service.config.workspace import BASE
 from ident_service.errors import ModelError
 from ident_service.model.chain import WORLD, Array, Chain
+from ident_service.model.rigid_body import urdf_model
 from ident_service.model.solids import Body, Box, Capsule, Cylinder, Solid, turned
 
 
-def urdf_solids(file: TextFile, chain: Chain, skip: frozenset[str]) -> list[Body]:
+def urdf_solids(kinematics: Kinematics, chain: Chain, skip: frozenset[str]) -> list[Body]:
     """The solids of all links but some.
 
     Args:
-        file: the URDF the chain was read from.
+        kinematics: the URDF that the chain was read from, and which part of it is the arm.
         chain: the mechanism.
         skip: joint names (or `base`) of links whose geometry is known from elsewhere.
 
     Raises:
         ModelError: a mesh, or a shape or number that cannot be read, in a link that is not skipped.
     """
-    model = pin.buildModelFromXML(file.text)
+    file = kinematics.urdf
+    if file is None:
+        return []
+    model = urdf_model(file, kinematics)
     bodies = []
     # Entities were refused when the chain was read from the same text.
     for link in ET.fromstring(file.text).iter("link"):  # noqa: S314
