@@ -81,6 +81,10 @@ class Sample:
         events: what happened on the bus since the sample before.
         drives: what each drive says of itself, in the words of its fieldbus, for people; empty where there is nothing
             to add to `status`.
+        measured_torque: what drives measured until this stamp [N m or N], shape (joints,), NaN where none reported in
+            this cycle; None where none ever did.
+        torque_difference: by how much their last reports are more than what drives were told [N m or N], shape
+            (joints,), with what a sound drive may take to follow allowed for; None where nothing is to be compared.
     """
 
     cycle: int
@@ -95,6 +99,8 @@ class Sample:
     status_age: int = 0
     events: tuple[AxisEvent, ...] = ()
     drives: tuple[str, ...] = ()
+    measured_torque: Vector | None = None
+    torque_difference: Vector | None = None
 
 
 class Arm(ABC):

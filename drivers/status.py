@@ -17,7 +17,7 @@ class AxisStatus(IntFlag):
     FAULT = 2  # the drive found something wrong with itself and gives no torque
     EMERGENCY_STOP = 4  # power was taken from outside
     WATCHDOG = 8  # no torque frame came in time, so that the drive gave up torque by itself
-    IDLE = 16  # no torque, and resistive braking
+    IDLE = 16  # no torque; braked first, then as the drive is without power
 
 
 # Any of these on a running arm means that the torque asked for does not act.

@@ -43,6 +43,7 @@ class SimulatedArm(Arm):
         delay_cycles: int = 1,
         watchdog: float = 0.01,
         braking: Vector | None = None,
+        unpowered: Vector | None = None,
         faults: Sequence[Fault] = (),
         observer: Callable[[Truth], None] | None = None,
     ) -> None:
@@ -57,6 +58,7 @@ class SimulatedArm(Arm):
                 contract's, each further one a cycle that torques wait in a queue.
             watchdog: time without a torque after which enabled drives go idle [s].
             braking: damping of idle axes [N m s/rad or N s/m], shape (joints,); None for none.
+            unpowered: damping of axes that are off, as `Machine` has it.
             faults: to inject, by cycle since `open`.
             observer: called with the truth of every cycle.
 
@@ -72,6 +74,7 @@ class SimulatedArm(Arm):
             delay_cycles=delay_cycles,
             watchdog=watchdog,
             braking=braking,
+            unpowered=unpowered,
             faults=faults,
         )
         self._schedule = Schedule(clock, round(plant.period * 1e9), skips=False)
@@ -146,7 +149,7 @@ class SimulatedArm(Arm):
         )
 
     def stop(self, kind: StopKind) -> None:
-        """No torque: what the last sample reported acts until its period ends, then the arm coasts, or is braked."""
+        """No torque: what the last sample reported acts until its period ends, then drives are off, or brake first."""
         self._machine.stop(kind)
 
     def close(self) -> None:
@@ -196,6 +199,7 @@ def from_config(
         delay_cycles=driver.delay_cycles,
         watchdog=driver.watchdog,
         braking=pieces.braking,
+        unpowered=pieces.unpowered,
         faults=pieces.faults,
         observer=observer,
     )

@@ -1,7 +1,7 @@
 """From a configuration with a simulated driver to what stands beyond the bus.
 
 Boundary: construction only. Missing pieces get values here: home where none is given, infinite torque limits, and the
-braking of idle drives.
+braking of idle drives and of drives that are off.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ from sim_backend.plant import Plant
 # Where limits do not say how strong a drive is, its shorted windings stop the joint in about this time [s].
 _BRAKING_TIME = 0.1
 _BRAKING_SHARE = 0.5
+# A closed brake, times the braking: creeps by mrad/s where idle drives let the joint sink by rad/s.
+_HOLDING = 1e3
 
 
 def build_machine(config: ArmConfig, faults: Sequence[Fault] = ()) -> Machine:
@@ -76,6 +78,8 @@ def build_machine(config: ArmConfig, faults: Sequence[Fault] = ()) -> Machine:
         # need no more than that share to hold it never sinks faster than it may move.
         known = np.isfinite(limit) & np.isfinite(speed)
         braking = np.where(known, _BRAKING_SHARE * limit, plant.inertia) / np.where(known, speed, _BRAKING_TIME)
+    held = np.array([joint is not None and joint.brake for joint in joints])
+    shorted = np.full(count, driver.windings_off == "shorted")
     return Machine(
         plant,
         imperfections,
@@ -83,6 +87,7 @@ def build_machine(config: ArmConfig, faults: Sequence[Fault] = ()) -> Machine:
         delay_cycles=driver.delay_cycles,
         watchdog=driver.watchdog,
         braking=braking,
+        unpowered=np.where(held, _HOLDING * braking, np.where(shorted, braking, 0.0)),
         faults=(*configured_faults(driver.faults, model.chain.names, plant.period), *faults),
     )
 

@@ -1,9 +1,10 @@
 """The simulated drives: which torque acts from which stamp on, what noise acts with it, and when they give up.
 
-A drive is on, off, or idle. Off, an axis coasts. Idle, its windings are shorted and brake it like viscous friction,
-`tau = -b dq`, as the WAM's do. Without a torque frame for the watchdog's time, whatever the host believes, all drives
-go idle and stay so until they are enabled again. A drive's own fault and an emergency stop stay latched until `reset`,
-which leaves their axes idle.
+A drive is on, off, or idle. Off, an axis coasts, unless its windings are shorted then or it has a brake. Idle, its
+windings are shorted and brake it like viscous friction, `tau = -b dq`; after the ramp of a quick stop it is as when it
+is off, and so it is at once where the power was taken from outside. Without a torque frame for the watchdog's time,
+whatever the host believes, all drives go idle and stay so until they are enabled again. A drive's own fault and an
+emergency stop stay latched until `reset`, which leaves their axes idle.
 
 Boundary: torques only, period by period; who may send one is `arm.py`, what a drive can make of it `imperfections.py`.
 """
@@ -20,6 +21,7 @@ from drivers.status import AxisStatus
 from sim_backend.faults import Fault, FaultKind
 from sim_backend.imperfections import Imperfections
 
+RAMP = 0.1  # s for which a quick stop brakes before the power stage is off
 _SILENT = 1 << 16  # an axis that no longer talks; no host ever reads this bit
 # What a fault latches in the axes it strikes. All but a drive's own fault leave the axis idle.
 _TRIPS: dict[FaultKind, int] = {
@@ -27,6 +29,7 @@ _TRIPS: dict[FaultKind, int] = {
     FaultKind.EMERGENCY_STOP: AxisStatus.EMERGENCY_STOP | AxisStatus.IDLE,
     FaultKind.NODE_SILENT: _SILENT | AxisStatus.IDLE,
 }
+_POWERLESS = _SILENT | int(AxisStatus.EMERGENCY_STOP)
 _WHY = {
     FaultKind.DRIVE_FAULT: "its drive has a fault",
     FaultKind.EMERGENCY_STOP: "the emergency stop is pressed",
@@ -51,6 +54,8 @@ class Drives:
         noise: np.random.Generator,
         braking: Vector,
         watchdog: int,
+        unpowered: Vector | None = None,
+        ramp: int = 1,
     ) -> None:
         """Set up the queue.
 
@@ -60,6 +65,9 @@ class Drives:
             noise: draws once per period that the drives are on, if there is noise at all.
             braking: damping of an idle axis [N m s/rad or N s/m], shape (joints,).
             watchdog: periods without a torque frame after which the drives go idle.
+            unpowered: damping of an axis that is off, and of an idle one after `ramp` periods [N m s/rad or N s/m],
+                shape (joints,); None for one that coasts when off and is braked for as long as it is idle.
+            ramp: periods for which an axis that goes idle is braked.
         """
         self._imperfections = imperfections
         self._waiting = delay_cycles - 1
@@ -69,6 +77,12 @@ class Drives:
         self._watchdog = watchdog
         joints = imperfections.torque_limit.size
         self._none = _frozen(np.zeros(joints))
+        self._off = self._none if unpowered is None else _frozen(unpowered)
+        # A power stage that failed shorts nothing; a brake, which holds more than shorted windings do, closes without.
+        self._failed = _frozen(np.where(self._off > braking, self._off, 0.0))
+        self._after_ramp = braking if unpowered is None else unpowered
+        self._ramp = ramp
+        self._braked = np.zeros(joints, dtype=np.int64)  # periods that each axis has been idle
         self._trips = np.zeros(joints, dtype=np.int64)
         self._full = _frozen(np.ones(joints))
         self._powered = self._none
@@ -105,6 +119,7 @@ class Drives:
         """Energise without torque, and forget that the drives had given up for silence."""
         self._forget()
         self._trips[:] = 0
+        self._braked[:] = 0
         self._silent = 0
         self.on = True
 
@@ -119,7 +134,8 @@ class Drives:
         """Begin anew, off; drives that gave up stay as they are until enabled."""
         self.release(StopKind.TORQUE_OFF)
         self._silent = 0
-        self.acting = self.torque = self.damping = self._none
+        self.acting = self.torque = self._none
+        self.damping = self._off
 
     def refusal(self, faults: Sequence[Fault], names: Sequence[str]) -> str | None:
         """Why the drives cannot be enabled while these faults strike; None if they can."""
@@ -171,7 +187,7 @@ class Drives:
             trips[fault.axes] |= _TRIPS.get(fault.kind, 0)
         if not faults and not trips.any():
             self.acting = self.torque = wanted
-            self.damping = self._none
+            self.damping = self._none if self.on else self._off
             self._powered = self._full if self.on else self._none
             self._words = (int(self.on),) * wanted.size
             return wanted
@@ -190,7 +206,15 @@ class Drives:
             if fault.kind is FaultKind.TORQUE_SIGN:
                 really[fault.axes] *= -1.0
         self.acting, self.torque = _frozen(told), _frozen(really)
-        self.damping = _frozen(np.where(trips & int(AxisStatus.IDLE), self._braking, 0.0))
+        idle = (trips & int(AxisStatus.IDLE)) != 0
+        self._braked = np.where(idle, self._braked + 1, 0)
+        # Who lost its power, by the emergency stop or by itself, has no ramp.
+        ramping = idle & (self._braked <= self._ramp) & ((trips & _POWERLESS) == 0)
+        off = np.where(idle, self._after_ramp, self._off)
+        failed = (trips & int(AxisStatus.FAULT)) != 0
+        self.damping = _frozen(
+            np.where(ramping, self._braking, np.where((trips == 0) & self.on, 0.0, np.where(failed, self._failed, off)))
+        )
         self._powered = _frozen(np.where((trips == 0) & self.on, 1.0, 0.0))
         words = np.where(trips == 0, int(self.on), trips & ~_SILENT)
         self._words = tuple(words.tolist())

@@ -15,7 +15,7 @@ import numpy as np
 
 from drivers.arm import Counts, Flags, StopKind, Vector
 from ident_service.errors import DriverError
-from sim_backend.drives import Drives
+from sim_backend.drives import RAMP, Drives
 from sim_backend.faults import LONGEST_DELAY, Fault, FaultKind, Feedback, active_faults
 from sim_backend.imperfections import Imperfections
 from sim_backend.plant import Plant
@@ -67,6 +67,7 @@ class Machine:
         delay_cycles: int = 1,
         watchdog: float = 0.01,
         braking: Vector | None = None,
+        unpowered: Vector | None = None,
         faults: Sequence[Fault] = (),
     ) -> None:
         """Put the pieces together; one cycle is one period of the plant.
@@ -78,6 +79,8 @@ class Machine:
             delay_cycles: from a sample to the first stamp at which a torque computed from it can act.
             watchdog: of the drives [s].
             braking: damping of idle axes [N m s/rad or N s/m], shape (joints,); None for no braking.
+            unpowered: damping of axes that are off, and of idle ones after a quick stop's ramp [N m s/rad or N s/m],
+                shape (joints,); None for axes that coast when off and are braked while idle.
             faults: to inject, by period since `restart`.
 
         Raises:
@@ -105,7 +108,16 @@ class Machine:
         # Rounding must not make the watchdog one period slower than it is.
         periods = max(1, int(np.ceil(watchdog / plant.period - 1e-6)))
         self.braking = np.zeros(joints) if braking is None else braking
-        self._drives = Drives(imperfections, delay_cycles, np.random.default_rng(seed), self.braking, periods)
+        self.unpowered = unpowered
+        self._drives = Drives(
+            imperfections,
+            delay_cycles,
+            np.random.default_rng(seed),
+            self.braking,
+            periods,
+            unpowered,
+            max(1, round(RAMP / plant.period)),
+        )
         self.supported = True
         self.restart()
 
@@ -160,7 +172,7 @@ class Machine:
         self._drives.reset()
 
     def stop(self, kind: StopKind) -> None:
-        """No torque from the end of this period on: coasting after a torque off, braked after a quick stop."""
+        """No torque from the end of this period on: off after a torque off, braked first after a quick stop."""
         self._drives.release(kind)
 
     def cycle(self, torque: Vector | None) -> Reading:

@@ -25,21 +25,21 @@ from drivers.canopen import dictionary as od
 from drivers.canopen.buses import Buses
 from drivers.canopen.codec import Drive, Emergency
 from drivers.canopen.coordinates import Coordinates, coordinates, unwrapped
-from drivers.canopen.enabling import Enabling, Resetting
-from drivers.canopen.events import MissedReports, axis_events
+from drivers.canopen.enabling import Enabling, Resetting, hold
+from drivers.canopen.events import Reports
 from drivers.canopen.link import Link, open_links
 from drivers.canopen.lock import BusLock
 from drivers.canopen.looking import LookingArm
+from drivers.canopen.measured import MeasuredTorque
 from drivers.canopen.profile import bus_profiles
 from drivers.canopen.sdo import Objects
 from drivers.canopen.session_log import SessionLog, logged_links, require_format
-from drivers.canopen.setup import Setup, configure, identify, released
+from drivers.canopen.setup import Setup, configure, identify, quick_stop_option, released
 from drivers.canopen.stopping import StopCommand
 from drivers.canopen.words import NmtCommand, joint_status
 from drivers.canopen.zero import zeros_of
 from drivers.canopen.zeroing import ZeroingArm
 from drivers.clock import Clock, RealClock, VirtualClock
-from drivers.status import AxisEvent
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError, PositionUnknown
@@ -71,6 +71,7 @@ class CanopenArm(Arm):
         self._look_every = min(max(1, cycles), _MOST_UNLOOKED)
         self._coordinates: Coordinates = coordinates(config.driver, config.transmission)
         self._zeros = zeros_of(config)
+        self._quick_stop = quick_stop_option(config)
         self._limits = np.array([np.inf if j.torque is None else j.torque for j in config.joints.values()])
         if len(self._limits) != len(config.driver.drives):
             raise DriverError(f"{config.name}: joints must name all {len(config.driver.drives)} joints")
@@ -103,7 +104,9 @@ class CanopenArm(Arm):
         self._told: list[tuple[int | None, Emergency | None]] = []
         self._status: tuple[int, ...] = ()
         self._cycle = self._begun = 0  # drives whose configuration has begun, the first ones
-        self._missed = MissedReports()
+        first = {k: joints[0] for k, joints in self._joints_of.items()}
+        self._reports = Reports(self._driver, first, self._look_every)
+        self._measured = MeasuredTorque(self._coordinates, 1e9 / self._period_ns)
         self._identities: tuple[str, ...] = ()
 
     def look(self) -> Arm:
@@ -179,18 +182,22 @@ class CanopenArm(Arm):
     def enable(self) -> None:
         """Energise all drives together with zero torque, through the states of CiA 402.
 
+        Drives that hold the arm in quick stop (605Ah of 5 to 8) go on holding it until all others are ready, too.
+
         Raises:
-            DriverError: not open, a drive has a fault, or does not follow in time; none stays energised.
+            DriverError: not open, a drive has a fault, or does not follow in time; only what held the arm still does.
         """
         buses = self._open()
+        held = hold(buses.drives)
         self._no_torque()
         self._streaming, self._stop = True, StopCommand()
         try:
             reports = self._driver.status.inhibit, self._driver.status.period
-            steps = Enabling(buses.drives, self._names, self._driver.bring_up, self.clock.now_ns(), reports)
+            now_ns, option = self.clock.now_ns(), self._quick_stop
+            steps = Enabling(buses.drives, self._names, self._driver.bring_up, now_ns, reports, option)
             self._through(buses, steps)
         except BaseException:
-            self.stop(StopKind.TORQUE_OFF)
+            self.stop(StopKind.QUICK_STOP if held else StopKind.TORQUE_OFF)
             raise
         buses.forget_events()  # of the states that drives went through
         self._enabled = True
@@ -226,6 +233,7 @@ class CanopenArm(Arm):
         # Enabled, an exchange that only looks is no torque frame: drives that count them must notice.
         idle = self._stop.counts(self._counts) if self._streaming and not self._enabled else None
         stamp_ns = buses.cycle(idle if torque is None else self._counts)
+        self._measured.cycle(self._counts, buses.drives)
         sample = self._sample(buses, stamp_ns)
         self._cycle += 1
         return sample
@@ -245,9 +253,11 @@ class CanopenArm(Arm):
         """Torque off, drives as they were powered up, buses free; any number of times.
 
         A quick stop is not cut short by it: drives that are told to let go in the midst of one would let the arm fall.
+        The same holds for drives that were found holding the arm in quick stop, unless they have been told to let go.
         """
         if not self._stop.braking:
-            self.stop(StopKind.TORQUE_OFF)
+            held = not self._stops and self._buses is not None and hold(self._buses.drives)
+            self.stop(StopKind.QUICK_STOP if held else StopKind.TORQUE_OFF)
         if self._buses is not None:
             self._leave(self._buses)
             self._buses.close()
@@ -302,7 +312,8 @@ class CanopenArm(Arm):
             objects = buses.objects(number)
             identity = identify(objects, drive.identity)
             self._begun = number + 1
-            configure(objects, Setup(drive, buses.profile(number), self._driver.reactions, limits[number]))
+            reactions = self._driver.reactions, self._quick_stop
+            configure(objects, Setup(drive, buses.profile(number), *reactions, limits[number]))
             if self._zeros is not None:
                 counts = self._coordinates.zero[number]
                 if not self._zeros.keep_on(objects, number, counts, buses.restarted(number)):
@@ -351,7 +362,9 @@ class CanopenArm(Arm):
             buses.lost,
             self._statuses(drives),
             max(drive.status_age for drive in drives),
-            tuple(self._events(buses)),
+            tuple(self._reports.new(buses.codecs, self._cycle, self.clock.now_ns())),
+            measured_torque=self._measured.torque,
+            torque_difference=self._measured.difference if self._enabled else None,
         )
 
     def _statuses(self, drives: Sequence[Drive]) -> tuple[int, ...]:
@@ -361,17 +374,6 @@ class CanopenArm(Arm):
             self._told = told
             self._status = tuple(int(joint_status(drives[k].axis_status for k in needed)) for needed in self._drives_of)
         return self._status
-
-    def _events(self, buses: Buses) -> list[AxisEvent]:
-        found: list[AxisEvent] = []
-        for codec in buses.codecs:
-            events = codec.take_events()
-            look = self._cycle % self._look_every == 0
-            if events or look:
-                joints = {self._driver.drives[k].node: self._joints_of[k][0] for k in codec.profile.drives}
-                found += axis_events(events, codec, joints)
-                found += self._missed.new(codec, self.clock.now_ns(), joints) if look else []
-        return found
 
 
 def from_config(config: ArmConfig, clock: Clock | None = None) -> CanopenArm:

@@ -227,8 +227,8 @@ def _lines(profile: BusProfile) -> Iterator[Line]:
             yield _line(profile, whose, (frame.cob_id,), (od.TARGET_TORQUE,) * len(frame.nodes), rate, cyclic=True)
     if alone:
         yield _line(profile, "torques, one drive each", alone, (od.TARGET_TORQUE,), rate, cyclic=True)
-    yield _line(profile, "positions", tuple(TPDO1 + n for n in nodes), (od.POSITION,), rate, cyclic=True)
-    status = (od.STATUS_WORD, od.TORQUE_ACTUAL)
+    yield _line(profile, "positions", tuple(TPDO1 + n for n in nodes), profile.position_slots, rate, cyclic=True)
+    status = profile.status_slots
     yield _line(profile, "status reports", tuple(TPDO2 + n for n in nodes), status, 1.0 / profile.status_inhibit)
     beats = tuple(HEARTBEAT + n for n in nodes)
     yield _line(profile, "heartbeats of the drives", beats, (HEARTBEAT_STATE,), 1.0 / profile.heartbeat_drives)

@@ -32,7 +32,6 @@ LISTEN = 0.12  # s before we send anything; another host's heartbeat comes withi
 AWAKE = 2.0  # s within which every drive must answer
 LEAST = 0.5  # of a period, from SYNC on, that positions are waited for in any case
 SETTLED = 5  # cycles in a row with everybody's position before an arm counts as open
-_POSITION_BYTES = 4
 _ASK = bytes([0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0])  # SDO upload of the device type, which every node has
 
 
@@ -245,7 +244,7 @@ def _on_the_wire(profile: BusProfile) -> float:
     lengths = [
         0,
         *(2 * len(frame.drives) for frame in profile.torque_frames),
-        *(_POSITION_BYTES for _ in profile.nodes),
+        *(sum(slot.kind.size for slot in profile.position_slots) for _ in profile.nodes),
     ]
     bus = profile.bus
     return sum(worst(length, fd=profile.fd).seconds(bus.bitrate, bus.data_bitrate) for length in lengths)

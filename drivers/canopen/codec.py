@@ -46,7 +46,7 @@ from drivers.status import AxisStatus
 from ident_service.config.canopen import BUS_EMERGENCIES
 from ident_service.errors import DriverError
 
-_POSITION, _STATUS, _CONTROL = struct.Struct("<i"), struct.Struct("<Hh"), struct.Struct("<Hb")
+_CONTROL = struct.Struct("<Hb")
 _EMERGENCY_BYTES = 8
 _MOST_EVENTS = 256  # that wait to be taken; a flood must neither eat the memory nor hide what matters
 _FOLLOWED = 64  # identifiers of strangers that are remembered
@@ -75,7 +75,8 @@ class Drive:
         duplicates: positions that came second in a cycle.
         late: positions that came outside a cycle.
         status: the last status word (6041h), None before the first.
-        torque: actual torque with it [per mille of rated torque] (6077h).
+        torque: the last one that it measured [per mille of rated torque] (6077h).
+        torques: how often that was told.
         status_age: cycles since it.
         nmt: what its last heartbeat said, None before the first.
         heartbeat_ns: when that was [ns of the link's clock].
@@ -93,6 +94,7 @@ class Drive:
     late: int = 0
     status: int | None = None
     torque: int = 0
+    torques: int = 0
     status_age: int = 0
     nmt: int | None = None
     heartbeat_ns: int = 0
@@ -167,6 +169,9 @@ class BusCodec:
         self._now_ns = 0
         self._events: list[Event] = []
         self._status_cycles = math.ceil(profile.status_timeout * profile.rate)
+        # With the torque that it measures, a report is one number longer.
+        self._positions = struct.Struct("<ih" if len(profile.position_slots) > 1 else "<i")
+        self._reports = struct.Struct("<Hh" if len(profile.status_slots) > 1 else "<H")
         self._notices = dict(zip(profile.nodes, profile.notices, strict=True))
         self._strangers: set[int] = set()
         self._foreign: set[int] = set()
@@ -277,8 +282,8 @@ class BusCodec:
             self._on_other(frame)
 
     def _on_position(self, drive: Drive, frame: Frame) -> None:
-        if len(frame.data) != _POSITION.size:
-            self._wrong_length(drive, frame, "position", _POSITION.size)
+        if len(frame.data) != self._positions.size:
+            self._wrong_length(drive, frame, "position", self._positions.size)
         elif not self._open:
             drive.late += 1
             self._tell(EventCode.LATE, drive.node, "its position came after its cycle")
@@ -286,17 +291,21 @@ class BusCodec:
             drive.duplicates += 1
             self._tell(EventCode.DUPLICATE, drive.node, "a second position in one cycle")
         else:
-            (drive.position,) = _POSITION.unpack(frame.data)
+            drive.position, *measured = self._positions.unpack(frame.data)
+            if measured:
+                drive.torque, drive.torques = measured[0], drive.torques + 1
             drive.seen = drive.answered = True
             self._missing -= 1
             drive.age = 0
             drive.answers += 1
 
     def _on_status(self, drive: Drive, frame: Frame) -> None:
-        if len(frame.data) != _STATUS.size:
-            self._wrong_length(drive, frame, "status", _STATUS.size)
+        if len(frame.data) != self._reports.size:
+            self._wrong_length(drive, frame, "status", self._reports.size)
             return
-        status, drive.torque = _STATUS.unpack(frame.data)
+        status, *measured = self._reports.unpack(frame.data)
+        if measured:
+            drive.torque, drive.torques = measured[0], drive.torques + 1
         before, drive.status, drive.status_age = drive.status, status, 0
         if before == status:
             return

@@ -156,7 +156,7 @@ class Coordinates:
                 counts[k] = min(max(round(exact[k] * share), -limit), limit)
         return counts, clipped
 
-    def joint_torque(self, counts: Sequence[int]) -> Vector:
+    def joint_torque(self, counts: Sequence[float]) -> Vector:
         """The joint torque [N m or N], shape (n,), that motors really give which are asked for this."""
         return np.asarray(self.torque_per_count @ [float(n) for n in counts])
 

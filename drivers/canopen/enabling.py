@@ -14,7 +14,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from drivers.canopen.codec import Drive
-from drivers.canopen.words import DISABLE_VOLTAGE, RESET_FAULT, TOWARDS_ENABLED, DriveState, emergency_words
+from drivers.canopen.words import (
+    DISABLE_VOLTAGE,
+    ENABLE,
+    RESET_FAULT,
+    STAY_IN_QUICK_STOP,
+    TOWARDS_ENABLED,
+    DriveState,
+    emergency_words,
+)
 from ident_service.errors import DriverError
 
 SEEDED = 5  # cycles in a row with zero torque and all positions before anything is enabled
@@ -27,7 +35,13 @@ class Enabling:
     """From switched off to `operation enabled`."""
 
     def __init__(
-        self, drives: Sequence[Drive], names: Sequence[str], step: float, now_ns: int, reports: tuple[float, float]
+        self,
+        drives: Sequence[Drive],
+        names: Sequence[str],
+        step: float,
+        now_ns: int,
+        reports: tuple[float, float],
+        quick_stop: int,
     ) -> None:
         """Begin.
 
@@ -37,7 +51,9 @@ class Enabling:
             step: how long all drives together may take for one step [s].
             now_ns: of the link's clock.
             reports: least and longest time between two status reports of a drive [s].
+            quick_stop: 605Ah; drives that stay in quick stop hold the arm, and are enabled out of it with the others.
         """
+        self._stays = quick_stop in STAY_IN_QUICK_STOP
         self._drives, self._names = drives, names
         self._inhibit_ns, self._report_ns = (round(seconds * 1e9) for seconds in reports)
         self._reported_ns = [now_ns] * len(drives)
@@ -82,7 +98,10 @@ class Enabling:
         for number, drive in enumerate(self._drives):
             if self._there(drive):  # and waits for the others, or for the seed
                 continue
-            word = TOWARDS_ENABLED.get(drive.state, DISABLE_VOLTAGE)
+            stopped = drive.state is DriveState.QUICK_STOP
+            if stopped and not self._stays:
+                continue  # its ramp ends by itself
+            word = ENABLE if stopped else TOWARDS_ENABLED.get(drive.state, DISABLE_VOLTAGE)
             state, sent_ns = self._sent.get(number, (None, 0))
             if state is not drive.state or now_ns - sent_ns > REPEAT * 1e9:
                 self._sent[number] = drive.state, now_ns
@@ -102,7 +121,8 @@ class Enabling:
         return all(self._there(drive) for drive in self._drives)
 
     def _there(self, drive: Drive) -> bool:
-        return drive.state in _WAY[self._target :]
+        holds = self._stays and drive.state is DriveState.QUICK_STOP and self._target < len(_WAY) - 1
+        return holds or drive.state in _WAY[self._target :]
 
 
 class Resetting:
@@ -134,6 +154,11 @@ class Resetting:
                 self._edge[number] = phase + 1
                 words.append((number, RESET_FAULT if phase % 2 else DISABLE_VOLTAGE))
         return words
+
+
+def hold(drives: Sequence[Drive]) -> bool:
+    """Tell whether some of the drives have said that they are in quick stop."""
+    return any(drive.state is DriveState.QUICK_STOP for drive in drives)
 
 
 def _told(drives: Sequence[Drive], names: Sequence[str], chosen: Sequence[Drive]) -> str:

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from drivers.canopen.bus_event import HOST, Event, EventCode
 from drivers.canopen.codec import BusCodec
 from drivers.status import AxisEvent, AxisEventCode
+from ident_service.config.canopen import CanopenDriver
 
 _CODES: dict[EventCode, AxisEventCode] = {
     EventCode.EMERGENCY: AxisEventCode.EMERGENCY_MESSAGE,
@@ -52,6 +53,33 @@ def axis_events(events: Iterable[Event], codec: BusCodec, joint_of: Mapping[int,
             words = f"{bus}: {event.words}" if event.node == HOST else f"node {event.node}: {event.words}"
             found.append(AxisEvent(code, joint_of.get(event.node), words))
     return found
+
+
+class Reports:
+    """What all buses of an arm tell, cycle by cycle."""
+
+    def __init__(self, driver: CanopenDriver, joints: Mapping[int, int], look_every: int) -> None:
+        """Begin.
+
+        Args:
+            driver: the section `driver`.
+            joints: first joint that each drive moves, by number.
+            look_every: cycles between two looks at who is missing.
+        """
+        self._joints = [{d.node: joints[k] for k, d in enumerate(driver.drives) if d.bus == bus} for bus in range(4)]
+        self._look_every = look_every
+        self._missed = MissedReports()
+
+    def new(self, codecs: Iterable[BusCodec], cycle: int, now_ns: int) -> list[AxisEvent]:
+        """Return what has happened since the last time; `cycle` is its number, `now_ns` of the links' clock [ns]."""
+        found: list[AxisEvent] = []
+        look = cycle % self._look_every == 0
+        for codec in codecs:
+            if (events := codec.take_events()) or look:
+                joints = self._joints[codec.profile.number]
+                found += axis_events(events, codec, joints)
+                found += self._missed.new(codec, now_ns, joints) if look else []
+        return found
 
 
 class MissedReports:

@@ -36,7 +36,6 @@ _RESTRICTED = (
 )
 _NOT_VALID, _NO_REMOTE = 1 << 31, 1 << 30  # bits of a PDO's COB-ID entry
 _EVERY_SYNC, _ON_RECEPTION, _ON_CHANGE = 1, 255, 255
-_STATUS_SLOTS = (od.STATUS_WORD, od.TORQUE_ACTUAL)
 _UNUSED = (3, 4)  # some drives command their axis by these out of the box
 _MOST_16 = 0xFFFF
 _STATUS_PATIENCE = 2.5  # periods without a status report: one was lost, and the next one is late as well
@@ -146,6 +145,8 @@ class BusProfile:
         torque_deadline: after which a drive without torque frames stops by itself [s].
         status_period: of a drive's status report without a change [s].
         status_inhibit: least time between two of them [s].
+        position_slots: what a drive tells at every SYNC.
+        status_slots: what its status report tells.
     """
 
     number: int
@@ -162,6 +163,8 @@ class BusProfile:
     torque_deadline: float
     status_period: float
     status_inhibit: float
+    position_slots: tuple[Entry, ...]
+    status_slots: tuple[Entry, ...]
 
     @property
     def fd(self) -> bool:
@@ -188,8 +191,8 @@ class BusProfile:
         return [
             Pdo(1, False, frame.cob_id, _EVERY_SYNC, slots, timer=_whole(self.torque_deadline, 1e-3)),
             Pdo(2, False, RPDO2 + node, _ON_RECEPTION, (od.CONTROL_WORD, od.MODE)),
-            Pdo(1, True, TPDO1 + node, _EVERY_SYNC, (od.POSITION,)),
-            Pdo(2, True, TPDO2 + node, _ON_CHANGE, _STATUS_SLOTS, inhibit, period),
+            Pdo(1, True, TPDO1 + node, _EVERY_SYNC, self.position_slots),
+            Pdo(2, True, TPDO2 + node, _ON_CHANGE, self.status_slots, inhibit, period),
         ]
 
     def writes(self, node: int) -> list[Write]:
@@ -256,6 +259,8 @@ def _profile(driver: CanopenDriver, rate: float, number: int, bus: CanBus) -> Bu
         driver.torque_deadline,
         driver.status.period,
         driver.status.inhibit,
+        (od.POSITION, od.TORQUE_ACTUAL) if driver.torque_reports == "cyclic" else (od.POSITION,),
+        (od.STATUS_WORD, od.TORQUE_ACTUAL) if driver.torque_reports == "status" else (od.STATUS_WORD,),
     )
 
 

@@ -15,11 +15,13 @@ from drivers.canopen.profile import BusProfile, Write
 from drivers.canopen.sdo import DOES_NOT_EXIST, READ_ONLY, Objects, SdoRefused
 from drivers.canopen.words import POWER_OFF, state_of
 from drivers.canopen.zero import Zeros
-from ident_service.config.canopen import CanopenDrive, DriveIdentity, Reactions
+from ident_service.config.canopen import CanopenDrive, CanopenDriver, DriveIdentity, Reactions
+from ident_service.config.schema import ArmConfig
 from ident_service.errors import AnotherDrive, DriverError
 
 DRIVE_PROFILE = 402  # low word of 1000h
 _FIRMWARE = 0x100A
+_LETS_GO, _STAYS = 2, 6  # values of 605Ah: a ramp, then power off, or hold on
 IDENTITY = {"vendor": od.VENDOR, "product": od.PRODUCT, "revision": od.REVISION, "serial": od.SERIAL}
 
 
@@ -31,12 +33,14 @@ class Setup:
         drive: its section.
         profile: of its bus.
         reactions: to what it finds by itself.
+        quick_stop: 605Ah, in place of what `reactions` leaves open.
         limits: lowest and highest position [counts], for a drive that heeds them; None where joints have none.
     """
 
     drive: CanopenDrive
     profile: BusProfile
     reactions: Reactions
+    quick_stop: int
     limits: tuple[int, int] | None
 
     def protections(self) -> list[Write]:
@@ -45,7 +49,7 @@ class Setup:
         return [
             Write(od.MAX_TORQUE, torque_limit_counts(drive.max_torque, drive.rated_torque)),
             Write(od.MAX_SPEED, round(drive.max_speed)),
-            Write(od.QUICK_STOP_OPTION, self.reactions.quick_stop),
+            Write(od.QUICK_STOP_OPTION, self.quick_stop),
             Write(od.FAULT_OPTION, self.reactions.fault),
             Write(od.ABORT_CONNECTION, self.reactions.abort_connection),
         ]
@@ -74,6 +78,15 @@ def differences(found: Mapping[str, int], wanted: DriveIdentity) -> list[str]:
         for name, value in wanted.model_dump(exclude_none=True).items()
         if found.get(name) != value
     ]
+
+
+def quick_stop_option(config: ArmConfig) -> int:
+    """Return what 605Ah is set to: as described, else to stay in quick stop where the arm has no brakes."""
+    assert isinstance(config.driver, CanopenDriver)  # noqa: S101 - of an arm of CANopen drives
+    described = config.driver.reactions.quick_stop
+    if described is not None:
+        return described
+    return _STAYS if config.control.after_stop in ("hold", "lower") else _LETS_GO
 
 
 def identify(objects: Objects, wanted: DriveIdentity) -> str:

@@ -54,17 +54,20 @@ POWER_OFF = frozenset(
     {DriveState.NOT_READY, DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON, DriveState.FAULT}
 )
 
+# Values of 605Ah with which a drive stays in quick stop, and may be enabled out of it (transition 16).
+STAY_IN_QUICK_STOP = range(5, 9)
+
 # Bits of the status word beside the state.
 WARNING, REMOTE, INTERNAL_LIMIT, FOLLOWS = 1 << 7, 1 << 9, 1 << 11, 1 << 12
 
 # Commands: control words without any other bit.
 DISABLE_VOLTAGE, QUICK_STOP, SHUTDOWN, SWITCH_ON, ENABLE, RESET_FAULT = 0x0000, 0x0002, 0x0006, 0x0007, 0x000F, 0x0080
 
-# The next command on the way to `operation enabled`. FAULT_REACTION and NOT_READY end by themselves; a fault is reset
-# by a rising edge, so that DISABLE_VOLTAGE must have been sent before.
+# The next command on the way to `operation enabled`. FAULT_REACTION and NOT_READY end by themselves, and so does a
+# quick stop in which the drive does not stay: cut short, it would let the arm fall. A fault is reset by a rising edge,
+# so that DISABLE_VOLTAGE must have been sent before.
 TOWARDS_ENABLED: dict[DriveState, int] = {
     DriveState.FAULT: RESET_FAULT,
-    DriveState.QUICK_STOP: DISABLE_VOLTAGE,
     DriveState.SWITCH_ON_DISABLED: SHUTDOWN,
     DriveState.READY_TO_SWITCH_ON: SWITCH_ON,
     DriveState.SWITCHED_ON: ENABLE,

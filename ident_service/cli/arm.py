@@ -1,4 +1,4 @@
-"""Verbs at an arm: `watch`, `check`, `rehearse`, `run`; from any terminal `stop`, `pause`, `resume`, `finish`, `ack`.
+"""Verbs at an arm: `watch`, `check`, `rehearse`, `run`; from any terminal `stop`, `pause`, `resume`, `finish` and more.
 
 Boundary: words to requests, results to words; the work is `service/run.py`. `stop` asks for nothing, waits for nobody.
 """
@@ -75,6 +75,7 @@ def add(verbs: Verbs) -> None:
         ("pause", "let the arm stand"),
         ("resume", "let it go on"),
         ("finish", "leave out the rest of the motion: the arm goes back to where it stood, and the run is done"),
+        ("supported", "confirm that an arm that is held after a stop is supported or home: it is let down"),
     ):
         sub = verbs.add(name, _stop if name == "stop" else _ask, text)
         sub.add_argument("arm", metavar="ARM", nargs="?" if name == "stop" else None, help=_HELP_ARM)
@@ -248,17 +249,34 @@ def _stop(arguments: argparse.Namespace) -> Answer:
 
 
 def _ask(arguments: argparse.Namespace) -> Answer:
-    from ident_service.motion.control_file import ControlFile
+    from ident_service.motion.control_file import ControlFile, in_use
 
     name, path = _control(arguments)
+    if arguments.asks == "supported" and not in_use(path):
+        return _let_go(arguments)
     with ControlFile.reach(path) as controls:
-        if arguments.asks == "finish":
-            controls.ask_finish()
-        controls.ask_pause(arguments.asks == "pause")
+        if arguments.asks == "supported":
+            controls.confirm_support()
+        else:
+            if arguments.asks == "finish":
+                controls.ask_finish()
+            controls.ask_pause(arguments.asks == "pause")
         pid = controls.pid
     note_act(arguments, arguments.asks, name, reached=[name])
     document: dict[str, Any] = {"arm": name, "asked": arguments.asks, "pid": pid}
     return DONE, f"{name}: {arguments.asks} asked of process {pid}\n", document
+
+
+def _let_go(arguments: argparse.Namespace) -> Answer:
+    """Take the power from drives that hold an arm which nobody moves any more."""
+    from ident_service.config.load import load_arm
+    from ident_service.service.recover import let_go
+
+    config = load_arm(arguments.arm)
+    held = let_go(config, own_state_folder(arguments))
+    note_act(arguments, "supported", config.name, reached=[config.name])
+    document = {"arm": config.name, "asked": "supported", "let_go": list(held)}
+    return DONE, f"{config.name}: drives have let go of {', '.join(held)}\n", document
 
 
 def _ack(arguments: argparse.Namespace) -> Answer:

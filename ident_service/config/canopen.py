@@ -15,6 +15,7 @@ from pydantic import Field, model_validator
 
 from ident_service.config.quantities import (
     Count,
+    GrownSection,
     ParameterTable,
     PerJoint,
     Positive,
@@ -23,7 +24,7 @@ from ident_service.config.quantities import (
     TextBeside,
 )
 from ident_service.config.recording import Transmission
-from ident_service.config.simulation import SimulatedFault
+from ident_service.config.simulation import SimulatedFault, WindingsOff
 
 NodeId = Annotated[int, Field(strict=True, ge=1, le=127)]
 Seconds = Annotated[float, Field(strict=True, ge=0.001, le=60.0)]  # whole ms of 16 bits in the drive
@@ -127,9 +128,15 @@ class Heartbeats(Section):
 
 
 class Reactions(Section):
-    """What a drive does by itself: option codes of CiA 402, as its manual numbers them."""
+    """What a drive does by itself: option codes of CiA 402, as its manual numbers them.
 
-    quick_stop: Annotated[int, Field(strict=True)] = 2  # 605Ah: ramp, then switch-on disabled
+    Left out, `quick_stop` is 2, or 6 for an arm whose `control.after_stop` is `hold` or `lower`: it has no brakes, and
+    stays in quick stop, where the drive goes on holding the motor.
+    """
+
+    quick_stop: Annotated[int, Field(strict=True)] | None = (
+        None  # 605Ah: 2 and 6 ramp, then switch-on disabled, or stay
+    )
     fault: Annotated[int, Field(strict=True)] = 2  # 605Eh: quick-stop ramp
     abort_connection: Annotated[int, Field(strict=True)] = 3  # 6007h: quick stop
 
@@ -141,17 +148,22 @@ class StatusReports(Section):
     inhibit: InhibitTime = 0.05
 
 
-class Emulation(Section):
-    """What stands behind emulated drives: an arm with true parameters, noise and faults, as `SimulatedDriver` has."""
+class Emulation(GrownSection):
+    """What stands behind emulated drives: an arm with true parameters, noise and faults, as `SimulatedDriver` has.
+
+    A drive whose power stage is off leaves its motor coasting, or braked where `windings_off` is `shorted`.
+    """
 
     seed: Seed = 0
     truth: ParameterTable | None = None
     torque_noise: PerJoint = 0.0
     braking: PerJoint | None = None
+    windings_off: WindingsOff = "open"
+    later = frozenset({"windings_off"})
     faults: tuple[SimulatedFault, ...] = ()
 
 
-class CanopenDriver(Section):
+class CanopenDriver(GrownSection):
     """Drives in cyclic synchronous torque mode.
 
     `torque_frames` says whether up to four drives share a frame, by dummy mapping, or each has its own.
@@ -159,7 +171,9 @@ class CanopenDriver(Section):
     without its position a joint counts as gone (FIELDBUS.md: 3 to 5). `bring_up` [s] is how long all
     drives together may take for one step to `operation enabled`. `zero` says whether encoders know where they stand
     (`absolute`), or count from where they were when power came; then a person leads the arm to the joints' `home` and
-    says so, `ident home ARM --zero`, after every loss of power.
+    says so, `ident home ARM --zero`, after every loss of power. `measured_torque` says whether drives report the torque
+    that they measure (6077h): with their positions, in every cycle (`cyclic`), with their status (`status`), or not at
+    all; left out, with their status where the EDS has the object.
     """
 
     kind: Literal["canopen"]
@@ -171,6 +185,8 @@ class CanopenDriver(Section):
     lost_cycles: Annotated[int, Field(ge=3, le=5)] = 3
     bring_up: Positive = 0.5
     zero: Literal["absolute", "at_home"] = "absolute"
+    measured_torque: Literal["cyclic", "status", "none"] | None = None
+    later = frozenset({"measured_torque"})
     heartbeats: Heartbeats = Heartbeats()
     reactions: Reactions = Reactions()
     status: StatusReports = StatusReports()
@@ -180,6 +196,13 @@ class CanopenDriver(Section):
     def watchdog(self) -> float:
         """How long a drive goes on without torque frames [s]."""
         return self.torque_deadline
+
+    @property
+    def torque_reports(self) -> Literal["cyclic", "status", "none"]:
+        """With what drives report the torque that they measure."""
+        if self.measured_torque is not None:
+            return self.measured_torque
+        return "status" if has_object(self.eds.text, 0x6077) else "none"
 
     @property
     def report_delay(self) -> float:
@@ -221,6 +244,17 @@ def maps_dummies(eds: str) -> bool:
         return section is not None and int(parser.get(section, "Dummy0003", fallback="0"), 0) == 1
     except (configparser.Error, ValueError):
         return False
+
+
+@lru_cache(maxsize=8)
+def has_object(eds: str, index: int) -> bool:
+    """Return whether an EDS (CiA 306-1) lists an object; one that cannot be read lists none."""
+    parser = configparser.ConfigParser(strict=False, interpolation=None)
+    try:
+        parser.read_string(eds)
+    except configparser.Error:
+        return False
+    return any(name.upper() == f"{index:04X}" for name in parser.sections())
 
 
 @lru_cache(maxsize=8)
@@ -278,6 +312,11 @@ def disagreements(
             ("driver", "eds"),
             f"driver.eds: {driver.eds.name} has no Dummy0003=1 under [DummyUsage], so that these drives cannot share"
             " torque frames; set driver.torque_frames to single, at a rate that it fits",
+        )
+    elif driver.measured_torque in ("cyclic", "status") and not has_object(driver.eds.text, 0x6077):
+        yield (
+            ("driver", "measured_torque"),
+            f"driver.measured_torque: {driver.eds.name} has no 6077h, so that these drives do not tell their torque",
         )
     if joints and len(joints) != len(driver.drives):
         yield ("driver", "drives"), f"{len(driver.drives)} drives for {len(joints)} joints"

@@ -9,9 +9,19 @@ import json
 import math
 import re
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationInfo,
+    model_serializer,
+    model_validator,
+)
 
 MAX_FILE_BYTES = 16 * 2**20
 UPLOAD = "upload"  # key of a validation's context
@@ -36,6 +46,22 @@ class Section(BaseModel):
     """A frozen part of a configuration that refuses keys it does not know."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class GrownSection(Section):
+    """A section that got keys after descriptions were hashed.
+
+    Those of `later` are left out of documents while they have their defaults, so that a description without them keeps
+    the hash that motions and results name it by.
+    """
+
+    later: ClassVar[frozenset[str]] = frozenset()
+
+    @model_serializer(mode="wrap")
+    def _without_later_defaults(self, serialized: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        fields = type(self).model_fields
+        document: dict[str, Any] = serialized(self)
+        return {k: v for k, v in document.items() if k not in self.later or getattr(self, k) != fields[k].default}
 
 
 def _angle(value: Any) -> Any:

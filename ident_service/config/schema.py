@@ -11,13 +11,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import (
     Field,
-    SerializerFunctionWrapHandler,
     ValidationInfo,
     field_validator,
-    model_serializer,
     model_validator,
 )
 
+from ident_service.config.control import Control
 from ident_service.config.design import Design
 from ident_service.config.drivers import Driver
 from ident_service.config.kinematics import Kinematics
@@ -25,6 +24,7 @@ from ident_service.config.quantities import (
     UPLOAD,
     Angle,
     Count,
+    GrownSection,
     Interval,
     NonNegative,
     Number,
@@ -94,11 +94,12 @@ class Body(Section):
     symmetry: tuple[Literal["xy", "yz", "xz"], ...] = ()
 
 
-class Joint(Section):
+class Joint(GrownSection):
     """Limits, gains and body of one joint; what a motion needs may be left out of an arm that is only identified.
 
     `drive_inertia` [kg m^2 or kg] is what its rotors have at the joint by data sheet, the least that is there.
-    Margins of the gains are stated with it where the prior, a CAD model of the links, lacks it.
+    Margins of the gains are stated with it where the prior, a CAD model of the links, lacks it. `brake` says that the
+    joint's drive has a holding brake, which closes whenever its power stage is off.
     """
 
     position: Interval | None = None
@@ -111,6 +112,8 @@ class Joint(Section):
     kp: Positive | None = None
     kd: Positive | None = None
     drive_inertia: NonNegative | None = None
+    brake: bool = False
+    later = frozenset({"brake"})
     body: Body = Body()
 
     @model_validator(mode="after")
@@ -131,7 +134,7 @@ class Mass(Section):
     upper: Positive | None = None
 
 
-class Constraints(Section):
+class Constraints(GrownSection):
     """Physical knowledge about the whole arm (eqs. 25, 28).
 
     `torque_constant` bounds, per joint, what its measured torque must be multiplied by to be true; 1 elsewhere.
@@ -143,6 +146,7 @@ class Constraints(Section):
     positive: tuple[Literal["drive_inertia", "viscous", "coulomb"], ...] = ("drive_inertia", "viscous", "coulomb")
     torque_constant: dict[str, tuple[Positive, Positive]] = Field(default_factory=dict)
     custom: Annotated[str, Field(pattern=_FUNCTION)] | None = None
+    later = frozenset({"custom"})
 
     @field_validator("custom")
     @classmethod
@@ -153,12 +157,6 @@ class Constraints(Section):
             )
         return value
 
-    @model_serializer(mode="wrap")
-    def _unless_none(self, serialized: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # Descriptions without it keep the hash that results have named them by.
-        document: dict[str, Any] = serialized(self)
-        return {key: value for key, value in document.items() if key != "custom" or value is not None}
-
     @model_validator(mode="after")
     def _ordered(self) -> Constraints:
         for joint, (lower, upper) in self.torque_constant.items():
@@ -167,13 +165,6 @@ class Constraints(Section):
                     f"torque_constant of {joint}: lower bound {lower:g} is not below upper bound {upper:g}"
                 )
         return self
-
-
-class Control(Section):
-    """The computed-torque loop (eq. 76): rate [Hz] and cut-off of the velocity low-pass [Hz]."""
-
-    rate: Positive = 1000.0
-    velocity_cutoff: Positive = 30.0
 
 
 class Smoothing(Section):
@@ -232,13 +223,14 @@ class PriorPull(Section):
     weight: NonNegative | Literal["held_out"] = "held_out"
 
 
-class Identification(Section):
+class Identification(GrownSection):
     """How a recording becomes equations, and equations an estimate.
 
     `method` is the estimator, by default the one of `wls` and `huber` that predicts held-out parts of the recordings
     better; `edge` [s] is left out at both ends of every recording, two periods of the cut-off by default; `block` [s]
-    is what doubt is computed from; `delay` [s] is how much later the stamps of the torque are than the position's;
-    `period` [s] averages a periodic motion over its periods, without the filters of the torque.
+    is what doubt is computed from; `delay` [s] is how much later the torque's stamps are than the position's; `period`
+    [s] averages a periodic motion over its periods, without the filters of the torque. `torque` is what drives measured
+    or what they were told; left out, what they measured where a recording has it in every sample.
     """
 
     method: Method | Literal["choose"] = "choose"
@@ -250,6 +242,8 @@ class Identification(Section):
     block: Positive = 1.0
     delay: Number | Literal["estimate"] = 0.0
     period: Positive | None = None
+    torque: Literal["measured", "commanded"] | None = None
+    later = frozenset({"torque"})
 
     @model_validator(mode="after")
     def _averaged_instead(self) -> Identification:

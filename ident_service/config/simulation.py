@@ -14,6 +14,7 @@ from pydantic import Field, model_validator
 
 from ident_service.config.quantities import (
     Count,
+    GrownSection,
     NonNegative,
     Number,
     ParameterTable,
@@ -81,12 +82,10 @@ FAULT_RULES: dict[FaultKind, FaultRule] = {
     FaultKind.TORQUE_SATURATION: FaultRule("torques clipped below the limit", "share of the limit", stays=True),
     FaultKind.DRIVE_FAULT: FaultRule("no torque until reset, the axis coasts; status says fault", stays=True),
     FaultKind.NODE_SILENT: FaultRule(
-        "as lost feedback, and no torque but resistive braking until enabled again, which no sample says",
+        "as lost feedback, and no torque until enabled again, which no sample says",
         stays=True,
     ),
-    FaultKind.EMERGENCY_STOP: FaultRule(
-        "no torque but resistive braking until reset; status says so", of_joint=False, stays=True
-    ),
+    FaultKind.EMERGENCY_STOP: FaultRule("no torque until reset; status says so", of_joint=False, stays=True),
     # What happens to the plant.
     FaultKind.LOAD_ATTACHED: FaultRule("a point mass on the last link", "mass [kg]", of_joint=False, stays=True),
     # What happens on the way.
@@ -94,6 +93,7 @@ FAULT_RULES: dict[FaultKind, FaultRule] = {
     FaultKind.LATE_CYCLE: FaultRule("exchange returns late", "lateness [s]", of_joint=False),
     FaultKind.CLOCK_JUMP: FaultRule("stamps are wrong by size", "[s]", of_joint=False, stays=True),
 }
+WindingsOff = Literal["open", "shorted"]  # of a drive whose power stage is off
 _LEAST_WATCHDOG = 2.0  # cycles, so that a torque frame may be late
 _NOT_NEGATIVE = (
     FaultKind.DELAYED_FEEDBACK,
@@ -143,12 +143,13 @@ class SimulatedFault(Section):
         return self
 
 
-class SimulatedDriver(Section):
+class SimulatedDriver(GrownSection):
     """The simulated arm: true parameters and imperfections, all per joint or one number for all.
 
     `process` says where its plant lives; `bus` names a separate one that other processes may ask for, `status` the file
     it reports to, `deadline` [s] how long an answer of it may take. `watchdog` [s] without a torque frame makes
-    the drives idle; idle drives brake with `braking` [N m s/rad].
+    the drives idle; idle drives brake with `braking` [N m s/rad], for 0.1 s or, where `windings_off` is `shorted`, for
+    as long as they are off.
     """
 
     kind: Literal["simulated"]
@@ -165,6 +166,8 @@ class SimulatedDriver(Section):
     delay_cycles: Annotated[Count, Field(le=100)] = 1
     watchdog: Positive = 0.01
     braking: PerJoint | None = None
+    windings_off: WindingsOff = "open"
+    later = frozenset({"windings_off"})
     faults: tuple[SimulatedFault, ...] = ()
 
 

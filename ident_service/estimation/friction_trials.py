@@ -276,7 +276,7 @@ def _joined(parts: Sequence[_Part], every: int) -> _Part:
     return (
         np.concatenate(time)[::every],
         np.concatenate(rate)[::every],
-        np.asarray(np.any(moving, axis=0)),
+        np.asarray(np.any(moving, axis=0), dtype=np.bool_),
         [np.concatenate(joint)[::every] for joint in zip(*tables, strict=True)],
     )
 

@@ -27,7 +27,9 @@ FOLLOWING_LOST = 2.0  # times the following error allowed
 # Towards a position limit no motion within the acceleration limit a is faster than sqrt(2 a d) at a distance d from it
 # (FIELDBUS.md). The arm itself may brake by so much harder, and be by so much of its velocity limit faster, than that.
 ENVELOPE, ENVELOPE_SLACK = 1.5, 0.2
-NOT_APPLIED = 0.1  # of the torque limit, by which the torque that acts may differ from the one asked for
+# Of the torque limit, by which the torque that acts may differ from the one asked for, and the measured one from both.
+# A sound drive is within its current loop's offset and noise, some hundredths of its largest torque.
+NOT_APPLIED = 0.1
 
 
 @dataclass(frozen=True)
@@ -149,6 +151,9 @@ def _what_can_be_bridged(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
         differs = np.abs(seen.sample.torque - seen.sent) > NOT_APPLIED * limits.torque
         what = "the drive gives {} of the {} {f} it was told"
         yield Check("torque_not_applied", differs, what, (seen.sample.torque, seen.sent))
+    if (more := seen.sample.torque_difference) is not None:
+        what = "the drive measures {} {f} more than it was told, at {} {f}"
+        yield Check("torque_not_applied", np.abs(more) > NOT_APPLIED * limits.torque, what, (more, seen.sample.torque))
 
 
 def approach_speed(distance: Vector, limits: MotionLimits) -> Vector:

@@ -5,7 +5,9 @@
 with the prior (CAD) model. Velocity comes from encoder differences through a first-order low-pass, because at 1 kHz
 one encoder step is a tenth of a radian per second. An arm that is only held, or lowered, is asked for no position:
 
-    tau = -M(q) K_d dq + c(q, dq) + s g(q) + tau_0
+    tau = M(q) (K_p e - K_d dq) + c(q, dq) + s g(q) + tau_0
+
+where e is how far it is to be brought back inside its position limits.
 """
 
 from __future__ import annotations
@@ -79,6 +81,7 @@ class ComputedTorque:
         share: float = 1.0,
         added: Vector | float = 0.0,
         elapsed: float | None = None,
+        back: Vector | float = 0.0,
     ) -> Vector:
         """One update without a reference.
 
@@ -88,13 +91,15 @@ class ComputedTorque:
             share: of gravity to compensate.
             added: tau_0, what else is needed to stand [N m or N], shape (joints,).
             elapsed: as for `torque`.
+            back: e, by how much each joint is to be brought back [rad or m], shape (joints,).
 
         Returns:
             Torque [N m or N], shape (joints,), not yet limited.
         """
         position = self._filtered(position, valid, elapsed)
         self.correction = self.answer = self._none
-        torque = self._dynamics.torque(position, self.velocity, -self._kd * self.velocity) + added
+        answer = self._kp * back - self._kd * self.velocity
+        torque = self._dynamics.torque(position, self.velocity, answer) + added
         if share < 1.0:
             torque = torque - (1.0 - share) * self._dynamics.torque(position, self._none, self._none)
         return torque

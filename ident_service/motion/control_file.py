@@ -8,6 +8,8 @@
 | 16 | uint8 | stop: not 0 for a controlled stop; never taken back |
 | 17 | uint8 | pause: not 0 while the arm shall stand |
 | 18 | uint8 | finish: not 0 when the run shall end early, in order; never taken back |
+| 19 | uint8 | waiting: not 0 while the arm is held until a person confirms that it is supported; of the loop |
+| 20 | uint8 | supported: not 0 when that was confirmed; counts while the arm waits for it |
 | 24 | int64 | when the lease was renewed last [ns of the machine's monotonic clock] |
 | 32 | int64 | how long it lasts [ns]; 0 for none |
 | 40 | int64 | when a stop was asked for last, whether or not the arm moved then [ns of the same]; 0 for never |
@@ -38,7 +40,7 @@ from typing import Self
 from ident_service.errors import DriverError, UsageError
 
 _MAGIC, _VERSION, _SIZE = b"identctl", 1, 64
-_PID, _STOP, _PAUSE, _FINISH, _RENEWED, _LENGTH, _STOPPED = 12, 16, 17, 18, 24, 32, 40
+_PID, _STOP, _PAUSE, _FINISH, _WAITING, _SUPPORTED, _RENEWED, _LENGTH, _STOPPED = 12, 16, 17, 18, 19, 20, 24, 32, 40
 _TRIES, _TRY_AGAIN = 20, 0.005  # s; who looks whether the file is in use holds it for a moment
 
 
@@ -177,6 +179,31 @@ class ControlFile:
     def ask_finish(self) -> None:
         """Let the run end early, in order; cannot be taken back. A pause stays one until that is taken back."""
         self._memory[_FINISH] = 1
+
+    @property
+    def waiting(self) -> bool:
+        """Whether the arm is held until a person confirms that it is supported or home."""
+        return self._memory[_WAITING] != 0
+
+    def wait_for_support(self) -> None:
+        """Hold the arm until that is confirmed; for whoever moves it."""
+        self._memory[_SUPPORTED] = 0
+        self._memory[_WAITING] = 1
+
+    @property
+    def supported(self) -> bool:
+        """Whether that was confirmed."""
+        return self._memory[_SUPPORTED] != 0
+
+    def confirm_support(self) -> None:
+        """Say, as a person who sees it, that the arm is supported or home; cannot be taken back.
+
+        Raises:
+            UsageError: the arm does not wait for it; what is said beforehand would let go an arm that still moves.
+        """
+        if not self.waiting:
+            raise UsageError("the arm is not held after a stop; there is nothing to confirm")
+        self._memory[_SUPPORTED] = 1
 
     def renew(self) -> None:
         """Say that whoever asked for motion is still there."""

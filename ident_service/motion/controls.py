@@ -1,5 +1,7 @@
 """What people and programs may ask of a motion while it runs: stop, pause, finish, and that they are still there.
 
+An arm without brakes that has been stopped is held, and waits for a person to say that it is supported.
+
 The loop reads this once per cycle, so it must answer at once: a word of shared memory, an attribute, never a lock.
 Stop needs no lease. Hold-to-run is nothing but a short lease.
 """
@@ -28,23 +30,43 @@ class Controls(Protocol):
     def finish(self) -> bool:
         """Whether what is left of the motion is to be left out: the arm rests, and goes back to where it stood."""
 
+    @property
+    def supported(self) -> bool:
+        """Whether a person has confirmed, since the arm began to wait for it, that it is supported or home."""
+
+    def wait_for_support(self) -> None:
+        """Say that the arm is held until somebody confirms that; called once for each hold."""
+
     def lease_ok(self, now_ns: int) -> bool:
         """Whether whoever asked for motion is still there at this time of the loop's clock [ns]."""
 
 
 class StopWhen:
-    """Controls of a run that nobody pauses or finishes early: stops when a function says so."""
+    """Controls of a run that nobody pauses or finishes early: stops when a function says so.
+
+    A second function says whether an arm that is held since is supported.
+    """
 
     pause = False
     finish = False
 
-    def __init__(self, asked: Callable[[], bool] = lambda: False) -> None:
-        self._asked = asked
+    def __init__(
+        self, asked: Callable[[], bool] = lambda: False, supported: Callable[[], bool] = lambda: False
+    ) -> None:
+        self._asked, self._supported = asked, supported
 
     @property
     def stop(self) -> bool:
         """What the function says."""
         return self._asked()
+
+    @property
+    def supported(self) -> bool:
+        """What the second function says."""
+        return self._supported()
+
+    def wait_for_support(self) -> None:
+        """Nothing more: the function is asked."""
 
     def lease_ok(self, now_ns: int) -> bool:
         """There is no lease to lose."""
@@ -58,6 +80,8 @@ class Switches:
         stop: the arm is to stop.
         pause: the arm is to stand.
         finish: the run is to end early.
+        supported: the arm, which is held, is supported.
+        waiting: whether the arm is held until that is so.
     """
 
     def __init__(self, lease_seconds: float | None = None) -> None:
@@ -69,8 +93,13 @@ class Switches:
         self.stop = False
         self.pause = False
         self.finish = False
+        self.supported = self.waiting = False
         self._length_ns = None if lease_seconds is None else round(lease_seconds * 1e9)
         self._renewed_ns: int | None = None
+
+    def wait_for_support(self) -> None:
+        """Wait for the switch `supported`; one that was set before does not count."""
+        self.supported, self.waiting = False, True
 
     def renew(self, now_ns: int) -> None:
         """Say at a time of the loop's clock [ns] that somebody is still there."""

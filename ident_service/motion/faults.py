@@ -6,11 +6,12 @@ Reactions, from mild to severe; a motion only ever goes from a milder one to a m
   too many of the last 100 cycles becomes a controlled stop.
 * **controlled stop**: the loop stays closed on a stop within limits (`stop.py`). The arm must then be measured at rest
   within `SETTLE` of the end of the stop, and is held: gravity compensated, motion damped, what else it needed to stand
-  kept on, no position asked for, so that it gives way to whoever pushes it. After `HOLD` seconds the drives are told to
-  quick-stop, which on arms without brakes is resistive braking (IDLE): torque is never ramped out by itself over an arm
-  that nobody supports.
+  kept on, no position asked for, so that it gives way to whoever pushes it. After `HOLD` seconds the drives of an arm
+  with brakes are told to quick-stop. Without brakes (`after_stop.py`) it is held until a person confirms that it is
+  supported or home, or lowered; either ends without torque when the arm rests.
 * **damped lowering**: for an arm that does not follow although it can be measured. No position is asked for any more:
-  `LOWER_AFTER` seconds of damped gravity compensation, which is ramped out over `LOWER` seconds, then a quick stop.
+  `LOWER_AFTER` seconds of damped gravity compensation, which is then taken away as fast as the arm sinks slowly
+  (`lowering.py`). With brakes a quick stop follows `LOWER` seconds later, without them when the arm rests.
 * **quick stop**: in the same cycle the drives brake by themselves; for faults of ours or of single axes, where the
   drives still know what they do.
 * **torque off**: in the same cycle; where the drives' own measurement or sign cannot be believed either.

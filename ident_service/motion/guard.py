@@ -224,6 +224,10 @@ class Guard:
             return False
         if self._sent is not None and not bool((np.abs(sample.torque - self._sent) <= self._not_applied).all()):
             return False
+        if sample.torque_difference is not None and not bool(
+            (np.abs(sample.torque_difference) <= self._not_applied).all()
+        ):
+            return False
         if sample.velocity is not None and not bool(np.isfinite(sample.velocity).all()):
             return False
         if self._contact is None:

@@ -46,6 +46,15 @@ class Lifeline:
         return self._controls.finish
 
     @property
+    def supported(self) -> bool:
+        """Whether a person has confirmed that the arm, which waits for it, is supported or home."""
+        return self._controls.supported
+
+    def wait_for_support(self) -> None:
+        """Hold the arm until that is confirmed."""
+        self._controls.wait_for_support()
+
+    @property
     def cut(self) -> bool:
         """Whether the other end of the pipe is closed."""
         return bool(self._poll.poll(0))

@@ -3,12 +3,14 @@
     exchange -> deadlines -> course -> guard.feedback -> control law -> guard.torque -> sink -> reaction -> controls
 
 Reactions that end torque are an `ArmFault` out of `Loop.run`; taking the torque away is `run.py`'s. After a stop the
-loop goes on until the arm has been measured at rest and held for a while, see `faults.py`.
+loop goes on until the arm has been measured at rest and held for a while, see `faults.py`; one without brakes until a
+person has confirmed that it is supported, or until it has been lowered (`after_stop.py`, `lowering.py`).
 """
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Final
@@ -18,6 +20,7 @@ import numpy as np
 from drivers.arm import Arm, Flags, Sample, Vector
 from ident_service.config.limits import MotionLimits
 from ident_service.errors import ArmFault, DriverError
+from ident_service.motion.after_stop import AfterStop
 from ident_service.motion.control import ComputedTorque
 from ident_service.motion.controls import Controls
 from ident_service.motion.course import Course
@@ -25,6 +28,7 @@ from ident_service.motion.deadlines import Deadlines
 from ident_service.motion.faults import FAULTS, LOWER, LOWER_AFTER, SETTLE, Fault, Reaction, Severity
 from ident_service.motion.guard import Guard
 from ident_service.motion.latch import Latch
+from ident_service.motion.lowering import MEANT, Anchor, Lowering
 from ident_service.motion.reference import Setpoint, rest
 from ident_service.motion.sink import Sink
 from ident_service.motion.states import State, States
@@ -34,6 +38,8 @@ KEPT_SAMPLES: Final = 100
 REST_SPEED: Final = 0.05  # of the velocity limit, below which a joint counts as at rest
 REST_CYCLES: Final = 20  # of rest in a row
 HOLD_SPEED: Final = 0.25  # of the velocity limit, above which an arm that is held has come loose
+WAITS: Final = "held until a person confirms, by `ident supported`, that the arm is supported or home"
+LOWERS: Final = "lowered under damped control until it rests"
 
 
 @dataclass
@@ -50,6 +56,7 @@ class Loop:
 
     Attributes:
         ended_by: the fault that stopped the arm under control, if one did.
+        lowered: whether the arm rests without torque, so that it can be taken away.
         last: the latest samples.
         peaks: so far.
     """
@@ -66,7 +73,10 @@ class Loop:
     limits: MotionLimits
     hold_seconds: float
     peaks: Peaks
+    after_stop: AfterStop = AfterStop.BRAKE
+    floor_reached: Callable[[Vector], bool] = lambda position: False
     ended_by: Fault | None = None
+    lowered: bool = False
     last: deque[Sample] = field(default_factory=lambda: deque(maxlen=KEPT_SAMPLES))
 
     def __post_init__(self) -> None:
@@ -74,7 +84,10 @@ class Loop:
         self._rested = 0
         self._needed = np.zeros_like(self.limits.torque)  # beside gravity, to stand: the sum over the cycles of rest
         self._since_ns = 0  # of the hold or the lowering
-        self._lowering = False
+        self._lowering: Lowering | None = None
+        self._anchor: Anchor | None = None  # of an arm that is held for as long as it takes
+        self._waiting = False  # for a person's word
+        self._recorded = False  # all that is recorded of the run
         self._told: set[str] = set()
         self._rest_speed = REST_SPEED * self.limits.velocity
         self._hold_speed = HOLD_SPEED * self.limits.velocity
@@ -106,7 +119,7 @@ class Loop:
         reference = self.course.at(stamp_ns)
         if self.states.state is State.DONE:
             return None
-        free = self._lowering or self.states.state is State.STOPPED
+        free = self._lowering is not None or self.states.state is State.STOPPED
         if free:  # no position is asked for
             reference = rest(self.control.position)
         usable, fault = self.guard.feedback(
@@ -134,10 +147,12 @@ class Loop:
         elapsed = self.deadlines.elapsed
         if not free:
             return self.control.torque(sample.position, usable, reference, elapsed)
-        if not self._lowering:
-            return self.control.damping(sample.position, usable, added=self._needed / REST_CYCLES, elapsed=elapsed)
-        left = 1.0 - ((sample.stamp_ns - self._since_ns) * 1e-9 - LOWER_AFTER) / LOWER
-        return self.control.damping(sample.position, usable, min(max(left, 0.0), 1.0), elapsed=elapsed)
+        needed, lowering = self._needed / REST_CYCLES, self._lowering
+        if lowering is None:
+            back = self._anchor.back(self.control.position) if self._anchor is not None else 0.0
+            return self.control.damping(sample.position, usable, added=needed, elapsed=elapsed, back=back)
+        share, beyond = lowering.share, lowering.beyond(self.control.position)
+        return self.control.damping(sample.position, usable, share, share * needed, elapsed, beyond)
 
     def _react(self, fault: Fault, stamp_ns: int) -> None:
         """Do what the table says, unless something as severe is being done already.
@@ -150,7 +165,7 @@ class Loop:
                 self._told.add(fault.code)
                 self.tell(fault.severity, stamp_ns, f"{fault.code}: {fault.message}")
             return
-        if fault.reaction <= self._level:
+        if fault.reaction <= self._level or (self._lowering is not None and fault.code in MEANT):
             return
         self._level = fault.reaction
         if fault.reaction >= Reaction.QUICK_STOP:
@@ -160,7 +175,12 @@ class Loop:
         self.course.stop(stamp_ns)
         self.tell(fault.severity, stamp_ns, f"{fault.code}: {fault.message}")
         if fault.reaction is Reaction.DAMPED_LOWERING:
-            self._lowering, self._since_ns = True, stamp_ns
+            self._needed = np.zeros_like(self._needed)
+            self._lower(stamp_ns, LOWER_AFTER)
+
+    def _lower(self, stamp_ns: int, after: float = 0.0) -> None:
+        """Begin to lower the arm."""
+        self._lowering, self._since_ns = Lowering(self.limits, stamp_ns, after), stamp_ns
 
     def _rests(self, stamp_ns: int) -> bool:
         """See to the ends of stops, pauses, holds and lowerings; whether this was the last cycle.
@@ -169,14 +189,12 @@ class Loop:
             ArmFault: lowered; not at rest in time; or at rest no more.
         """
         state, since = self.states.state, (stamp_ns - self._since_ns) * 1e-9
-        if self._lowering:
-            if since < LOWER_AFTER + LOWER or self.ended_by is None:
-                return False
-            raise self._end(self.ended_by)
+        if self._lowering is not None:
+            return self._is_lowered(self._lowering, stamp_ns, since)
         if state is State.STOPPED:
             if (np.abs(self.control.velocity) > self._hold_speed).any():
                 raise self._end(self._named("hold_lost", "moves at {} while it is held"))
-            return since >= self.hold_seconds
+            return self._held(stamp_ns, since)
         if state not in (State.STOPPING, State.PAUSING):
             return False
         overdue = self.course.overdue(stamp_ns)
@@ -192,10 +210,55 @@ class Loop:
                 return False
             self.states.enter(State.STOPPED)
             self._since_ns = stamp_ns
-            return self.hold_seconds <= 0.0
+            return self._held(stamp_ns, 0.0)
         if overdue > SETTLE:
             raise self._end(self._named("not_at_rest", f"moves at {{}} {SETTLE:g} s after it was to rest"))
         return False
+
+    def _held(self, stamp_ns: int, since: float) -> bool:
+        """See to the end of a hold, which for an arm without brakes is the beginning of its lowering."""
+        if self.after_stop is AfterStop.BRAKE:
+            return since >= self.hold_seconds
+        if self.after_stop is AfterStop.LOWER:
+            if since >= self.hold_seconds:
+                self.tell(Severity.WARNING, stamp_ns, LOWERS)
+                self._lower(stamp_ns)
+            return False
+        if not self._waiting:
+            self._waiting, self._anchor = True, Anchor(self.limits, self.control.position)
+            self._asked_controls(self.controls.wait_for_support, stamp_ns)
+            self.tell(Severity.WARNING, stamp_ns, WAITS)
+        elif self._asked_controls(lambda: self.controls.supported, stamp_ns):
+            self.tell(Severity.WARNING, stamp_ns, LOWERS)
+            self._lower(stamp_ns)
+        return False
+
+    def _asked_controls(self, ask: Callable[[], object], stamp_ns: int) -> bool:
+        """Ask the controls about a held arm, which must not fall because they fail."""
+        try:
+            return bool(ask())
+        except Exception as error:  # noqa: BLE001 - whatever they died of
+            what = f"reading the controls failed ({error!r})"
+            self._react(self.guard.findings.found("controls_failed", what), stamp_ns)
+            return False
+
+    def _is_lowered(self, lowering: Lowering, stamp_ns: int, since: float) -> bool:
+        """Go on lowering; whether the arm rests or is at its floor.
+
+        Raises:
+            ArmFault: the arm was lowered because of a fault.
+        """
+        self.lowered = lowering.update(stamp_ns, self.control.position, self.control.velocity) or (
+            lowering.share < 1.0 and self.floor_reached(self.control.position)
+        )
+        braked = self.after_stop is AfterStop.BRAKE and since >= LOWER_AFTER + LOWER
+        if not self.lowered and not braked:
+            return False
+        if self.states.state is State.STOPPED:
+            return True
+        if self.ended_by is None:
+            raise AssertionError("an arm that was not stopped is lowered because of a fault only")
+        raise self._end(self.ended_by)
 
     def _forget_rest(self) -> None:
         self._rested, self._needed = 0, np.zeros_like(self._needed)
@@ -239,6 +302,11 @@ class Loop:
             self._react(self.guard.findings.found("lease_lost", "the lease has ended"), stamp_ns)
 
     def _record(self, sample: Sample, reference: Setpoint, compute_ns: int) -> Fault | None:
+        if self.states.state is State.STOPPED and self.after_stop is not AfterStop.BRAKE:
+            # Nobody identifies from it, and a person may let an arm wait for hours.
+            self._recorded = self._recorded or (sample.stamp_ns - self._since_ns) * 1e-9 > self.hold_seconds
+        if self._recorded:
+            return None
         try:
             kept = self.sink.put(
                 Cycle(
@@ -254,6 +322,7 @@ class Loop:
                     sample.valid,
                     sample.age,
                     sample.lost,
+                    sample.measured_torque,
                 )
             )
             why = "" if kept else self.sink.error or "the recorder cannot keep up"

@@ -34,6 +34,7 @@ from ident_service.motion.fault_file import CONTROLS, FaultFile
 from ident_service.motion.histogram import Histogram
 from ident_service.motion.latch import Latch
 from ident_service.motion.lifeline import Lifeline
+from ident_service.motion.loop import LOWERS, WAITS
 from ident_service.motion.plans import Destination, Excite, GoTo, Plan
 from ident_service.motion.preflight.ticket import subject_of, ticket_from_json
 from ident_service.motion.realtime import ask
@@ -70,9 +71,11 @@ class TimedSink:
         return self._sink.put(cycle)
 
     def event(self, stamp_ns: int, level: int, message: str) -> bool:
-        """Record one line of the story; a state is told to the parent too."""
+        """Record one line of the story; a state, and what is done with a held arm, is told to the parent too."""
         if message in _STATES:
             say({"state": message})
+        elif message in (WAITS, LOWERS):
+            say({"held": message})
         return self._sink.event(stamp_ns, level, message)
 
 

@@ -6,6 +6,7 @@ control like one that is slow. The stop path is `_halt`: torque away, no conditi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -18,6 +19,7 @@ from ident_service.excitation.excitation import Excitation
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.contact import Contact
 from ident_service.model.rigid_body import InverseDynamics
+from ident_service.motion.after_stop import after_stop
 from ident_service.motion.attended import attended
 from ident_service.motion.control import ComputedTorque
 from ident_service.motion.controls import Controls, StopWhen
@@ -27,6 +29,7 @@ from ident_service.motion.faults import FAULTS, HOLD
 from ident_service.motion.guard import Guard
 from ident_service.motion.latch import Latch
 from ident_service.motion.loop import REST_CYCLES, REST_SPEED, Loop, Peaks
+from ident_service.motion.lowering import lowest_point
 from ident_service.motion.owed import owed_ways
 from ident_service.motion.plans import Excite, Plan
 from ident_service.motion.reference import rest
@@ -83,7 +86,7 @@ def run(
         speed: share of the motion's own speed at which all of it is played, approach, return and ways out of pauses
             too; a rehearsal takes 0.2. Stops are never slowed.
         latch: the arm's faults, which outlive the run; a new one when None.
-        hold_seconds: for which a stopped arm is held before the drives brake it by themselves [s].
+        hold_seconds: for which a stopped arm is held before the drives brake it by themselves, or it is lowered [s].
 
     Returns:
         The report of a run that ended in DONE or, after a request, in STOPPED.
@@ -153,9 +156,9 @@ class _Run:
             self.states.enter(State.ARMED)
             self.states.enter(loop.course.first)
             loop.run(torque)
-            # Done, the arm stands where it stood supported; stopped, it may not, and the drives brake it.
+            # Done, the arm stands where it stood supported; lowered, it rests; stopped, it may not: drives brake it.
             done = self.states.state is State.DONE
-            self.arm.stop(StopKind.TORQUE_OFF if done else StopKind.QUICK_STOP)
+            self.arm.stop(StopKind.TORQUE_OFF if done or loop.lowered else StopKind.QUICK_STOP)
             if loop.course.complete and loop.ended_by is None and not done:
                 self.states.enter(State.DONE)
         except BaseException as error:
@@ -183,6 +186,7 @@ class _Run:
         limits = motion_limits(model.config)
         if model.prior is None:
             raise MotionRefused(f"{model.config.name}: computed torque needs prior parameters")
+        self.after_stop = after_stop(model, limits)
         described = arm.describe()
         if described.joint_names != chain.names:
             raise MotionRefused(
@@ -245,8 +249,18 @@ class _Run:
             limits,
             self.hold_seconds,
             Peaks(np.zeros_like(home), np.zeros_like(home)),
+            self.after_stop,
+            self._at_floor(),
         )
         return loop, torque
+
+    def _at_floor(self) -> Callable[[Vector], bool]:
+        """Whether the lowest point of the arm is at the floor of its description."""
+        floor = self.model.config.control.floor
+        if floor is None:
+            return lambda position: False
+        height = lowest_point(self.model)
+        return lambda position: height(position) <= floor
 
     def _look(self, limits: MotionLimits, period: float) -> Sample:
         """Samples without torque: the arm must be at rest."""
@@ -270,7 +284,7 @@ class _Run:
         # A code that the table lacks must not keep the torque on.
         rule = FAULTS.get(code, FAULTS["program"])
         try:
-            self.arm.stop(rule.reaction.stop_kind)
+            self.arm.stop(StopKind.TORQUE_OFF if loop.lowered else rule.reaction.stop_kind)
         except Exception as second:  # noqa: BLE001 - a driver that breaks its promise must not hide why it was stopped
             error.add_note(f"and taking the torque away failed: {second}")
         cause = str(error) or type(error).__name__

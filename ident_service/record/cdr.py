@@ -97,6 +97,28 @@ class JointStateEncoder:
         # Behind 8-byte values a count needs four bytes more to the next ones; behind an empty sequence's count, none.
         self._count = struct.pack("<I", self._joints)
         self._count_aligned = struct.pack("<I4x", self._joints)
+        effort = CdrBuilder()
+        effort.stamp(0)
+        effort.string("")
+        effort.uint32(self._joints)
+        for name in joint_names:
+            effort.string(name)
+        for count in (0, 0, self._joints):
+            effort.uint32(count)
+        effort.align(8)
+        self._until_effort = effort.body()[_STAMP.size :]
+
+    def encode_effort(self, utc_ns: int, effort: ArrayLike) -> bytes:
+        """One message without position and velocity.
+
+        Args:
+            utc_ns: stamp [ns since 1970].
+            effort: [N m or N], shape (joints,).
+
+        Raises:
+            ValueError: an array of another shape.
+        """
+        return b"".join((ENCAPSULATION, stamp_bytes(utc_ns), self._until_effort, self._floats(effort)))
 
     def encode(self, utc_ns: int, position: ArrayLike, velocity: ArrayLike | None, effort: ArrayLike | None) -> bytes:
         """One message.

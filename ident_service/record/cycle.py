@@ -29,6 +29,8 @@ class Cycle(NamedTuple):
         valid: which axes answered, shape (joints,).
         age: cycles since each answered, shape (joints,).
         lost: frames lost so far.
+        measured_torque: by the drives, told with the positions: what acted until this stamp [N m or N], shape
+            (joints,), NaN where none was told; None where drives do not measure it.
     """
 
     stamp_ns: int
@@ -43,3 +45,4 @@ class Cycle(NamedTuple):
     valid: NDArray[np.bool_]
     age: NDArray[np.int64]
     lost: int
+    measured_torque: Vector | None = None

@@ -21,7 +21,7 @@ from ident_service.record.extras import Extras, read_extras
 from ident_service.record.files import require_file, sha256
 from ident_service.record.joint_state import JointStateDecoder, Layout, PayloadError
 from ident_service.record.messages import JOINT_STATE
-from ident_service.record.recording import BLOCK_SAMPLES, Block
+from ident_service.record.recording import BLOCK_SAMPLES, Block, Matrix, Stamps
 from ident_service.record.writer import METADATA_NAME
 
 # 292 years: what is beyond cannot be a log time, and would not fit an int64.
@@ -114,6 +114,39 @@ class McapRecording:
         with self._open() as stream:
             return read_extras(self.path, stream, self._size, self._offset_ns)
 
+    def measured(self, topic: str) -> tuple[Stamps, Matrix]:
+        """Read the torques that drives measured.
+
+        Args:
+            topic: with sensor_msgs/msg/JointState that have effort only.
+
+        Returns:
+            Stamps on the recording's time axis [ns], shape (messages,), and torques in the order of the joints [N m or
+            N], NaN where none was told, shape (messages, joints); nothing where the topic has no messages.
+
+        Raises:
+            RecordingError: messages that are no such joint states, or of other joints.
+        """
+        payloads = [payload for _, payload in self._payloads(topic=topic)]
+        if not payloads:
+            return np.zeros(0, np.int64), np.zeros((0, self.joints))
+        try:
+            return self._efforts(payloads)
+        except (PayloadError, ValueError) as error:
+            raise RecordingError(self.path, f"{topic}: {error}") from None
+
+    def _efforts(self, payloads: list[bytes]) -> tuple[Stamps, Matrix]:
+        layout = Layout.parse(payloads[0])
+        if layout.effort is None or set(self.joint_names) - set(layout.names):
+            raise PayloadError(f"has no effort of {', '.join(self.joint_names)}")
+        rows = np.frombuffer(b"".join(payloads), np.uint8).reshape(len(payloads), len(payloads[0]))
+        if not layout.matches(rows).all():
+            raise PayloadError("the joint names change from message to message")
+        order = np.array([layout.names.index(name) for name in self.joint_names], np.intp)
+        seconds, nanoseconds = np.ascontiguousarray(rows[:, 4:12]).view("<u4").T
+        stamps = seconds.view(np.int32).astype(np.int64) * 1_000_000_000 + nanoseconds - self._offset_ns
+        return stamps, layout.columns(rows, layout.effort, order)
+
     def _pieces(self, samples: int) -> Iterator[Block]:
         payloads: list[bytes] = []
         log_times: list[int] = []
@@ -138,16 +171,18 @@ class McapRecording:
             ) from error
         return Block(block.stamp_ns - self._offset_ns, block.position, block.torque, block.velocity)
 
-    def _payloads(self, directory: mcap.Directory | None = None) -> Iterator[tuple[int, bytes]]:
-        """Log time [ns] and payload of each message on the topic, up to the tear."""
-        directory = directory or mcap.Directory()
+    def _payloads(
+        self, directory: mcap.Directory | None = None, topic: str | None = None
+    ) -> Iterator[tuple[int, bytes]]:
+        """Log time [ns] and payload of each message on a topic, that of the states if None, up to the tear."""
+        directory, topic = directory or mcap.Directory(), topic or self._topic
         chosen: dict[int, bool] = {}
         try:
             with self._open() as stream:
                 for run in mcap.contents(stream, self._size):
                     for channel_id, log_time, payload in mcap.messages(run, directory):
                         if (wanted := chosen.get(channel_id)) is None:
-                            wanted = chosen[channel_id] = self._is_chosen(channel_id, directory)
+                            wanted = chosen[channel_id] = self._is_chosen(channel_id, directory, topic)
                         if wanted:
                             yield log_time, payload
         except mcap.TornError as error:
@@ -155,15 +190,15 @@ class McapRecording:
         except (mcap.TooLargeError, OSError) as error:
             raise RecordingError(self.path, str(error)) from error
 
-    def _is_chosen(self, channel_id: int, directory: mcap.Directory) -> bool:
+    def _is_chosen(self, channel_id: int, directory: mcap.Directory, topic: str) -> bool:
         channel = directory.channels.get(channel_id)
         if channel is None:
             raise mcap.TornError("a message of a channel that was never announced")
-        if channel.topic != self._topic:
+        if channel.topic != topic:
             return False
         if (schema := directory.schema_of(channel)) != JOINT_STATE or channel.message_encoding != "cdr":
             raise RecordingError(
-                self.path, f"{self._topic} carries {schema} as {channel.message_encoding}, not {JOINT_STATE} as cdr"
+                self.path, f"{topic} carries {schema} as {channel.message_encoding}, not {JOINT_STATE} as cdr"
             )
         return True
 

@@ -70,6 +70,7 @@ DEFINITIONS: Final[dict[str, bytes]] = {
 TOPICS: Final[dict[str, str]] = {
     "/joint_states": JOINT_STATE,
     "/joint_commands": JOINT_STATE,
+    "/joint_torques": JOINT_STATE,
     "/cycle": CYCLE,
     "/events": LOG,
     "/robot_description": STRING,

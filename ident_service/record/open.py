@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 from ident_service.config.recording import RecordingFormat, Transmission
 from ident_service.errors import RecordingError, UsageError
@@ -12,6 +12,7 @@ from ident_service.record.csv_file import GZIP_MAGIC, CsvRecording
 from ident_service.record.files import require_file
 from ident_service.record.mcap_file import McapRecording
 from ident_service.record.mcap_records import MAGIC
+from ident_service.record.measured import ENOUGH, MeasuredRecording
 from ident_service.record.recording import Recording
 from ident_service.record.transmission import JointSideRecording
 
@@ -24,6 +25,7 @@ def open_recording(
     *,
     fmt: RecordingFormat = PLAIN,
     transmission: Transmission | None = None,
+    torque: Literal["measured", "commanded"] | None = "commanded",
 ) -> Recording:
     """Open an MCAP or CSV recording for reading; its blocks are on the joint side.
 
@@ -35,13 +37,15 @@ def open_recording(
         joints: the arm's joints. An MCAP file's columns come in this order; a CSV file must have as many.
         fmt: how the file is to be read.
         transmission: the arm's gears, needed for a file that was recorded on the motor side.
+        torque: of a recording of ours, the one that drives were told, the one that they measured, or the latter where
+            nearly every sample has it (None); files of others have one torque.
 
     Returns:
         The recording; its file is read when its blocks are.
 
     Raises:
         UsageError: no such file; motor side, but no transmission.
-        RecordingError: neither MCAP nor CSV, or not of these joints.
+        RecordingError: neither MCAP nor CSV, not of these joints, or without the torque that is asked for.
     """
     path = Path(path)
     require_file(path)
@@ -56,7 +60,7 @@ def open_recording(
     if start.startswith(MAGIC):
         recording = McapRecording(path, order=joints, bag=fmt)
         if recording.own:
-            return recording
+            return _with_torque(recording, torque)
     elif not start.startswith(GZIP_MAGIC) and b"\x00" in start:
         raise RecordingError(path, "is neither MCAP nor CSV (plain or gzip)")
     else:
@@ -68,3 +72,19 @@ def open_recording(
         raise UsageError(f"{path}: recorded on the motor side, but no transmission leads from there to the joints")
     positions, torques = fmt.motor_sides
     return JointSideRecording(recording, transmission, positions=positions, torques=torques)
+
+
+def _with_torque(recording: McapRecording, torque: Literal["measured", "commanded"] | None) -> Recording:
+    """A recording of ours with the torque that is asked for."""
+    if torque == "commanded":
+        return recording
+    measured = MeasuredRecording(recording)
+    if measured.share >= ENOUGH:
+        return measured
+    if torque == "measured":
+        raise RecordingError(
+            recording.path,
+            f"drives measured their torque in {100.0 * measured.share:.0f} % of the samples; let them tell it with "
+            "their positions (driver.measured_torque: cyclic), or set identification.torque to commanded",
+        )
+    return recording

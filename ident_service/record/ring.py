@@ -75,10 +75,12 @@ class RingWriter:
         self._words[at.WRITER_PID] = os.getpid()
         # A record is put together here, so that it stands in shared memory half done for one copy only.
         self._stage = bytearray(self.memory.slot_bytes - 8)
-        vectors = np.frombuffer(self._stage, np.float64, 5 * joints, slot.AT_VECTORS).reshape(5, joints)
-        self._position, self._velocity, self._torque, self._q_reference, self._dq_reference = vectors
-        self._age = np.frombuffer(self._stage, np.int64, joints, slot.AT_VECTORS + 40 * joints)
-        self._valid = np.frombuffer(self._stage, np.bool_, joints, slot.AT_VECTORS + 48 * joints)
+        vectors = np.frombuffer(self._stage, np.float64, slot.VECTORS * joints, slot.AT_VECTORS)
+        vectors = vectors.reshape(slot.VECTORS, joints)
+        self._position, self._velocity, self._torque, self._q_reference, self._dq_reference, self._measured = vectors
+        behind = slot.AT_VECTORS + 8 * slot.VECTORS * joints
+        self._age = np.frombuffer(self._stage, np.int64, joints, behind)
+        self._valid = np.frombuffer(self._stage, np.bool_, joints, behind + 8 * joints)
         self._shape = (joints,)
         self._cycle_bytes = slot.cycle_bytes(joints)
         whole = memoryview(self._stage)
@@ -93,19 +95,21 @@ class RingWriter:
             struct.error: an integer beyond 64 bits.
         """
         stamp_ns, position, velocity, torque, reference_position, reference_velocity = cycle[:6]
-        number, lateness_ns, compute_ns, valid, age, lost = cycle[6:]
+        number, lateness_ns, compute_ns, valid, age, lost, measured = cycle[6:]
         if not (
             self._shape == position.shape == torque.shape == reference_position.shape == reference_velocity.shape
             and self._shape == valid.shape == age.shape
             and (velocity is None or velocity.shape == self._shape)
+            and (measured is None or measured.shape == self._shape)
         ):
-            given = (position, velocity, torque, reference_position, reference_velocity, valid, age)
+            given = (position, velocity, torque, reference_position, reference_velocity, valid, age, measured)
             shapes = ", ".join(str(array.shape) for array in given if array is not None)
             raise ValueError(f"arrays of shapes {shapes} but the ring has {self._shape[0]} joints")
         self._position[:] = position
         if velocity is not None:
             self._velocity[:] = velocity
         self._torque[:] = torque
+        self._measured[:] = np.nan if measured is None else measured
         self._q_reference[:] = reference_position
         self._dq_reference[:] = reference_velocity
         self._valid[:] = valid

@@ -11,7 +11,7 @@ offset bytes     what
 28     4         level of an event
 32     8         stamp [ns]
 40     4 x 8     a cycle's: number, lateness [ns], compute time [ns], frames lost
-72     5 x 8 J   position, velocity, torque, reference position, reference velocity
+72     6 x 8 J   position, velocity, torque, reference position, reference velocity, measured torque (NaN: none)
 ...    8 J       age
 ...    J         valid
 40     ...       an event's: message in UTF-8
@@ -43,6 +43,7 @@ TIMING: Final = struct.Struct("=4q")
 AT_TIMING: Final = BODY + HEAD.size
 AT_VECTORS: Final = AT_TIMING + TIMING.size
 AT_MESSAGE: Final = AT_TIMING
+VECTORS: Final = 6
 
 _LEAST_BYTES: Final = 512  # room for a sentence even where an arm has one joint
 _CUT: Final = b" [cut]"
@@ -61,7 +62,7 @@ Record = Cycle | EventRecord
 
 def cycle_bytes(joints: int) -> int:
     """Bytes of a cycle's content behind the checksum."""
-    return AT_VECTORS - BODY + 6 * 8 * joints + joints
+    return AT_VECTORS - BODY + 8 * (VECTORS + 1) * joints + joints
 
 
 def slot_bytes(joints: int) -> int:
@@ -90,11 +91,12 @@ def decode(content: bytes, number: int, joints: int) -> Record | None:
     if kind not in (CYCLE, CYCLE_WITH_VELOCITY) or length != cycle_bytes(joints):
         return None
     cycle, lateness_ns, compute_ns, lost = TIMING.unpack_from(content, AT_TIMING)
-    vectors = np.frombuffer(content, np.float64, 5 * joints, AT_VECTORS).reshape(5, joints)
-    age = np.frombuffer(content, np.int64, joints, AT_VECTORS + 40 * joints)
-    valid = np.frombuffer(content, np.bool_, joints, AT_VECTORS + 48 * joints)
+    vectors = np.frombuffer(content, np.float64, VECTORS * joints, AT_VECTORS).reshape(VECTORS, joints)
+    age = np.frombuffer(content, np.int64, joints, AT_VECTORS + 8 * VECTORS * joints)
+    valid = np.frombuffer(content, np.bool_, joints, AT_VECTORS + 8 * (VECTORS + 1) * joints)
     velocity = vectors[1] if kind == CYCLE_WITH_VELOCITY else None
     return Cycle(
         *(stamp_ns, vectors[0], velocity, vectors[2], vectors[3], vectors[4]),
         *(cycle, lateness_ns, compute_ns, valid, age, lost),
+        None if np.isnan(vectors[5]).all() else vectors[5],
     )

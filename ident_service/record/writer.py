@@ -149,7 +149,7 @@ class RecordingWriter:
             error.add_note(f"the recording could not be finished either: {second}")
 
     def sample(self, cycle: Cycle) -> None:
-        """Write one cycle to `/joint_states`, `/joint_commands` and `/cycle`.
+        """Write one cycle to `/joint_states`, `/joint_commands`, `/cycle` and, where drives measure, `/joint_torques`.
 
         Raises:
             RecordingError: the file cannot be written.
@@ -161,11 +161,10 @@ class RecordingWriter:
         timing = self._cycles.encode(
             utc_ns, cycle.cycle, cycle.lateness_ns, cycle.compute_ns, cycle.valid, cycle.age, cycle.lost
         )
-        self._add(
-            cycle.stamp_ns,
-            (("/joint_states", state), ("/joint_commands", command), ("/cycle", timing)),
-            sequence=cycle.cycle,
-        )
+        messages = [("/joint_states", state), ("/joint_commands", command), ("/cycle", timing)]
+        if cycle.measured_torque is not None:
+            messages.append(("/joint_torques", self._states.encode_effort(utc_ns, cycle.measured_torque)))
+        self._add(cycle.stamp_ns, messages, sequence=cycle.cycle)
 
     def event(self, stamp_ns: int, level: int, message: str) -> None:
         """Write one line to `/events`; `level` is 10 (debug), 20 (info), 30 (warning), 40 (error) or 50 (fatal)."""

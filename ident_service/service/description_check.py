@@ -14,6 +14,7 @@ from ident_service.config.limits import motion_limits
 from ident_service.config.load import load_arm
 from ident_service.errors import MotionRefused
 from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.motion.after_stop import AfterStop, after_stop
 from ident_service.motion.preflight.stability import StabilityReport, delay_of, stability
 from ident_service.service.bus import bus_lines, require_budget
 
@@ -26,16 +27,18 @@ class CheckedDescription:
         model: of its arm.
         budget: of its buses; None for an arm without CANopen drives.
         gains: how stable they are; None for an arm that can be identified but not moved.
+        after_stop: what follows a stop, or why nothing may move; None likewise.
     """
 
     model: ArmModel
     budget: Budget | None
     gains: StabilityReport | None
+    after_stop: AfterStop | str | None
 
     @property
     def good(self) -> bool:
         """Whether nothing is objected to."""
-        return self.gains is None or self.gains.stable
+        return (self.gains is None or self.gains.stable) and not isinstance(self.after_stop, str)
 
 
 def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescription:
@@ -54,8 +57,12 @@ def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescri
     try:
         limits = motion_limits(model.config)
     except MotionRefused:  # an arm that is only identified needs none
-        return CheckedDescription(model, budget, None)
-    return CheckedDescription(model, budget, stability(model, limits, delay_of(model.config)))
+        return CheckedDescription(model, budget, None, None)
+    try:
+        follows: AfterStop | str | None = None if model.prior is None else after_stop(model, limits)
+    except MotionRefused as refusal:
+        follows = str(refusal)
+    return CheckedDescription(model, budget, stability(model, limits, delay_of(model.config)), follows)
 
 
 def description_document(checked: CheckedDescription) -> dict[str, Any]:
@@ -67,6 +74,8 @@ def description_document(checked: CheckedDescription) -> dict[str, Any]:
         "sha256": config.sha256,
         "problems": [],
         "stability": None if report is None or gains is None else asdict(report) | gains,
+        "after_stop": checked.after_stop.value if isinstance(checked.after_stop, AfterStop) else None,
+        "objection": checked.after_stop if isinstance(checked.after_stop, str) else None,
     }
 
 
@@ -79,7 +88,19 @@ def description_text(arm: str, checked: CheckedDescription) -> str:
         return (
             head + "gains: not judged; limits or gains are missing, so that this arm can be identified but not moved\n"
         )
-    return head + _gains_text(checked.gains)
+    return head + _after_stop_text(checked.after_stop) + _gains_text(checked.gains)
+
+
+def _after_stop_text(follows: AfterStop | str | None) -> str:
+    """One line, or none for an arm without a model."""
+    words = {
+        AfterStop.BRAKE: "held for two seconds, then left to brakes or to itself; nothing can fall",
+        AfterStop.HOLD: "held until a person confirms that the arm is supported (`ident supported`)",
+        AfterStop.LOWER: "lowered until it rests",
+    }
+    if follows is None:
+        return ""
+    return f"after a stop: {words[follows]}\n" if isinstance(follows, AfterStop) else f"CANNOT MOVE: {follows}\n"
 
 
 def _gains_text(report: StabilityReport) -> str:

@@ -51,7 +51,9 @@ def open_for(path: Path, model: ArmModel, form: RecordingFormat | None = None) -
     file, seconds = file_and_range(path)
     form, gears = form or model.config.recording, model.config.transmission
     # Quality, friction, equations and evidence each read it.
-    recording: Recording = KeptRecording(open_recording(file, model.chain.names, fmt=form, transmission=gears))
+    torque = model.config.identification.torque
+    whole = open_recording(file, model.chain.names, fmt=form, transmission=gears, torque=torque)
+    recording: Recording = KeptRecording(whole)
     if seconds is not None:
         recording = RangeRecording(recording, *seconds, label=path.name.removeprefix(file.name))
     if form.standstill == "cut":

@@ -11,12 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.arm import Arm
+from drivers.arm import Arm, StopKind
 from drivers.status import TRIPPED, AxisStatus
+from ident_service.config.canopen import CanopenDriver
 from ident_service.config.limits import MotionLimits, motion_limits
 from ident_service.config.schema import ArmConfig
-from ident_service.errors import DriverError, MotionRefused, PositionUnknown
-from ident_service.motion.control_file import mover
+from ident_service.errors import DriverError, MotionRefused, PositionUnknown, UsageError
+from ident_service.motion.control_file import ControlFile, mover
 from ident_service.motion.factory import make_arm
 from ident_service.motion.fault_file import Remembered
 from ident_service.motion.loop import REST_SPEED
@@ -27,6 +28,8 @@ from ident_service.service.arm_state import control_path, fault_file
 LOOK = 0.3  # s
 AT_HOME = 0.05  # rad or m
 _SUPPORT = "Support the arm, or see that it rests on something: nothing holds it up now."
+_HELD = "Support the arm, then `ident supported {}`: its drives hold it in quick stop, and let it go by that."
+_SEEN = 20  # cycles in which drives say what they do
 
 
 @dataclass(frozen=True)
@@ -98,10 +101,40 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str 
         unreachable = str(error)
     tripped = {} if seen is None else _tripped(seen)
     out = [] if seen is None else outside(seen.position, limits, seen.joint_names)
-    before = _before(called, faults, seen, unreachable, zero_lost, tripped, refusal, limits)
+    support = _SUPPORT
+    if seen is not None and isinstance(config.driver, CanopenDriver) and any(w & AxisStatus.IDLE for w in seen.status):
+        support = _HELD.format(called)
+    before = _before(called, faults, seen, unreachable, zero_lost, tripped, refusal, limits, support)
     usable = not before
     steps = (*before, _at_last(called, seen, limits, bool(out)))
     return Recovery(config.name, faults, None, seen, unreachable, zero_lost, reset, tripped, tuple(out), steps, usable)
+
+
+def let_go(config: ArmConfig, state: Path, arm: Arm | None = None) -> tuple[str, ...]:
+    """Take the power from drives that hold an arm in quick stop, which a person has said to be supported.
+
+    Args:
+        config: of the arm.
+        state: the state folder.
+        arm: not open; the configured one when None.
+
+    Returns:
+        Names of the axes that were held.
+
+    Raises:
+        UsageError: the drives do not hold it.
+        DriverError: the arm cannot be had, or another process has it.
+    """
+    arm = make_arm(config) if arm is None else arm
+    with ControlFile.take(control_path(state, config.name), None), arm:
+        for _ in range(_SEEN):
+            status = arm.exchange(None).status
+        names = arm.describe().joint_names
+        held = tuple(name for name, word in zip(names, status, strict=True) if word & AxisStatus.IDLE)
+        if not held:
+            raise UsageError(f"{config.name}: nobody moves the arm, and its drives do not hold it")
+        arm.stop(StopKind.TORQUE_OFF)
+    return held
 
 
 def _tripped(seen: Watched) -> dict[str, str]:
@@ -135,6 +168,7 @@ def _before(
     tripped: dict[str, str],
     refusal: str,
     limits: MotionLimits,
+    support: str,
 ) -> list[str]:
     """What must be done before the arm is usable, in order."""
     steps = [f"`ident ack {name} {one.code}`, when you know why it came: {one.cause}." for one in faults]
@@ -143,7 +177,7 @@ def _before(
     if zero_lost:
         steps.append(f"Zero it: {zero_lost}.")
     if seen is None:
-        return [_SUPPORT, *steps, f"`ident recover {name}` again."]
+        return [support, *steps, f"`ident recover {name}` again."]
     silent = [joint for joint, q in zip(seen.joint_names, seen.position, strict=True) if not np.isfinite(q)]
     if silent:
         steps.append(f"Check power and cables of the axes that do not answer: {', '.join(silent)}.")
@@ -162,7 +196,7 @@ def _before(
             )
         except MotionRefused as error:
             steps.append(f"Bring it back by hand: {error}.")
-    return [_SUPPORT, *steps] if steps else steps
+    return [support, *steps] if steps or support is not _SUPPORT else steps
 
 
 def _at_last(name: str, seen: Watched | None, limits: MotionLimits, out: bool) -> str:

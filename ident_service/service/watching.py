@@ -1,7 +1,9 @@
 """The motion process from its parent's side: started, its lease kept, heard until it ends; and what it said at last.
 
 What ends this process closes the pipe, and what makes it hang lets the lease lapse; either stops the arm. An interrupt
-while somebody has the arm ends nothing at once: it asks for a controlled stop, and the end of that is waited for.
+while somebody has the arm ends nothing at once: it asks for a controlled stop, and the end of that is waited for. An
+arm without brakes may then be held until a person confirms that it is supported; whoever holds it is waited for, and
+never killed.
 """
 
 from __future__ import annotations
@@ -146,10 +148,9 @@ def watched(
         except BaseException:
             process.stdin.close()  # nobody asks for this motion any more
             watch.ask_stop()
-            try:
-                process.wait(_LAST_WORDS)
-            except subprocess.TimeoutExpired:
-                process.kill()  # it hangs, and the drives have heard nothing for as long
+            while process.poll() is None and not watch.hear(time.monotonic() + _LAST_WORDS):
+                if not watch.holding:
+                    process.kill()  # it hangs, and the drives have heard nothing for as long
             raise
         finally:
             watch.close()
@@ -158,7 +159,11 @@ def watched(
 
 
 class _Watch:
-    """Hears one motion process."""
+    """Hears one motion process.
+
+    Attributes:
+        holding: whether the arm would fall without it.
+    """
 
     def __init__(
         self,
@@ -174,6 +179,7 @@ class _Watch:
         self._tell, self._stop_requested, self._finish_requested = tell, stop_requested, finish_requested
         self._controls: ControlFile | None = None
         self._asked = self._finishing = False
+        self.holding = False
 
     def hear(self, until: float = float("inf")) -> bool:
         """Hear it, and renew its lease, until it ends or the time has come [s]; whether it ended."""
@@ -204,7 +210,10 @@ class _Watch:
         with _deaf():
             self.ask_stop()
             self._tell(f"interrupted: the arm is being stopped under control; waiting {_LAST_WORDS:g} s at most")
-            return self.hear(time.monotonic() + _LAST_WORDS) and self.ending.heard
+            ended = self.hear(time.monotonic() + _LAST_WORDS)
+            while self.holding and not ended:
+                ended = self.hear(time.monotonic() + _LAST_WORDS)
+            return ended and self.ending.heard
 
     def ask_stop(self) -> None:
         """Ask for a controlled stop, where somebody has the arm."""
@@ -225,6 +234,9 @@ class _Watch:
         self.ending.error = said.get("error", self.ending.error)
         if "state" in said:
             self._tell(said["state"])
+        if "held" in said:
+            self.holding = True
+            self._tell(said["held"])
 
 
 @contextmanager

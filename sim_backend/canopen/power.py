@@ -1,8 +1,9 @@
 """The power drive system's state machine of an emulated drive (CiA 402-2, 6.2): states, commands, transitions.
 
 `TRANSITIONS` is the standard's table, `_LEAVING` says what the motor does when the drive function ends. A quick stop,
-and a fault reaction by ramp, brake with shorted windings for as long as the configured deceleration would take; this
-drive has no other way to slow down.
+and a fault reaction by ramp, brake with shorted windings for as long as the configured deceleration would take, and on
+for up to 0.1 s until the motor is slow; this drive has no other way to slow down. After that, and without power, the
+motor coasts, unless the description says that the drive leaves the windings shorted or that the joint has a brake.
 
 Boundary: states and what the power stage does in them; torque while enabled is `torque.py`.
 """
@@ -17,6 +18,8 @@ from sim_backend.pucks.motor import Motor
 
 _RAMP = "ramp"
 _MS = 1_000_000
+# Share of the speed at which a stop began, and the time within which shorted windings are given to reach it.
+_SLOW, _LONGEST_NS = 0.1, 100 * _MS
 
 
 class PowerState(IntEnum):
@@ -91,6 +94,7 @@ class PowerStage:
         """Before self-test."""
         self._node, self._motor = node, motor
         self._word = 0
+        self._slow, self._ramp_ends_ns = 0.0, 0
         self.state = PowerState.NOT_READY
         self.voltage = True
 
@@ -147,7 +151,8 @@ class PowerStage:
         if self.state in (*_FAULTS, PowerState.NOT_READY):
             return
         if coasting or self._node.objects.number(0x605E) == 0:
-            self._motor.coast(self._node.now_ns)
+            end = self._motor.fail if coasting else self._motor.switch_off
+            end(self._node.now_ns)
             self._node.stop(_RAMP)
             self.state = PowerState.FAULT
         elif self.state in (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE):
@@ -157,10 +162,10 @@ class PowerStage:
             self.state = PowerState.FAULT
 
     def supply(self, on: bool) -> None:
-        """Power comes, or is taken from outside: the relay then shorts the windings."""
+        """Power comes, or is taken from outside."""
         self.voltage = on
         if not on:
-            self._motor.brake(self._node.now_ns)
+            self._motor.switch_off(self._node.now_ns)
             if self.state in POWERED:
                 self._node.stop(_RAMP)
                 faulty = self.state is PowerState.FAULT_REACTION_ACTIVE
@@ -170,9 +175,17 @@ class PowerStage:
         """A timer of this name is due."""
         if name != _RAMP:
             return
+        now = self._node.now_ns
+        if now < self._ramp_ends_ns and abs(self._motor.speed(now)) > self._slow:
+            self._node.after(_RAMP, _MS)
+            return
         if self.state is PowerState.FAULT_REACTION_ACTIVE:
-            self.state = PowerState.FAULT  # 14; the windings stay shorted
-        elif self.state is PowerState.QUICK_STOP_ACTIVE and not self._stays():
+            self._motor.switch_off(self._node.now_ns)
+            self.state = PowerState.FAULT  # 14
+        elif self.state is PowerState.QUICK_STOP_ACTIVE and self._stays():
+            self._motor.hold(self._node.now_ns)
+        elif self.state is PowerState.QUICK_STOP_ACTIVE:
+            self._motor.switch_off(self._node.now_ns)
             self.state = PowerState.SWITCH_ON_DISABLED  # 12
 
     def _stays(self) -> bool:
@@ -185,13 +198,16 @@ class PowerStage:
             if option is not None and self._node.objects.number(option):
                 self._motor.brake(self._node.now_ns)
             else:
-                self._motor.coast(self._node.now_ns)
+                self._motor.switch_off(self._node.now_ns)
         elif self.state is PowerState.QUICK_STOP_ACTIVE and target is PowerState.SWITCH_ON_DISABLED:
-            self._motor.coast(self._node.now_ns)
+            self._motor.switch_off(self._node.now_ns)
         self.state = target
 
     def _brake(self) -> None:
         now = self._node.now_ns
-        counts = abs(self._motor.speed(now)) * self._motor.counts_per_turn / (2.0 * math.pi)
+        speed, per_radian = abs(self._motor.speed(now)), self._motor.counts_per_turn / (2.0 * math.pi)
+        deceleration = self._node.objects.number(0x6085)
+        self._slow = max(_SLOW * speed, 1e-9 * _MS * deceleration / per_radian)
+        self._ramp_ends_ns = now + _LONGEST_NS
         self._motor.brake(now)
-        self._node.after(_RAMP, max(_MS, round(1e9 * counts / self._node.objects.number(0x6085))))
+        self._node.after(_RAMP, max(_MS, round(1e9 * speed * per_radian / deceleration)))

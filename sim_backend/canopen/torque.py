@@ -52,8 +52,10 @@ class TorqueLoop:
         self.limited = demand != asked
         if demand and self._leads_faster(demand, now_ns):
             demand, self.limited, self.follows = 0, True, False
-        values[0x607400] = values[0x607700] = values[0x607800] = demand
-        self._motor.drive(demand * number(0x6076) * 1e-6, now_ns)
+        values[0x607400] = demand
+        fraction = self._motor.defects.torque_fraction
+        values[0x607700] = values[0x607800] = round(fraction * demand)
+        self._motor.drive(fraction * demand * number(0x6076) * 1e-6, now_ns)
 
     def _leads_faster(self, demand: int, now_ns: int) -> bool:
         speed = self._motor.speed(now_ns)

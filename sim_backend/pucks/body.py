@@ -174,7 +174,7 @@ class Body:
             return
         powered = np.array([power is Power.TORQUE for power, _ in outputs], dtype=float)
         self._driven = self.gears.driven(powered)
-        braked = np.array([m.braking if m.power is Power.BRAKE else 0.0 for m in self.motors])
+        braked = np.array([motor.damping for motor in self.motors])
         damping = self.gears.joint_damping(braked)
         self.plant.brake(damping if (damping != np.diag(np.diag(damping))).any() else np.diag(damping).copy())
 

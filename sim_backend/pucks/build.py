@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from ident_service.config.canopen import CanopenDrive, CanopenDriver
 from ident_service.config.schema import ArmConfig
 from ident_service.config.simulation import SimulatedDriver
@@ -19,7 +21,7 @@ from sim_backend.pucks.body import Body
 from sim_backend.pucks.emulator import Emulator
 from sim_backend.pucks.faults import PuckFault, configured
 from sim_backend.pucks.gears import Gears
-from sim_backend.pucks.motor import Motor
+from sim_backend.pucks.motor import Motor, Power
 
 
 def build_emulator(config: ArmConfig, faults: Sequence[PuckFault] = ()) -> Emulator:
@@ -47,12 +49,16 @@ def build_emulator(config: ArmConfig, faults: Sequence[PuckFault] = ()) -> Emula
         truth=emulation.truth,
         torque_noise=emulation.torque_noise,
         braking=emulation.braking,
+        windings_off=emulation.windings_off,
     )
     machine = build_machine(config.model_copy(update={"driver": simulated}))
     names = arm_model(config).chain.names
     gears = Gears(config.transmission, len(names))
     body = Body(machine.plant, gears, machine.imperfections.torque_noise, machine.seed)
     braking = gears.motor_damping(machine.braking).tolist()
+    braked = np.array([joint.brake for joint in config.joints.values()] or [False] * len(names))
+    off = Power.BRAKE if emulation.windings_off == "shorted" else Power.COAST
+    unpowered = [Power.HELD if braked[row != 0.0].any() else off for row in gears.matrix]
     body.motors = tuple(
         Motor(
             body,
@@ -61,6 +67,7 @@ def build_emulator(config: ArmConfig, faults: Sequence[PuckFault] = ()) -> Emula
             scale=drive.torque_scale,
             braking=braking[number],
             relative=driver.zero == "at_home",
+            unpowered=unpowered[number],
         )
         for number, drive in enumerate(driver.drives)
     )

@@ -24,9 +24,12 @@ PUCK_FAULTS: dict[str, FaultRule] = {
     "stuck_torque": FaultRule("the power stage goes on with what it does"),
     "torque_sign": FaultRule("the opposite torque acts, and the drive does not say so", stays=True),
     "torque_saturation": FaultRule("torque held below the limit; the drive says so", "share of the limit", stays=True),
+    "torque_fraction": FaultRule(
+        "this share of what it is told; only the torque that it measures says so", "share of the torque", stays=True
+    ),
     "drive_fault": FaultRule("the power stage fails: emergency message, fault, the motor coasts", stays=True),
-    "node_silent": FaultRule("no frames, and the motor brakes; the node boots when the fault ends", stays=True),
-    "emergency_stop": FaultRule("the motors' power is taken; they brake", of_joint=False, stays=True),
+    "node_silent": FaultRule("no frames, and no power for the motor; the node boots when the fault ends", stays=True),
+    "emergency_stop": FaultRule("the motors' power is taken", of_joint=False, stays=True),
     "load_attached": FaultRule("a point mass on the last link", "mass [kg]", of_joint=False, stays=True),
     "bus_gone": FaultRule("no frame gets through, in either direction", of_joint=False, stays=True),
     # Only drives on a bus can have these.
@@ -155,9 +158,10 @@ def _check_range(fault: PuckFault) -> None:
     if fault.at < 0.0 or (fault.duration is not None and fault.duration <= 0.0):
         raise DriverError(f"{fault.kind}: at must not be negative, and duration must be above 0")
     same = {kind.value for kind in FAULT_RULES}
-    if fault.kind in same and fault.kind not in ("encoder_jump", "encoder_offset") and fault.size < 0.0:
+    one_sided = (fault.kind in same and fault.kind not in ("encoder_jump", "encoder_offset")) or "torque" in fault.kind
+    if one_sided and fault.size < 0.0:
         raise DriverError(f"{fault.kind}: size {fault.size:g} is negative")
-    if fault.kind == "torque_saturation" and fault.size > 1.0:
+    if fault.kind in ("torque_saturation", "torque_fraction") and fault.size > 1.0:
         raise DriverError(f"{fault.kind}: size {fault.size:g} is above 1; it is a share")
     if fault.kind == "emergency" and not (fault.size.is_integer() and 1 <= fault.size <= _LARGEST_CODE):
         raise DriverError(f"emergency: an error code is from 0x0001 to 0xFFFF, not {fault.size:g}")

@@ -152,7 +152,7 @@ class Injection:
             case "reboot", True:
                 return face.reboot(now_ns)
             case "node_silent", True:
-                face.motor.brake(now_ns)
+                face.motor.switch_off(now_ns)
             case "node_silent", False:
                 face.power_up(now_ns)
         return []
@@ -181,4 +181,6 @@ class Injection:
                     found.reversed = not found.reversed
                 case "torque_saturation":
                     found.torque_share = min(found.torque_share, fault.size)
+                case "torque_fraction":
+                    found.torque_fraction = min(found.torque_fraction, fault.size)
         return found

@@ -1,8 +1,8 @@
 """One emulated motor with its encoder and power stage, as the firmware in front of it sees it.
 
 A power stage makes a torque, leaves the windings open (the motor coasts), or shorts them (it brakes, as idle WAM pucks
-do). Boundary: no protocol; the firmware says what the power stage does, `body.py` moves the rotor, and `faults.py`
-sets the defects.
+do). Without power a holding brake, where there is one, has the shaft. Boundary: no protocol; the firmware says what the
+power stage does, `body.py` moves the rotor, and `faults.py` sets the defects.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Protocol
 
 _HISTORY = 4096  # encoder readings kept for an encoder that answers late
 _COUNTS = 1 << 32
+_HOLDING = 1e3  # times the braking of shorted windings: creeps by mrad/s where those let the joint sink by rad/s
 
 
 class Power(Enum):
@@ -23,6 +24,7 @@ class Power(Enum):
     COAST = "coasts"
     BRAKE = "brakes"
     TORQUE = "has torque"
+    HELD = "is held, by its brake or by the drive's own loop"
 
 
 class Rotor(Protocol):
@@ -46,6 +48,7 @@ class Defects:
         reversed: the torque acts the other way round.
         stuck: the power stage goes on doing what it does.
         torque_share: of the largest torque, which is all the power stage can make.
+        torque_fraction: of what it is told, which is what the power stage makes; only what it measures says so.
         frozen: the encoder shows what it showed.
         mirrored: the encoder counts the wrong way.
         shift: counts added to what the encoder shows.
@@ -55,6 +58,7 @@ class Defects:
     reversed: bool = False
     stuck: bool = False
     torque_share: float = 1.0
+    torque_fraction: float = 1.0
     frozen: bool = False
     mirrored: bool = False
     shift: int = 0
@@ -67,12 +71,20 @@ class Motor:
     Attributes:
         power: what the power stage does.
         torque: that acts when `power` is TORQUE, at the motor [N m].
-        braking: with what it brakes when `power` is BRAKE [N m s/rad].
+        braking: with what it brakes when `power` is BRAKE [N m s/rad]; a thousand times that when it is HELD.
         defects: what is wrong with it.
     """
 
     def __init__(
-        self, rotor: Rotor, index: int, *, counts: int, scale: float, braking: float, relative: bool = False
+        self,
+        rotor: Rotor,
+        index: int,
+        *,
+        counts: int,
+        scale: float,
+        braking: float,
+        relative: bool = False,
+        unpowered: Power = Power.COAST,
     ) -> None:
         """Take the place on the arm.
 
@@ -83,26 +95,28 @@ class Motor:
             scale: torque that acts for one that is asked for.
             braking: with shorted windings [N m s/rad].
             relative: whether the encoder counts from where it was when power came, instead of from angle zero.
+            unpowered: what the power stage does when it is off: COAST, BRAKE or HELD.
         """
         self._rotor = rotor
         self._index = index
         self._per_radian = counts / (2.0 * math.pi)
         self._scale = scale
         self._relative = relative
+        self._unpowered = unpowered
         self._origin = 0
         self._shown = 0
         self._history: deque[tuple[int, int]] = deque(maxlen=_HISTORY)
         self.counts_per_turn = counts
         self.braking = braking
-        self.power = Power.BRAKE
+        self.power = unpowered
         self.torque = 0.0
         self.defects = Defects()
 
     def power_up(self, now_ns: int) -> None:
-        """The firmware starts: the windings are shorted, a relative encoder counts from here."""
+        """The firmware starts without power for the motor; a relative encoder counts from here."""
         if self._relative:
             self._origin = round(self._rotor.angle(self._index, now_ns) * self._per_radian)
-        self.brake(now_ns)
+        self.switch_off(now_ns)
 
     def encoder(self, now_ns: int) -> int:
         """What the encoder shows [counts], in 32 bits with sign."""
@@ -126,9 +140,22 @@ class Motor:
         """Make a torque from now on [N m at the motor]."""
         self._do(Power.TORQUE, torque * self._scale, now_ns)
 
-    def coast(self, now_ns: int) -> None:
-        """Open the windings."""
-        self._do(Power.COAST, 0.0, now_ns)
+    @property
+    def damping(self) -> float:
+        """What the shaft is braked with now [N m s/rad]."""
+        return {Power.BRAKE: self.braking, Power.HELD: _HOLDING * self.braking}.get(self.power, 0.0)
+
+    def switch_off(self, now_ns: int) -> None:
+        """Take the power away: windings open or shorted, as this drive leaves them, or the brake closed."""
+        self._do(self._unpowered, 0.0, now_ns)
+
+    def hold(self, now_ns: int) -> None:
+        """Hold the shaft by the drive's own loop, which creeps no more than a closed brake."""
+        self._do(Power.HELD, 0.0, now_ns)
+
+    def fail(self, now_ns: int) -> None:
+        """Open the windings: a power stage that failed does not short them; a brake closes without it."""
+        self._do(Power.HELD if self._unpowered is Power.HELD else Power.COAST, 0.0, now_ns)
 
     def brake(self, now_ns: int) -> None:
         """Short the windings."""

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.emulated_arms import tapped, weightless_config
+from helpers.emulated_arms import Tapped, tapped, weightless_config
 
 from drivers.arm import StopKind
 from drivers.canopen.arm import CanopenArm
 from drivers.canopen.bus_errors import BusError
 from drivers.canopen.frame import Frame
+from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError
 from sim_backend.canopen.drive import CanopenDrive
 from sim_backend.canopen.power import PowerState
 from sim_backend.machine import Truth
+from sim_backend.pucks.faults import parse_fault
 from sim_backend.pucks.lock_step import LockStepArm
+from sim_backend.pucks.motor import Power
 
 PUSH = np.array([5.0, 2.0])
 CYCLES = 50
@@ -139,3 +142,67 @@ def test_drives_that_stay_in_quick_stop_keep_their_watchdogs() -> None:
         arm.enable()
         arm.stop(StopKind.TORQUE_OFF)
     assert [face.objects.number(0x6007) for face in behind.emulator.faces if isinstance(face, CanopenDrive)] == [0, 0]
+
+
+def held(behind: LockStepArm) -> list[PowerState]:
+    return [face.power.state for face in behind.emulator.faces if isinstance(face, CanopenDrive)]
+
+
+def in_quick_stop() -> tuple[ArmConfig, LockStepArm]:
+    """Drives whose host has left them holding the arm."""
+    config = weightless_config(reactions={"quick_stop": 6})
+    behind = LockStepArm(config)
+    with CanopenArm(config, lambda _: [behind.link(0)]) as arm:
+        arm.enable()
+        arm.exchange(PUSH)
+        arm.stop(StopKind.QUICK_STOP)
+    assert held(behind) == [PowerState.QUICK_STOP_ACTIVE] * 2
+    return config, behind
+
+
+def words(tap: Tapped) -> list[int]:
+    return [frame.data[0] for frame in tap.sent if 0x300 < frame.identifier < 0x380]
+
+
+def test_drives_that_hold_the_arm_are_enabled_without_letting_it_go() -> None:
+    config, behind = in_quick_stop()
+    (tap,) = taps = tapped(behind, config)
+    powers = set()
+    with CanopenArm(config, lambda _: taps) as arm:
+        behind.emulator.observer = lambda truth: powers.update(motor.power for motor in behind.emulator.body.motors)
+        arm.enable()
+        assert words(tap) == [0x0F, 0x0F]
+        assert powers == {Power.HELD, Power.TORQUE}
+        np.testing.assert_allclose(arm.exchange(PUSH).torque, PUSH, atol=1e-3)
+        arm.stop(StopKind.QUICK_STOP)
+
+
+def test_who_only_opens_and_closes_leaves_them_holding_it() -> None:
+    config, behind = in_quick_stop()
+    with CanopenArm(config, lambda _: [behind.link(0)]) as arm:
+        for _ in range(5):
+            arm.exchange(None)
+    assert held(behind) == [PowerState.QUICK_STOP_ACTIVE] * 2
+    with CanopenArm(config, lambda _: [behind.link(0)]) as arm:
+        arm.stop(StopKind.TORQUE_OFF)  # a person lets it go
+    assert held(behind) == [PowerState.SWITCH_ON_DISABLED] * 2
+
+
+def test_a_drive_with_a_fault_does_not_make_the_others_let_go() -> None:
+    config, behind = in_quick_stop()
+    behind.inject(parse_fault("drive_fault joint=slide", ("turn", "slide")))
+    with CanopenArm(config, lambda _: [behind.link(0)]) as arm, pytest.raises(DriverError, match="drive 2"):
+        arm.enable()
+    assert held(behind) == [PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT]
+
+
+@pytest.mark.parametrize(("after_stop", "stays"), [("brake", False), ("hold", True), ("lower", True)])
+def test_drives_of_arms_without_brakes_stay_in_quick_stop(after_stop: str, stays: bool) -> None:
+    document = weightless_config().model_dump(mode="json", by_alias=True)
+    document["control"]["after_stop"] = after_stop
+    config = ArmConfig.model_validate(document)
+    behind = LockStepArm(config)
+    with CanopenArm(config, lambda _: [behind.link(0)]) as arm:
+        arm.enable()
+        arm.stop(StopKind.QUICK_STOP)
+    assert held(behind) == [PowerState.QUICK_STOP_ACTIVE if stays else PowerState.SWITCH_ON_DISABLED] * 2

@@ -72,13 +72,15 @@ def test_a_run_ends_early(daemon: Asked, patient: str, state: Path, asked: str) 
 
 
 def test_only_operators_finish_and_nobody_is_reached_where_nothing_moves(daemon: Asked, arm: str, viewer: str) -> None:
-    answer = daemon.post(f"/api/v1/arms/{ARM}/finish")
-    assert (answer.status_code, answer.json()["reached"]) == (200, False)
+    for what in ("finish", "supported"):
+        answer = daemon.post(f"/api/v1/arms/{ARM}/{what}")
+        assert (answer.status_code, answer.json()["reached"]) == (200, False)
     for until in ({"share": 1.0}, {"share": 0}, {"share": 0.1, "parameters": [""]}, {"share": 0.1, "more": 1}):
         body = {"job": {"kind": "run", "arm": ARM, "until": until}}
         assert daemon.post("/api/v1/jobs", body).status_code == 422
     daemon.as_token(viewer)
     assert daemon.post(f"/api/v1/arms/{ARM}/finish").status_code == 403
+    assert daemon.post(f"/api/v1/arms/{ARM}/supported").status_code == 403
 
 
 @pytest.mark.timeout(300)

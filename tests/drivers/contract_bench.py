@@ -70,7 +70,8 @@ def canopen_config(**driver: Any) -> ArmConfig:
         "eds": {"name": "puck.eds", "text": eds},
         "buses": [{"interface": "lock_step", "channel": "bench"}],
         "drives": [drive | {"node": 1, "max_torque": 10.0}, drive | {"node": 2, "max_torque": 5.0}],
-        "emulation": {"truth": bench_config().model_dump(mode="json")["driver"]["truth"]},
+        # An arm that is looked at, or reset, must not be moved by what it falls or slides on by.
+        "emulation": {"truth": bench_config().model_dump(mode="json")["driver"]["truth"], "windings_off": "shorted"},
     }
     content = bench_config().model_dump(mode="json", exclude={"driver"}) | {
         "transmission": {"ratios": [1.0, 1.0], "drive_terms": "joints"},

@@ -146,7 +146,8 @@ def endings(which: Subject, strikes: Callable[[int], Sequence[Fault]], speed: fl
         code = None
         with arm:
             try:
-                run(arm, which.model, which.motion, story, speed=speed, hold_seconds=HOLD)
+                script = Script(arm, which, State.EXCITING, speed)
+                run(arm, which.model, which.motion, story, script, speed=speed, hold_seconds=HOLD)
             except ArmFault as error:
                 code = error.code
         sizes = [np.abs([getattr(moment, name) for moment in truth]).max(axis=0) for name in ("torque", "velocity")]

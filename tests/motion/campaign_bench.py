@@ -189,12 +189,18 @@ class Script(Switches):
         self._arm = arm
         self._pause = round(which.pause / speed) if state in PAUSED else 10**9
         self._stop = round(which.stop / speed) if state in STOPPED else 10**9
+        self._held_since = 10**9
 
     def lease_ok(self, now_ns: int) -> bool:
         cycle = self._arm.cycle - 1
         self.pause = self._pause <= cycle < self._pause + PAUSED_FOR + 200
         self.stop = cycle >= self._stop
+        self.supported = cycle >= self._held_since + HOLD / PERIOD  # counts where the arm waits for it
         return True
+
+    def wait_for_support(self) -> None:
+        super().wait_for_support()
+        self._held_since = self._arm.cycle - 1
 
 
 @dataclass

@@ -12,7 +12,7 @@ from functools import cache
 
 from campaign_bench import READ_WRONGLY, UNTRUE, Promise, Strike, Subject, wam_config
 from helpers.emulated_arms import EDS, Tapped, tapped
-from motion_bench import TRUTH, WatchedArm, bench_config
+from motion_bench import JOINTS, TRUTH, WatchedArm, bench_config
 
 from drivers.arm import Sample
 from drivers.canopen.arm import CanopenArm
@@ -56,6 +56,7 @@ CANOPEN_PROMISES: dict[str, Promise] = {
     "stuck_torque": Promise(_LIES, duration=10**6),
     "torque_sign": Promise(_LIES),
     "torque_saturation": Promise(_LIES, size=0.05),
+    "torque_fraction": Promise(_LIES, size=0.3),
     "drive_fault": Promise({"drive_emergency"}, within=SOON, words=("5400h power section",)),
     "node_silent": Promise({"feedback_gone"}, within=MAX_AGE + 1),
     "emergency_stop": Promise({"drive_emergency"}, within=SOON, words=("3220h under-voltage of the DC link",)),
@@ -144,10 +145,16 @@ class EmulatedArm(WatchedArm):
         self.states = self.behind.emulator.states
 
 
-def bench_canopen_config() -> ArmConfig:
-    """The bench's arm behind two drives with gears of 1; a thousandth is 1 mN m."""
+def bench_canopen_config(*, brakes: bool = True) -> ArmConfig:
+    """The bench's arm behind two drives with gears of 1; a thousandth is 1 mN m.
+
+    Without brakes it is held after a stop, and drives stay in quick stop; without power they leave windings open.
+    """
+    loose = {name: joint | {"brake": False} for name, joint in JOINTS.items()}
     drive = {"counts": 1 << 20, "rated_torque": 1.0, "max_speed": 6000.0}
     return bench_config(
+        joints=JOINTS if brakes else loose,
+        control={} if brakes else {"after_stop": "hold"},
         transmission={"ratios": [1.0, 1.0], "drive_terms": "joints"},
         driver={
             "kind": "canopen",
@@ -171,9 +178,9 @@ def wam_canopen_config(buses: int = 1) -> ArmConfig:
 
 @cache
 def canopen_subject(name: str) -> Subject:
-    """`bench canopen`, `wam canopen`, or `wam two buses`."""
-    if name == "bench canopen":
-        config, pause = bench_canopen_config(), 900
+    """`bench canopen`, `loose canopen`, which has no brakes, `wam canopen`, or `wam two buses`."""
+    if name in ("bench canopen", "loose canopen"):
+        config, pause = bench_canopen_config(brakes=name == "bench canopen"), 900
     else:
         config, pause = wam_canopen_config(2 if name == "wam two buses" else 1), 2600
     model = arm_model(config)

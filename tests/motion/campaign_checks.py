@@ -36,6 +36,7 @@ from ident_service.errors import MotionRefused
 from ident_service.motion.checks import VELOCITY_OFF
 from ident_service.motion.faults import FAULTS, LOWER, LOWER_AFTER, SETTLE, Reaction
 from ident_service.motion.loop import REST_CYCLES
+from ident_service.motion.lowering import RESTING, SPEED
 from ident_service.motion.run import run
 from ident_service.record.cycle import Cycle
 from ident_service.record.open import open_recording
@@ -91,7 +92,7 @@ def is_kept(case: Case, fault: Fault | Strike, outcome: Outcome, path: Path) -> 
     assert outcome.fault.code in promise.codes, outcome.fault
     assert any(words in str(outcome.fault) for words in promise.words or ("",)), outcome.fault
     is_latched(which, outcome)
-    ends_as_the_table_says(outcome)
+    ends_as_the_table_says(which, outcome)
     ends_in_time(which, outcome)
     if promise.within is not None:
         assert found_in(outcome) < fault.at_cycle + promise.within
@@ -142,7 +143,7 @@ def is_latched(which: Subject, outcome: Outcome) -> None:
     assert outcome.latch.faults == ()
 
 
-def ends_as_the_table_says(outcome: Outcome) -> None:
+def ends_as_the_table_says(which: Subject, outcome: Outcome) -> None:
     """The last state, how torque ended, and that none was sent after it had."""
     assert outcome.fault is not None
     reaction = FAULTS[outcome.fault.code].reaction
@@ -151,9 +152,11 @@ def ends_as_the_table_says(outcome: Outcome) -> None:
         assert outcome.story.states[-2:] == ["stopping", "stopped"]
     else:
         assert outcome.story.states[-1] == "faulted"
-    kind = reaction.stop_kind
+    # Without brakes an arm is lowered first, and then needs no torque.
+    lowered = which.config.control.after_stop is not None and reaction <= Reaction.DAMPED_LOWERING
+    kind = StopKind.TORQUE_OFF if lowered else reaction.stop_kind
     assert outcome.arm.stops == [kind]
-    assert kind is (StopKind.TORQUE_OFF if reaction is Reaction.TORQUE_OFF else StopKind.QUICK_STOP)
+    assert lowered or kind is (StopKind.TORQUE_OFF if reaction is Reaction.TORQUE_OFF else StopKind.QUICK_STOP)
     assert len(outcome.arm.torques) == outcome.arm.cycle - LOOKED
 
 
@@ -164,6 +167,9 @@ def ends_in_time(which: Subject, outcome: Outcome) -> None:
     stop = (limits.velocity + 0.5 * limits.acceleration**2 / limits.jerk) / limits.acceleration
     stop = stop + 2.0 * limits.acceleration / limits.jerk
     controlled = float(stop.max()) + SETTLE + REST_CYCLES * PERIOD + HOLD
+    if which.config.control.after_stop is not None:
+        # From one end of a joint's range to the other, and as long again for what the compensation takes to go.
+        controlled += 2.0 * float(((limits.upper - limits.lower) / (SPEED * limits.velocity)).max()) + RESTING
     promised = {Reaction.CONTROLLED_STOP: controlled, Reaction.DAMPED_LOWERING: controlled + LOWER_AFTER + LOWER}
     # Every reaction on the way there may have taken its time.
     reactions = [FAULTS[message.split(":")[0]].reaction for message in outcome.story.errors]

@@ -13,8 +13,9 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-from campaign_bench import Case, Outcome, subject
+from campaign_bench import Case, Outcome, Strike, play, subject, windows
 from campaign_canopen import CANOPEN_PROMISES, WIRE, EmulatedArm
 from campaign_checks import keep_their_promises, keeps_its_promise, together
 from test_fault_campaign import STATES
@@ -25,7 +26,7 @@ from sim_backend.pucks.faults import PUCK_FAULTS
 from sim_backend.pucks.motor import Power
 
 SEED = 11
-DRIVES = {"bench canopen": 2, "wam canopen": 7, "wam two buses": 7}
+DRIVES = {"bench canopen": 2, "loose canopen": 2, "wam canopen": 7, "wam two buses": 7}
 # At the end of this stop j7 stands still against more than the friction guess, which is taken for a frozen encoder
 # (decision 0008). A stop that a person asks for in the same cycle ends so too.
 REMAINING = {"wam canopen-lost_status-exciting-0.64-None"}
@@ -58,6 +59,38 @@ def two_buses() -> Iterator[Case]:
     return (case for case in cases("wam two buses", 1, 2) if case.kind in kinds | {"foreign_sync", "emergency"})
 
 
+# What ends a motion of an arm without brakes, by who can still hold it: its drives, nobody, or nobody needs to.
+DRIVES_HOLD = ("bus_gone", "lost_torques", "full_queue", "heartbeat_lost", "lost_feedback", "foreign_torque")
+NOBODY_HOLDS = ("drive_fault", "node_silent", "emergency_stop")
+LOWERED = ("lost_status",)
+
+
+def loose() -> Iterator[Case]:
+    """Ends of motions of an arm without brakes, while it moves, stops, and is held."""
+    kinds = (*DRIVES_HOLD, *NOBODY_HOLDS, *LOWERED)
+    states = (State.EXCITING, State.STOPPING, State.STOPPED)
+    return (case for case in cases("loose canopen", 1, 1) if case.kind in kinds and case.state in states)
+
+
+def ends_as_it_can(case: Case, outcome: Outcome) -> None:
+    """Hold the end of an arm without brakes to what `docs/fieldbus.md` says of it."""
+    let_go(case, outcome)
+    arm = outcome.arm
+    assert isinstance(arm, EmulatedArm)
+    motors = arm.behind.emulator.body.motors
+    for number, motor in enumerate(motors):
+        ill = case.kind in NOBODY_HOLDS and case.joint in (None, number)
+        if outcome.fault is None or case.kind in LOWERED or ill:
+            assert motor.power is Power.COAST, case
+        else:
+            assert motor.power in (Power.HELD, Power.BRAKE), case
+    if case.kind in NOBODY_HOLDS or outcome.fault is None or case.kind in LOWERED:
+        return
+    before = arm.behind.emulator.body.plant.position
+    arm.behind.settle(arm.clock.now_ns() + 2_000_000_000)
+    assert np.abs(arm.behind.emulator.body.plant.position - before).max() < 0.1  # a ramp may not be over yet
+
+
 def test_every_kind_of_fault_has_its_promise() -> None:
     assert set(CANOPEN_PROMISES) == set(PUCK_FAULTS) | set(WIRE)
     for promise in CANOPEN_PROMISES.values():
@@ -70,6 +103,30 @@ def test_every_kind_of_fault_has_its_promise() -> None:
 @pytest.mark.parametrize("some", together(sample()))
 def test_a_sample_of_the_campaign(some: list[Case], tmp_path: Path) -> None:
     keep_their_promises(some, tmp_path, let_go)
+
+
+def test_a_drive_that_applies_a_share_of_its_torque_is_named() -> None:
+    begin, _ = windows("bench canopen", State.EXCITING)[State.EXCITING.value]
+    outcome = play(
+        subject("bench canopen"), State.EXCITING, (Strike(begin + 100, "torque_fraction", 0, None, 0.5),), None
+    )
+    assert outcome.fault is not None
+    warned = [words for _, _, words in outcome.story.events if words.startswith("torque_not_applied: shoulder: ")]
+    assert warned
+    assert "more than it was told" in warned[0]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("some", together([case for case in loose() if case.state is not State.STOPPING]))
+def test_ends_of_an_arm_without_brakes(some: list[Case], tmp_path: Path) -> None:
+    keep_their_promises(some, tmp_path, ends_as_it_can)
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("case", [pytest.param(case, id=str(case)) for case in loose()])
+def test_all_ends_of_an_arm_without_brakes(case: Case, tmp_path: Path) -> None:
+    ends_as_it_can(case, keeps_its_promise(case, tmp_path))
 
 
 def campaign() -> list[Any]:

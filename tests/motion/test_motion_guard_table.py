@@ -58,6 +58,12 @@ def torque_not_applied(joint: int) -> Fault | None:
     return bench.see(HOME, torque=-1.01 * NOT_APPLIED * LIMITS.torque * unit(joint))[1]
 
 
+def torque_measured_otherwise(joint: int) -> Fault | None:
+    bench = Bench()
+    assert bench.see(HOME, torque_difference=0.99 * NOT_APPLIED * LIMITS.torque)[1] is None
+    return bench.see(HOME, torque_difference=-1.01 * NOT_APPLIED * LIMITS.torque * unit(joint))[1]
+
+
 def encoder_jump(joint: int) -> Fault | None:
     return Bench().see(HOME + 1.01 * WINDOW * unit(joint), HOME)[1]
 
@@ -202,6 +208,7 @@ TRIGGERS: dict[str, Callable[[int], Fault | None]] = {
     )
 }
 OTHER_TRIGGERS = {
+    torque_measured_otherwise: "torque_not_applied",
     stale_from_the_start: "feedback_gone",
     velocity_not_finite: "feedback_not_finite",
     acting_torque_not_finite: "feedback_not_finite",

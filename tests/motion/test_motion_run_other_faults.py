@@ -254,6 +254,6 @@ def test_a_fault_that_the_table_does_not_know_takes_the_torque_away_all_the_same
     latch = Latch()
     arm = SimpleNamespace(stop=stopped.append, clock=SimpleNamespace(now_ns=lambda: 0))
     run_ = SimpleNamespace(arm=arm, latch=latch, states=SimpleNamespace(state=State.FAULTED))
-    _Run._halt(run_, ArmFault("from_a_foreign_driver", "who knows"), SimpleNamespace())  # type: ignore[arg-type]
+    _Run._halt(run_, ArmFault("from_a_foreign_driver", "who knows"), SimpleNamespace(lowered=False))  # type: ignore[arg-type]
     assert len(stopped) == 1
     assert [fault.code for fault in latch.faults] == ["from_a_foreign_driver"]

@@ -189,7 +189,7 @@ def test_strangers_are_led_to_the_way_in(daemon: Asked, commissioned: Path) -> N
 def test_a_viewer_may_do_nothing_with_forms(daemon: Asked, commissioned: Path) -> None:
     enter(daemon, "viewer")
     sent = f"kind=run&run={commissioned.name}&note=n&name={ARM}&code=FOLLOWING_ERROR"
-    motions = ("confirm", "move", "pause", "finish", "reidentify/confirm", "reidentify")
+    motions = ("confirm", "move", "pause", "finish", "supported", "reidentify/confirm", "reidentify")
     names = (*motions, "jobs", "ack", "accept", "rollback", "schedules", "maintenance")
     for name in names:
         answer = daemon.post(f"/arms/{ARM}/{name}", content=sent, headers=FORM)

@@ -22,7 +22,9 @@ GEARS = {"ratios": [20.0, -20.0], "coupling": [[1.0, -0.5], [1.0, 0.5]], "drive_
 HOST = 127
 
 
-def pucks_config(folder: Path, *, name: str = "planar2.yaml", gears: dict | None = None, **driver: object) -> ArmConfig:
+def pucks_config(
+    folder: Path, *, name: str = "planar2.yaml", gears: dict | None = None, brake: bool = False, **driver: object
+) -> ArmConfig:
     """A shipped arm on emulated drives in virtual time; planar2 with a differential unless told otherwise."""
     transmission = GEARS if gears is None else gears
     drives = [
@@ -31,6 +33,8 @@ def pucks_config(folder: Path, *, name: str = "planar2.yaml", gears: dict | None
     ]
     section = {"kind": "canopen", "eds": str(EDS), "buses": [{"interface": "lock_step"}], "drives": drives} | driver
     tree = {"extends": str(CONFIGS / name), "name": "pucks", "transmission": transmission, "driver": section}
+    if name == "planar2.yaml":
+        tree["joints"] = {joint: {"brake": brake} for joint in ("shoulder", "elbow")}
     path = folder / "pucks.yaml"
     path.write_text(yaml.safe_dump(tree), encoding="utf-8")
     return load_arm(path)

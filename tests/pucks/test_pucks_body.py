@@ -133,7 +133,7 @@ def test_braking_takes_the_energy_that_motors_turn_into_heat(tmp_path: Path, bra
         if number in braked:
             motor.brake(200 * MS)
         else:
-            motor.coast(200 * MS)
+            motor.switch_off(200 * MS)
     coefficients = np.array([m.braking if m.power is Power.BRAKE else 0.0 for m in body.motors])
     body.advance(205 * MS)  # the step in which brakes close sees the acceleration before
     for cycle in range(205, 400):

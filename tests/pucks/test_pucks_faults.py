@@ -125,10 +125,10 @@ def test_a_drive_fault_coasts_and_cannot_be_reset_while_it_lasts(enabled: Host) 
             enabled.cycle(0, 0)
 
 
-def test_a_silent_node_brakes_and_boots_again(enabled: Host) -> None:
+def test_a_silent_node_coasts_and_boots_again(enabled: Host) -> None:
     inject(enabled, "node_silent joint=elbow duration=0.02")
     assert set(enabled.cycle(0, 0)) == {1}
-    assert enabled.arm.emulator.body.motors[1].power is Power.BRAKE
+    assert enabled.arm.emulator.body.motors[1].power is Power.COAST
     assert enabled.arm.emulator.states[1] == "dead"
     enabled.heard.clear()
     for _ in range(25):
@@ -141,7 +141,7 @@ def test_emergency_stop_takes_power_until_it_ends(enabled: Host) -> None:
     inject(enabled, "emergency_stop duration=0.02")
     enabled.cycle(0, 0)
     assert [word & 0x7F for word in enabled.statuswords()] == [0x40, 0x40]  # bit 4: no voltage
-    assert [m.power for m in enabled.arm.emulator.body.motors] == [Power.BRAKE] * 2
+    assert [m.power for m in enabled.arm.emulator.body.motors] == [Power.COAST] * 2
     for word in (0x06, 0x07):
         enabled.control(word)
     assert [word & 0x6F for word in enabled.statuswords()] == [0x21, 0x21]

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
-from pucks_bench import MS, Host
+from pucks_bench import MS, Host, pucks_config
 
 from sim_backend.canopen.power import TRANSITIONS, Command, PowerState, command_of
 from sim_backend.pucks.faults import parse_fault
@@ -33,6 +34,9 @@ FIGURE = {
     (0x07, "disable voltage"): 0x40,
     (0x07, "enable"): 0x27,
 }
+
+
+PLAIN = {"ratios": [1.0, 1.0], "drive_terms": "joints"}
 
 
 def word_of(host: Host, node: int = 1) -> int:
@@ -188,18 +192,56 @@ def test_torque_acts_beyond_a_software_limit_which_is_of_the_position_modes(enab
         assert enabled.read(1, 0x6041, 0, "H") & 0x1800 == 0x1000
 
 
-def test_power_states_leave_the_motor_coasting_or_braked(enabled: Host) -> None:
-    motor = enabled.arm.emulator.body.motors[0]
+@pytest.mark.parametrize(
+    ("windings_off", "brake", "power"),
+    [("open", False, Power.COAST), ("shorted", False, Power.BRAKE), ("open", True, Power.HELD)],
+)
+@pytest.mark.parametrize("off", [(0x00,), (0x02,), (0x06,)])
+def test_without_power_the_motor_is_left_as_the_description_says(
+    tmp_path: Path, windings_off: str, brake: bool, power: Power, off: tuple[int, ...]
+) -> None:
+    host = Host.on(pucks_config(tmp_path, brake=brake, emulation={"windings_off": windings_off}))
+    motor = host.arm.emulator.body.motors[0]
+    assert motor.power is power
+    host.configure()
+    host.enable()
+    host.cycle(0, 0)
     assert motor.power is Power.TORQUE
-    enabled.control(0x00)
-    assert motor.power is Power.COAST
-    enabled.send(0x000, b"\x81\x01")
-    assert motor.power is Power.BRAKE
-    assert enabled.arm.emulator.faces[0].power.state is PowerState.NOT_READY
+    for word in off:
+        host.control(word)
+    host.listen(200)  # longer than the ramp of a quick stop
+    assert host.arm.emulator.faces[0].power.state in (PowerState.SWITCH_ON_DISABLED, PowerState.READY_TO_SWITCH_ON)
+    assert motor.power is (Power.BRAKE if off == (0x06,) and host.read(1, 0x605B, 0, "h") else power)
+    host.send(0x000, b"\x81\x01")
+    assert motor.power is power
+    assert host.arm.emulator.faces[0].power.state is PowerState.NOT_READY
 
 
-def test_a_drive_that_nobody_asks_stops_an_arm_by_itself(enabled: Host) -> None:
+# How far the shoulder sinks in 0.6 s after a quick stop from where it lay level [rad].
+@pytest.mark.parametrize(
+    ("windings_off", "brake", "least", "most"),
+    [("open", False, 1.5, 2.5), ("shorted", False, 0.1, 0.8), ("open", True, 0.0, 0.01)],
+)
+def test_how_far_an_arm_falls_after_its_host_has_died(
+    tmp_path: Path, windings_off: str, brake: bool, least: float, most: float
+) -> None:
+    host = Host.on(pucks_config(tmp_path, brake=brake, gears=PLAIN, emulation={"windings_off": windings_off}))
+    host.configure(deadline=10)
+    host.enable()
+    for _ in range(5):
+        host.cycle(22000, 2500)  # about what it weighs, N m in thousandths
+    body = host.arm.emulator.body
+    before = body.plant.position[0]
+    host.arm.settle(host.now + 600 * MS)
+    assert all("switch on disabled" in state for state in host.arm.emulator.states)
+    assert least <= abs(before - body.plant.position[0]) <= most
+
+
+def test_a_drive_that_nobody_asks_stops_an_arm_by_itself(tmp_path: Path) -> None:
     """The host dies: torques stop, and the arm sinks and comes to rest."""
+    enabled = Host.on(pucks_config(tmp_path, emulation={"windings_off": "shorted"}))
+    enabled.configure(deadline=10)
+    enabled.enable()
     for _ in range(200):
         enabled.cycle(300, 100)
     body = enabled.arm.emulator.body

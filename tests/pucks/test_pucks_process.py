@@ -83,7 +83,10 @@ def arm_file(folder: Path, port: int) -> Path:
     path = folder / "pucks.yaml"
     tree = yaml.safe_load(path.read_text(encoding="utf-8"))
     tree["driver"]["buses"] = [multicast(port)]
-    tree["driver"]["emulation"] = {"braking": [4.0, 2.0]}  # it sinks to rest in a few seconds
+    tree["driver"]["emulation"] = {
+        "braking": [4.0, 2.0],
+        "windings_off": "shorted",
+    }  # it sinks to rest in a few seconds
     path.write_text(yaml.safe_dump(tree), encoding="utf-8")
     return path
 

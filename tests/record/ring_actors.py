@@ -35,8 +35,10 @@ def record(n: int, joints: int = 3) -> Record:
     q = np.arange(joints) * 0.1 + n
     velocity = None if n % 3 == 0 else q * 2.0
     valid = (np.arange(joints) + n) % 2 == 0
+    measured = None if n % 4 == 0 else np.where(valid, -q, np.nan) if valid.any() else -q
     return Cycle(
-        n * STEP_NS, q, velocity, -q, q * 3.0, q * 4.0, n, n % 11, n % 13, valid, np.arange(joints) + n, n // 2
+        *(n * STEP_NS, q, velocity, -q, q * 3.0, q * 4.0),
+        *(n, n % 11, n % 13, valid, np.arange(joints) + n, n // 2, measured),
     )
 
 

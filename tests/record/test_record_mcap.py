@@ -292,3 +292,25 @@ def test_messages_outside_of_chunks(tmp_path: Path) -> None:
     torn = open_recording(path)
     assert torn.torn
     assert 0 < len(read_all(torn).stamp_ns) < 49
+
+
+def test_what_drives_measured_stands_beside_what_they_were_told(tmp_path: Path) -> None:
+    path, q = tmp_path / "run.mcap", np.array([0.1, 0.2, 0.3])
+    with RecordingWriter(path, JOINTS, URDF, OFFSET_NS) as writer:
+        for k in range(5):
+            measured = None if k == 3 else np.where(np.arange(3) == 1, np.nan, q + k)
+            timing = (k, 0, 0, np.ones(3, bool), np.zeros(3, int), 0)
+            writer.sample(Cycle(START_NS + k * STEP_NS, q, None, q, q, q, *timing, measured))
+    found = decoded(path, "/joint_torques")
+    assert [stamp - OFFSET_NS - START_NS for stamp, _ in found] == [0, STEP_NS, 2 * STEP_NS, 4 * STEP_NS]
+    for stamp, message in found:
+        k = (stamp - OFFSET_NS - START_NS) // STEP_NS
+        assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == stamp
+        assert list(message.name) == list(JOINTS)
+        assert (list(message.position), list(message.velocity)) == ([], [])
+        np.testing.assert_array_equal(message.effort, np.where(np.arange(3) == 1, np.nan, q + k))
+    stamps, torques = McapRecording(path).measured("/joint_torques")
+    np.testing.assert_array_equal(stamps, [stamp - OFFSET_NS for stamp, _ in found])
+    np.testing.assert_array_equal(torques, [message.effort for _, message in found])
+    reordered = McapRecording(path, order=JOINTS[::-1]).measured("/joint_torques")[1]
+    np.testing.assert_array_equal(reordered, torques[:, ::-1])

@@ -39,6 +39,20 @@ def test_what_one_side_asks_the_other_reads(tmp_path: Path) -> None:
         assert person.pid == loop.pid
 
 
+def test_support_is_confirmed_only_where_the_arm_waits_for_it(tmp_path: Path) -> None:
+    with ControlFile.take(loop_path(tmp_path), None) as loop, ControlFile.reach(loop_path(tmp_path)) as person:
+        assert (loop.waiting, loop.supported) == (False, False)
+        with pytest.raises(UsageError, match="not held"):
+            person.confirm_support()
+        assert not loop.supported
+        loop.wait_for_support()
+        assert (person.waiting, loop.supported) == (True, False)
+        person.confirm_support()
+        assert loop.supported
+    with ControlFile.take(loop_path(tmp_path), None) as loop:  # the next motion waits for nothing
+        assert (loop.waiting, loop.supported) == (False, False)
+
+
 def loop_path(folder: Path) -> Path:
     return folder / "arm" / "control"
 

@@ -84,5 +84,10 @@ def test_stop_and_pause_are_those_of_the_control_file(controls: ControlFile) -> 
     controls.ask_pause(True)
     controls.ask_stop()
     assert (lifeline.stop, lifeline.pause) == (True, True)
+    lifeline.wait_for_support()
+    assert controls.waiting
+    assert not lifeline.supported
+    controls.confirm_support()
+    assert lifeline.supported
     for fd in (end, other):
         os.close(fd)

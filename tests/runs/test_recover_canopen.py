@@ -13,9 +13,10 @@ from drivers.arm import StopKind
 from drivers.status import TRIPPED
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.config.schema import ArmConfig
+from ident_service.errors import UsageError
 from ident_service.motion.factory import make_arm
 from ident_service.service.arm_state import fault_file
-from ident_service.service.recover import recover
+from ident_service.service.recover import let_go, recover
 from sim_backend.pucks.faults import PuckFault
 from sim_backend.pucks.lock_step import LockStepArm, standing
 
@@ -118,3 +119,18 @@ def test_drives_whose_host_died_are_usable_again(config: ArmConfig, behind: Lock
     assert found.seen is not None
     assert not any(word & TRIPPED for word in found.seen.status)
     assert states(behind) == ["pre operational, switch on disabled"] * 2
+
+
+def test_drives_that_hold_the_arm_let_it_go_when_a_person_says_so(config: ArmConfig, state: Path) -> None:
+    config = config.model_copy(update={"control": config.control.model_copy(update={"after_stop": "hold"})})
+    with standing(config) as behind:
+        with pytest.raises(UsageError, match="its drives do not hold it"):
+            let_go(config, state)
+        session(config, behind)
+        assert all("quick stop active" in words for words in states(behind))
+        found = recover(config, state)
+        assert found.steps[0].startswith(f"Support the arm, then `ident supported {config.name}`")
+        assert all("quick stop active" in words for words in states(behind))  # looked at, not touched
+        assert let_go(config, state) == tuple(config.joints)
+        assert all("switch on disabled" in words for words in states(behind))
+        assert recover(config, state).usable

@@ -8,19 +8,22 @@ import resource
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from helpers.tickets import write_checked_ticket
-from kill_bench import TAG, VICTIMS, tagged
+from kill_bench import TAG, VICTIMS, tagged, wait_for
 from runs.conftest import written
 
 from ident_service.cli import main
 from ident_service.config.load import load_arm
 from ident_service.errors import ArmError, ArmFault, MotionRefused
-from ident_service.service.arm_state import fault_file, ticket_path
+from ident_service.motion.control_file import ControlFile, in_use
+from ident_service.motion.loop import LOWERS, WAITS
+from ident_service.service.arm_state import control_path, fault_file, ticket_path
 from ident_service.service.watching import Ending
 
 Capture = pytest.CaptureFixture[str]
@@ -228,3 +231,49 @@ def test_a_refusal_stays_one_and_a_death_without_a_word_is_none(tmp_path: Path) 
     with pytest.raises(ArmError, match=r"without a word \(SIGKILL\) before it took the arm"):
         Ending({}, {}, -signal.SIGKILL).raise_for(faults)
     Ending({"state": "done"}, {}, os.EX_OK).raise_for(faults)
+
+
+@pytest.fixture
+def loose(tmp_path: Path) -> list[str]:
+    """Words of a run of an arm without brakes, which is held after a stop."""
+    path = written(tmp_path / "loose.yaml", "{kind: seeded, seed: 1, base_frequency: 0.4, harmonics: 2, periods: 1}")
+    text = path.read_text().replace("{rate: 250}", "{rate: 250, after_stop: hold}")
+    path.write_text(text.replace("{kp:", "{brake: false, kp:"))
+    write_checked_ticket(load_arm(path), tmp_path / "state")
+    return ["run", str(path), "--out", str(tmp_path / "run"), "--state", str(tmp_path / "state")]
+
+
+@pytest.mark.slow
+def test_an_arm_without_brakes_is_held_until_a_person_confirms(
+    loose: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    state = ["--state", str(tmp_path / "state")]
+
+    def confirm() -> None:
+        assert main(["supported", "planar2", *state]) == 0
+
+    said = when(monkeypatch, {"exciting": lambda: signal.raise_signal(signal.SIGINT), WAITS: confirm})
+    assert main(["supported", loose[1], *state]) == 2  # nobody moves it, and its drives do not hold it
+    assert main(loose) == 1
+    assert said[-3:] == ["stopped", WAITS, LOWERS]
+    assert "supported asked of process" in capsys.readouterr().out
+    assert fault_file(tmp_path / "state", "planar2").latched() == {}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_held_arm_does_not_fall_with_whoever_asked_for_the_motion(loose: list[str], tmp_path: Path) -> None:
+    control = control_path(tmp_path / "state", "planar2")
+    command = [sys.executable, "-m", "ident_service", *loose]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as parent:
+        assert parent.stdout is not None
+        while "exciting" not in (line := parent.stdout.readline()):
+            assert line, "it ended"
+        parent.kill()
+    with ControlFile.reach(control) as controls:
+        wait_for(lambda: controls.waiting, "it is not held")
+        time.sleep(1.0)
+        assert in_use(control)
+        controls.confirm_support()
+    wait_for(lambda: not in_use(control), "it is not let go")
+    assert list(fault_file(tmp_path / "state", "planar2").latched()) == ["lease_lost"]

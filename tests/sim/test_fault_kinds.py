@@ -11,6 +11,7 @@ from drivers.status import AxisStatus
 from ident_service.config.simulation import FAULT_RULES
 from ident_service.errors import DriverError
 from sim_backend.arm import from_config
+from sim_backend.drives import RAMP
 from sim_backend.faults import Fault, FaultKind
 
 MS = 1e-3
@@ -23,8 +24,9 @@ TRUTH = {"m1": 1.0, "m2": 1.0} | {f"L{axis}{link}": 0.1 for axis in ("xx", "yy",
 JOINTS = {"x": {"torque": 10.0, "velocity": 2.0}, "y": {"torque": 5.0, "velocity": 1.0}}
 
 
-def sliders(**driver):
-    return arm_config(ROWS, TRUTH, gravity=(0.0, 0.0, 0.0), joints=JOINTS, **driver)
+def sliders(*, brakes=False, **driver):
+    joints = {name: {**joint, "brake": brakes} for name, joint in JOINTS.items()}
+    return arm_config(ROWS, TRUTH, gravity=(0.0, 0.0, 0.0), joints=joints, **driver)
 
 
 def run(*faults, cycles=CYCLES, torque=(2.0, 1.0), **driver):
@@ -148,7 +150,7 @@ def test_drives_cannot_be_enabled_while_what_broke_them_lasts():
 
 
 def test_a_silent_node_answers_no_more_and_brakes():
-    samples, truths, _ = run(Fault(AT, FaultKind.NODE_SILENT, 1))
+    samples, truths, _ = run(Fault(AT, FaultKind.NODE_SILENT, 1), windings_off="shorted")
     np.testing.assert_array_equal(column(samples, "valid"), np.arange(CYCLES) < AT)
     np.testing.assert_array_equal(column(samples, "age")[AT:], np.arange(1, CYCLES - AT + 1))
     np.testing.assert_array_equal(column(samples, "position")[AT:], samples[AT - 1].position[1])
@@ -169,7 +171,7 @@ def braked(velocity, damping, mass=1.0):
 
 
 def test_an_emergency_stop_takes_all_torque_and_brakes():
-    samples, truths, arm = run(Fault(AT, FaultKind.EMERGENCY_STOP, duration=20))
+    samples, truths, arm = run(Fault(AT, FaultKind.EMERGENCY_STOP, duration=20), windings_off="shorted")
     for joint, mass in ((0, 2.0), (1, 1.0)):  # the first moves both; damping is half of torque limit / velocity limit
         np.testing.assert_array_equal(column(samples, "torque", joint)[AT:], 0.0)
         braked(column(truths, "velocity", joint)[AT:], 2.5, mass)
@@ -253,8 +255,32 @@ def test_a_quick_stop_brakes_and_taking_the_torque_away_does_not():
         assert words == {(IDLE if slows else AxisStatus(0),) * 2}
 
 
+def test_drives_that_leave_their_windings_open_coast_after_the_ramp_of_a_quick_stop():
+    _, truths, arm = run()
+    arm.stop(StopKind.QUICK_STOP)
+    ramp = round(RAMP / MS)
+    for _ in range(ramp + 40):
+        arm.exchange(None)
+    speed = column(truths, "velocity")[CYCLES + 1 :]
+    braked(speed[:ramp], 2.5)
+    np.testing.assert_allclose(speed[ramp:], speed[ramp], rtol=1e-12)
+
+
+@pytest.mark.parametrize("kind", [FaultKind.NODE_SILENT, FaultKind.EMERGENCY_STOP, FaultKind.DRIVE_FAULT])
+def test_drives_without_power_coast_at_once(kind):
+    _, truths, _ = run(Fault(AT, kind))
+    speed = column(truths, "velocity")
+    np.testing.assert_allclose(speed[AT:], speed[AT], rtol=1e-12)
+
+
+@pytest.mark.parametrize("kind", [FaultKind.NODE_SILENT, FaultKind.EMERGENCY_STOP, FaultKind.DRIVE_FAULT])
+def test_a_brake_closes_whenever_there_is_no_power(kind):
+    _, truths, _ = run(Fault(AT, kind), brakes=True)
+    assert np.abs(column(truths, "velocity")[AT + 5 :]).max() < 1e-3 * column(truths, "velocity")[AT]
+
+
 def test_braking_can_be_given():
-    _, truths, _ = run(Fault(AT, FaultKind.EMERGENCY_STOP), braking=(7.0, 20.0))
+    _, truths, _ = run(Fault(AT, FaultKind.EMERGENCY_STOP), braking=(7.0, 20.0), windings_off="shorted")
     braked(column(truths, "velocity", 0)[AT:], 7.0, mass=2.0)
     braked(column(truths, "velocity", 1)[AT:], 20.0)
 

@@ -16,6 +16,7 @@ from ident_service.excitation.proof import objections, proof_of
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
 from ident_service.model.rigid_body import InverseDynamics
+from ident_service.motion.after_stop import after_stop
 from ident_service.motion.plans import Destination, GoTo
 from ident_service.motion.preflight.check import Check, Measure, Verdict, failed, judged, measure, measures
 from ident_service.motion.preflight.stability import INERTIA, LEAST_GAIN_MARGIN, delay_of, stability
@@ -36,6 +37,7 @@ def configuration_check(model: ArmModel) -> Check:
         if model.prior is None:
             raise MotionRefused(f"{model.config.name}: computed torque needs prior parameters")
         dynamics = InverseDynamics(model.chain, model.layout, model.prior)
+        after_stop(model, limits)
         smallest = float(np.linalg.eigvalsh(dynamics.mass_matrix(limits.home)).min())
     except IdentError as error:
         return failed(code, str(error), remedy)

@@ -128,6 +128,13 @@ def finish(service: Serving, who: Operator, arm: ArmName) -> AskedAnswer:
     return AskedAnswer(arm=name, asked="finish", reached=service.engine.finish(name, who.name))
 
 
+@router.post("/arms/{arm}/supported")
+def supported(service: Serving, who: Operator, arm: ArmName) -> AskedAnswer:
+    """Confirm that the arm, which is held after a stop, is supported or home: it is then let down."""
+    name = known.known_arm(service.db, service.state, arm).name
+    return AskedAnswer(arm=name, asked="supported", reached=service.engine.confirm_support(name, who.name))
+
+
 @router.get("/arms/{arm}/acceptances")
 def list_acceptances(service: Serving, _: Viewer, arm: ArmName) -> list[AcceptanceAnswer]:
     """What was accepted, the earliest first; the last one is current."""

@@ -29,7 +29,7 @@ from ident_service.service.jobs.keeping import keep
 from ident_service.service.jobs.live_jobs import TICK, LiveJob, LiveJobs
 from ident_service.service.jobs.outcome import outcome, said
 from ident_service.service.jobs.progress import Progress, progress
-from ident_service.service.jobs.reach import finish_arm, moving_arms, pause_arm, stop_arms
+from ident_service.service.jobs.reach import confirm_support, finish_arm, moving_arms, pause_arm, stop_arms
 from ident_service.service.jobs.recovery import explain_interrupted, mark_interrupted
 from ident_service.service.registry import jobs as rows
 from ident_service.service.registry.audit import AuditQueue, note
@@ -174,6 +174,12 @@ class Engine:
         """Let a run end early, in order, out of a pause too; whether anybody moves the arm."""
         reached = finish_arm(self.state, arm)
         self.audit.note(by, "finish", arm, reached=[arm] if reached else [])
+        return reached
+
+    def confirm_support(self, arm: str, by: str) -> bool:
+        """Take a person's word that an arm that is held after a stop is supported or home; whether one was held."""
+        reached = confirm_support(self.state, arm)
+        self.audit.note(by, "supported", arm, reached=[arm] if reached else [])
         return reached
 
     def progress(self, row: Row) -> Progress | None:

@@ -39,6 +39,11 @@ def finish_arm(state: Path, arm: str) -> bool:
     return bool(_reach(state, arm, _asking(ask)))
 
 
+def confirm_support(state: Path, arm: str) -> bool:
+    """Let an arm that is held after a stop go, since a person sees it supported; whether one was held."""
+    return bool(_reach(state, arm, _asking(ControlFile.confirm_support)))
+
+
 def moving_arms(state: Path) -> list[str]:
     """Names of the arms that anybody moves."""
     return _reach(state, None, mover)

@@ -170,6 +170,14 @@ def finish(service: Serving, who: Operator, arm: ArmName, form: Form) -> Respons
     return seen(f"/jobs/{rows.known_job(service.db, job)['id']}?attended=1" if job else f"/arms/{arm}")
 
 
+@router.post("/arms/{arm}/supported")
+def supported(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
+    """Take a person's word that an arm that is held is supported."""
+    arms.supported(service, who, arm)
+    job = form.get("job", "")
+    return seen(f"/jobs/{rows.known_job(service.db, job)['id']}?attended=1" if job else f"/arms/{arm}")
+
+
 def _alarms(service: Service, arm: str | None) -> list[dict[str, Any]]:
     """Drift alarms that stand, of an arm or of all, each with what was found."""
     return [

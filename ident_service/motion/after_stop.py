@@ -1,0 +1,70 @@
+"""What becomes of an arm after a stop: its brakes hold it, the loop holds it, or it is lowered.
+
+Joints are asked by their weight: one whose gravity torque, by the prior model, is above `WEIGHS` of its torque limit in
+some posture falls when its drive lets go, unless it has a brake.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import Final
+
+import numpy as np
+
+from ident_service.config.limits import MotionLimits
+from ident_service.errors import MotionRefused
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.rigid_body import InverseDynamics
+
+WEIGHS: Final = 1e-3  # of a torque limit: less than the friction of any drive that gives this torque
+_POSTURES, _SEED = 64, 1
+
+
+class AfterStop(Enum):
+    """What follows when a stopped arm rests."""
+
+    BRAKE = "brake"  # held for a while, then a quick stop: brakes close, or nothing weighs
+    HOLD = "hold"  # held until a person confirms that the arm is supported or home; then lowered
+    LOWER = "lower"  # held for a while, then lowered under damped control until it rests
+
+
+def falling_joints(model: ArmModel, limits: MotionLimits) -> tuple[str, ...]:
+    """Names of the joints that gravity moves when their drives let go, with or without a brake.
+
+    Args:
+        model: with prior parameters.
+        limits: of the arm.
+
+    Raises:
+        MotionRefused: no prior parameters.
+    """
+    if model.prior is None:
+        raise MotionRefused(f"{model.config.name}: computed torque needs prior parameters")
+    dynamics = InverseDynamics(model.chain, model.layout, model.prior)
+    still = np.zeros(model.chain.joints)
+    postures = np.random.default_rng(_SEED).uniform(limits.lower, limits.upper, (_POSTURES, model.chain.joints))
+    weight = np.abs([dynamics.torque(posture, still, still) for posture in postures]).max(axis=0)
+    return tuple(name for name, falls in zip(model.chain.names, weight > WEIGHS * limits.torque, strict=True) if falls)
+
+
+def after_stop(model: ArmModel, limits: MotionLimits) -> AfterStop:
+    """Say what follows a stop of this arm.
+
+    Args:
+        model: with prior parameters.
+        limits: of the arm.
+
+    Raises:
+        MotionRefused: joints can fall that have no brake, and the description says nothing else of them.
+    """
+    asked = model.config.control.after_stop
+    if asked in ("hold", "lower"):
+        return AfterStop(asked)
+    described = model.config.joints
+    loose = [name for name in falling_joints(model, limits) if not described[name].brake]
+    if loose:
+        raise MotionRefused(
+            f"{model.config.name}: {', '.join(loose)} would fall after a stop: gravity moves them, and no brake is "
+            f"described; set control.after_stop to hold or lower, or joints.{loose[0]}.brake to true where there is one"
+        )
+    return AfterStop.BRAKE

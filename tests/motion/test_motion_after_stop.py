@@ -1,0 +1,297 @@
+"""What becomes of an arm without brakes after a stop: held until a person says so, lowered, or what drives do."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from motion_bench import JOINTS, LOOKED, Story, WatchedArm, bench_config
+
+from drivers.arm import StopKind
+from ident_service.config.limits import motion_limits
+from ident_service.errors import ArmFault, MotionRefused
+from ident_service.excitation.plan import excitation
+from ident_service.model.arm_model import arm_model
+from ident_service.motion.after_stop import AfterStop, after_stop, falling_joints
+from ident_service.motion.controls import Switches
+from ident_service.motion.latch import Latch
+from ident_service.motion.loop import LOWERS, WAITS
+from ident_service.motion.lowering import SPEED, lowest_point
+from ident_service.motion.plans import Destination, GoTo
+from ident_service.motion.run import RunReport, follow, run
+from ident_service.motion.states import State
+from sim_backend.arm import Truth, from_config
+from sim_backend.faults import Fault, FaultKind
+
+Array = np.ndarray
+PERIOD = 1e-3
+HOLD = 0.1  # s
+STOP = 900  # a cycle in the middle of the excitation
+LOOSE = {name: joint | {"brake": False} for name, joint in JOINTS.items()}
+
+
+def loose(after: str | None, **changes: Any) -> Any:
+    """The bench's arm without brakes; its drives leave their windings open."""
+    control = {} if after is None else {"after_stop": after}
+    return bench_config(**{"joints": LOOSE, "control": control, **changes})
+
+
+class Person(Switches):
+    """Stops in one cycle, and confirms some cycles after the arm has begun to wait for it."""
+
+    def __init__(self, arm: WatchedArm, *, stop: int = STOP, confirm: int | None = None) -> None:
+        super().__init__()
+        self._arm, self._stop, self._confirm = arm, stop, confirm
+        self._since = 10**9
+
+    def lease_ok(self, now_ns: int) -> bool:
+        self.stop = self._arm.cycle > self._stop
+        self.supported = self._confirm is not None and self._arm.cycle > self._since + self._confirm
+        return True
+
+    def wait_for_support(self) -> None:
+        super().wait_for_support()
+        self._since = self._arm.cycle
+
+
+class Rig:
+    """An open arm, what it really does, and what is told of it."""
+
+    def __init__(self, config: Any, *faults: Fault) -> None:
+        self.config, self.model = config, arm_model(config)
+        self.limits = motion_limits(config)
+        self.truth: list[Truth] = []
+        self.arm = WatchedArm(from_config(config, faults=faults, observer=self.truth.append))
+        self.story, self.latch = Story(), Latch()
+
+    def run(self, **person: Any) -> RunReport:
+        self.arm.open()
+        motion = excitation(self.model, "identification")
+        return run(
+            self.arm,
+            self.model,
+            motion,
+            self.story,
+            Person(self.arm, **person),
+            latch=self.latch,
+            hold_seconds=HOLD,
+        )
+
+    def told(self, message: str) -> int:
+        """The cycle in which something was told."""
+        stamp = next(stamp for stamp, _, words in self.story.events if words == message)
+        return round(stamp * 1e-9 / PERIOD)
+
+    def column(self, name: str, since: int, until: int | None = None) -> Array:
+        """Of the truth, by cycle."""
+        return np.array([getattr(moment, name) for moment in self.truth[since:until]])
+
+    def moves_when_left(self, seconds: float = 1.0) -> Array:
+        """How far each joint goes in that time after everything has ended [rad]."""
+        before = self.truth[-1].position
+        for _ in range(round(seconds / PERIOD)):
+            self.arm.inner.exchange(None)
+        return np.abs(self.truth[-1].position - before)
+
+
+def test_an_arm_that_would_fall_must_say_what_holds_it() -> None:
+    with pytest.raises(MotionRefused, match=r"shoulder, elbow would fall after a stop.*hold or lower.*brake to true"):
+        resolved(loose(None))
+    with pytest.raises(MotionRefused, match="elbow would fall"):  # a wish is no brake
+        resolved(bench_config(joints={**JOINTS, "elbow": LOOSE["elbow"]}, control={"after_stop": "brake"}))
+    assert resolved(bench_config()) is AfterStop.BRAKE
+    assert resolved(loose("hold")) is AfterStop.HOLD
+    assert resolved(loose("lower")) is AfterStop.LOWER
+
+
+def test_an_arm_that_does_not_fall_need_not_say_anything() -> None:
+    assert resolved(loose(None, gravity=(0.0, 0.0, 0.0))) is AfterStop.BRAKE
+    assert resolved(loose(None, gravity=(0.0, 0.0, -9.81))) is AfterStop.BRAKE  # turns about a vertical axis
+    slide = {"position": (-0.3, 0.3), "velocity": 0.5, "acceleration": 4.0, "jerk": 40.0, "torque": 30.0}
+    joints = {name: {**LOOSE[name], **slide, "following_error": 0.05} for name in ("shoulder", "elbow")}
+    rows = {"shoulder": {"type": "prismatic", "alpha": np.pi / 2}, "elbow": {"type": "prismatic"}}
+    sliders = {"dh": {"convention": "standard", "joints": rows}}
+    level = loose(None, kinematics=sliders, joints=joints, gravity=(-9.81, 0.0, 0.0))
+    assert falling_joints(arm_model(level), motion_limits(level)) == ()
+    steep = loose(None, kinematics=sliders, joints=joints, gravity=(0.0, 0.0, -9.81))
+    assert falling_joints(arm_model(steep), motion_limits(steep)) == ("shoulder",)
+
+
+def resolved(config: Any) -> AfterStop:
+    return after_stop(arm_model(config), motion_limits(config))
+
+
+def test_nothing_moves_where_nothing_would_hold_the_arm() -> None:
+    rig = Rig(loose(None))
+    with pytest.raises(MotionRefused, match="would fall"):
+        rig.run()
+    assert rig.arm.enabled == 0
+
+
+@pytest.fixture(scope="module")
+def held() -> Rig:
+    """Stopped, held for ten seconds, confirmed."""
+    rig = Rig(loose("hold"))
+    assert rig.run(confirm=10_000).state is State.STOPPED
+    return rig
+
+
+def test_a_held_arm_stands_until_a_person_confirms(held: Rig) -> None:
+    waits, lowers = held.told(WAITS), held.told(LOWERS)
+    assert lowers - waits >= 10_000
+    position = held.column("position", waits, lowers)
+    assert (np.ptp(position, axis=0) < 0.01).all(), np.ptp(position, axis=0)
+    assert held.arm.stops == [StopKind.TORQUE_OFF]
+    assert held.story.states[-2:] == ["stopping", "stopped"]
+
+
+def test_what_is_let_go_of_sinks_slowly_and_needs_no_torque_at_the_end(held: Rig) -> None:
+    lowers = held.told(LOWERS)
+    speed = np.abs(held.column("velocity", lowers, -1))
+    assert (speed.max(axis=0) > 0.5 * SPEED * held.limits.velocity).any()  # nobody carries it
+    assert (speed.max(axis=0) < 2.0 * SPEED * held.limits.velocity).all()
+    assert (np.abs(held.arm.torques[-1]) < 0.02 * held.limits.torque).all()
+    assert (held.moves_when_left() < 0.02).all()
+
+
+def test_a_long_hold_is_not_recorded(held: Rig) -> None:
+    stamps = held.story.column("stamp_ns") * 1e-9 / PERIOD
+    assert stamps[-1] <= held.told(WAITS) + HOLD / PERIOD + 2
+    assert (np.diff(stamps) < 1.5).all()
+
+
+def test_a_word_that_was_given_too_early_does_not_count() -> None:
+    rig = Rig(loose("hold"))
+    rig.arm.open()
+    switches = Switches()
+    switches.supported = True
+    ended = 0
+
+    def watch(cycle: int) -> None:
+        nonlocal ended
+        switches.stop = cycle > STOP
+        ended += switches.waiting
+        if ended == 500:
+            switches.supported = True
+
+    rig.arm.before_exchange = watch
+    run(rig.arm, rig.model, excitation(rig.model, "identification"), rig.story, switches, hold_seconds=HOLD)
+    assert rig.told(LOWERS) - rig.told(WAITS) >= 498
+
+
+def test_an_arm_is_lowered_without_a_word_where_its_description_says_so() -> None:
+    rig = Rig(loose("lower"))
+    assert rig.run().state is State.STOPPED
+    assert WAITS not in [words for _, _, words in rig.story.events]
+    assert rig.arm.stops == [StopKind.TORQUE_OFF]
+    assert (rig.moves_when_left() < 0.02).all()
+
+
+def test_the_floor_ends_a_lowering() -> None:
+    low = -0.3
+    rig = Rig(loose("lower", control={"after_stop": "lower", "floor": low}))
+    rig.run()
+    height = lowest_point(rig.model)
+    heights = [height(moment.position) for moment in rig.truth[rig.told(LOWERS) :]]
+    assert min(heights[:-3]) > low
+    assert heights[-1] == pytest.approx(low, abs=2e-3)
+
+
+def test_the_height_of_the_lowest_point_is_that_of_bodies_or_frames() -> None:
+    bare = lowest_point(arm_model(loose("lower")))
+    assert bare(np.array([-np.pi / 2, 0.0])) == pytest.approx(-1.0)
+    assert bare(np.array([np.pi / 2, -np.pi])) == pytest.approx(0.0)
+    geometry = {"elbow": [{"from": (-0.5, 0.0, 0.0), "to": (0.1, 0.0, 0.0), "radius": 0.03}]}
+    thick = lowest_point(arm_model(loose("lower", geometry=geometry)))
+    assert thick(np.array([-np.pi / 2, 0.0])) == pytest.approx(-1.13)
+
+
+def test_a_joint_at_the_end_of_its_range_rests_there() -> None:
+    """Hanging straight down is outside the limits of both joints of this arm."""
+    joints = {"shoulder": LOOSE["shoulder"] | {"position": (-0.6, 1.8)}, "elbow": LOOSE["elbow"]}
+    rig = Rig(loose("lower", joints=joints))
+    assert rig.run().state is State.STOPPED
+    shoulder = rig.truth[-1].position[0]
+    assert -0.6 - rig.limits.following_error[0] < shoulder < -0.55
+    assert rig.latch.faults == ()
+
+
+@pytest.mark.parametrize(
+    ("kind", "code"), [(FaultKind.DRIVE_FAULT, "drive_fault"), (FaultKind.NODE_SILENT, "feedback_gone")]
+)
+def test_drives_and_their_own_reaction_come_before_any_holding(kind: FaultKind, code: str) -> None:
+    rig = Rig(loose("hold"), Fault(STOP + 2500, kind, 1))
+    with pytest.raises(ArmFault, match=code):
+        rig.run()
+    assert rig.told(WAITS) < STOP + 2500
+    assert rig.arm.stops == [StopKind.QUICK_STOP]
+    assert rig.story.states[-1] == "faulted"
+
+
+def test_a_controlled_stop_after_a_fault_is_held_too() -> None:
+    rig = Rig(loose("hold"), Fault(STOP, FaultKind.LATE_CYCLE, None, 50, 0.4e-3))
+    with pytest.raises(ArmFault, match="late_cycles"):
+        rig.run(stop=10**9, confirm=3000)
+    assert rig.told(LOWERS) - rig.told(WAITS) >= 3000
+    assert rig.arm.stops == [StopKind.TORQUE_OFF]
+    assert [fault.code for fault in rig.latch.faults] == ["late_cycles"]
+
+
+@pytest.mark.parametrize("after", ["hold", "lower"])
+def test_an_arm_that_does_not_follow_is_lowered_until_it_rests(after: str) -> None:
+    rig = Rig(loose(after), Fault(400, FaultKind.LOAD_ATTACHED, size=4.0))
+    with pytest.raises(ArmFault) as caught:
+        rig.run(stop=10**9, confirm=0)
+    assert caught.value.code == "following_lost"
+    assert rig.arm.stops == [StopKind.TORQUE_OFF]
+    rig.arm.inner.faults = ()
+    assert (rig.moves_when_left() < 0.05).all()
+
+
+def test_a_way_home_ends_held() -> None:
+    rig = Rig(loose("hold"))
+    rig.arm.open()
+    controls = Person(rig.arm, stop=10**9, confirm=1000)
+    report = follow(rig.arm, rig.model, GoTo(Destination.HOME), rig.story, controls, hold_seconds=HOLD)
+    assert report.state is State.DONE
+    assert rig.told(LOWERS) - rig.told(WAITS) >= 1000
+
+
+def test_a_run_ends_where_it_was_supported() -> None:
+    rig = Rig(loose("hold"))
+    assert rig.run(stop=10**9).state is State.DONE
+    assert rig.arm.stops == [StopKind.TORQUE_OFF]
+    assert (np.abs(rig.truth[-1].position - rig.truth[LOOKED].position) < 0.05).all()
+
+
+def test_controls_that_fail_do_not_let_a_held_arm_fall() -> None:
+    rig = Rig(loose("hold"))
+    rig.arm.open()
+    failures = 0
+
+    class Failing(Person):
+        @property  # type: ignore[override]
+        def supported(self) -> bool:
+            nonlocal failures
+            if self.waiting and failures < 200:
+                failures += 1
+                raise OSError("gone")
+            return failures >= 200
+
+        @supported.setter
+        def supported(self, wanted: bool) -> None:
+            pass
+
+    with pytest.raises(ArmFault, match="controls_failed"):
+        run(
+            rig.arm,
+            rig.model,
+            excitation(rig.model, "identification"),
+            rig.story,
+            Failing(rig.arm),
+            latch=rig.latch,
+            hold_seconds=HOLD,
+        )
+    assert rig.arm.stops == [StopKind.TORQUE_OFF]
+    assert rig.told(LOWERS) - rig.told(WAITS) >= 200
