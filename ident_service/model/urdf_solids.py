@@ -16,6 +16,7 @@ from ident_service.config.quantities import TextFile
 from ident_service.config.workspace import BASE
 from ident_service.errors import ModelError
 from ident_service.model.chain import WORLD, Array, Chain
+from ident_service.model.mechanism import read_mechanism
 from ident_service.model.solids import Body, Box, Capsule, Cylinder, Solid, turned
 
 
@@ -30,21 +31,23 @@ def urdf_solids(file: TextFile, chain: Chain, skip: frozenset[str]) -> list[Body
     Raises:
         ModelError: a mesh, or a shape or number that cannot be read, in a link that is not skipped.
     """
-    model = pin.buildModelFromXML(file.text)
+    frames = read_mechanism(file, "urdf").frames
     bodies = []
     # Entities were refused when the chain was read from the same text.
     for link in ET.fromstring(file.text).iter("link"):  # noqa: S314
         elements = link.findall("collision")
         if not elements:
             continue
-        frame = model.frames[model.getFrameId(link.get("name", ""), pin.FrameType.BODY)]
-        joint = int(frame.parentJoint) - 1
+        frame = frames.get(link.get("name", ""))
+        if frame is None:  # in an extension's element, say
+            continue
+        joint, rotation, translation = frame
         owner = BASE if joint == WORLD else chain.names[joint]
         if owner in skip:
             continue
         where = f"{file.name}: link {link.get('name')!r}"
         for element in elements:
-            placement = frame.placement * _origin(element.find("origin"), where)
+            placement = pin.SE3(rotation, translation) * _origin(element.find("origin"), where)
             bodies.append(Body(owner, joint, _solid(element, placement.rotation, placement.translation, owner, where)))
     return bodies
 

@@ -48,7 +48,8 @@ def original_urdf(model: ArmModel, delta: Array, has: Carried) -> tuple[str, tup
     Raises:
         ModelError: a link without positive mass, or a file that cannot be edited.
     """
-    from ident_service.model.rigid_body import delta_from_inertia, joint_frame_inertias
+    from ident_service.model.mechanism_process import delta_from_inertia
+    from ident_service.model.rigid_body import joint_frame_inertias
 
     file = model.config.kinematics.urdf
     if file is None:
