@@ -8,14 +8,9 @@ another. An MJCF is read in a process of its own, with limits of memory and time
 
 from __future__ import annotations
 
-import json
-import os
 import re
-import signal
-import subprocess
-import sys
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -27,6 +22,7 @@ from numpy.typing import NDArray
 
 from ident_service.config.quantities import TextFile
 from ident_service.errors import ModelError
+from ident_service.model.limited_process import ask_process
 
 Kind = Literal["urdf", "mjcf"]
 MOST_BYTES: Final = 2 * 2**20
@@ -89,7 +85,7 @@ def read_mechanism(file: TextFile, kind: Kind, *, own: bool = False) -> Mechanis
 
         document = urdf_document(file.text)
     else:
-        document = _in_folder(file, _here if own else _in_a_process)
+        document = _mjcf_document(file, own=own)
     if (error := document.get("error")) is not None:
         raise ModelError(f"{file.name}: {error}")
     return _mechanism(document)
@@ -169,40 +165,19 @@ class _Counter:
         raise ModelError(f"{self._name}: {what}; an arm has fewer")
 
 
-def _in_folder(file: TextFile, read: Callable[[str], dict[str, Any]]) -> dict[str, Any]:
+def _mjcf_document(file: TextFile, *, own: bool) -> dict[str, Any]:
     # Pinocchio reads MJCF from a path only; alone in a folder, the file cannot reach any other.
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "arm.xml"
         path.write_text(file.text, encoding="utf-8", errors="surrogatepass")
-        return read(str(path))
+        if own:
+            from ident_service.model.mechanism_process import mjcf_document
 
-
-def _here(path: str) -> dict[str, Any]:
-    from ident_service.model.mechanism_process import mjcf_document
-
-    return mjcf_document(path)
-
-
-def _in_a_process(path: str) -> dict[str, Any]:
-    paths = os.pathsep.join(path or str(Path.cwd()) for path in sys.path)
-    try:
-        done = subprocess.run(  # noqa: S603 - our own interpreter and module
-            [sys.executable, "-P", "-m", "ident_service.model.mechanism_process", path],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env={**os.environ, "PYTHONPATH": paths, "OPENBLAS_NUM_THREADS": "1"},
-            timeout=_DEADLINE,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        return {"error": f"the MJCF could not be read within {_DEADLINE:g} s"}
-    if done.returncode == 0:
-        document: dict[str, Any] = json.loads(done.stdout)
-        return document
-    if done.returncode == -signal.SIGXCPU:
-        return {"error": "the MJCF takes too long to read; give a smaller one"}
-    return {"error": "the MJCF breaks its parser: a name twice, a name that is reserved, or too much memory; mend it"}
+            return mjcf_document(str(path))
+        try:
+            return ask_process("ident_service.model.mechanism_process", path, _DEADLINE)
+        except ModelError as error:
+            return {"error": str(error)}
 
 
 def _mechanism(document: Mapping[str, Any]) -> Mechanism:

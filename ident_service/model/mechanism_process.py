@@ -5,9 +5,6 @@
 
 from __future__ import annotations
 
-import json
-import os
-import resource
 import sys
 from collections.abc import Callable
 from typing import Any, Final
@@ -15,6 +12,8 @@ from typing import Any, Final
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
+
+from ident_service.model.limited_process import answer_within
 
 MOST_MEMORY: Final = 512 * 2**20  # bytes of addresses, of which the libraries take 230 MB
 MOST_SECONDS: Final = 5  # of computing
@@ -81,15 +80,7 @@ def _document(kind: str, build: Callable[[], pin.Model]) -> dict[str, Any]:
 
 def main(words: list[str]) -> int:
     """Read one file within the limits."""
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY, MOST_MEMORY))
-    resource.setrlimit(resource.RLIMIT_CPU, (MOST_SECONDS, MOST_SECONDS + 1))
-    answer = os.dup(1)
-    os.dup2(2, 1)  # whatever the libraries print is no part of the answer
-    document = json.dumps(mjcf_document(words[0])).encode()
-    with os.fdopen(answer, "wb") as out:
-        out.write(document)
-    return 0
+    return answer_within(MOST_MEMORY, MOST_SECONDS, lambda: mjcf_document(words[0]))
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from helpers.forks import fork
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 
 from ident_service.config.quantities import TextFile
 from ident_service.errors import ModelError
+from ident_service.model.limited_process import ask_process
 from ident_service.model.mechanism import DEEPEST_LINKS, MOST_LINKS, Kind, read_mechanism
 
 LIMIT = '<limit lower="-1" upper="1" velocity="1" effort="1"/>'
@@ -70,7 +72,7 @@ ARM = (
         pytest.param("urdf", urdf(" " * 2**21), "larger than", id="bytes"),
         pytest.param("mjcf", "<mujoco>", "not a MJCF that can be read", id="no end"),
         # With this, pinocchio 3 writes beyond its memory; the daemon that read it died.
-        pytest.param("mjcf", ARM.replace('"slide"', '"universe"', 1).replace('qpos="0 0" ', ""), "MJCF", id="heap"),
+        pytest.param("mjcf", ARM.replace('"slide"', '"universe"', 1).replace('qpos="0 0" ', ""), "breaks what reads it", id="heap"),
     ],
 )
 def test_a_file_beyond_the_limits_is_one_clear_error(kind: Kind, text: str, message: str) -> None:
@@ -103,6 +105,32 @@ def test_an_mjcf_is_read_in_another_process() -> None:
     found = read_mechanism(TextFile(name="arm.xml", text=ARM), "mjcf")
     assert (found.names, found.damping.tolist(), found.armature.tolist()) == (("turn", "slide"), [1, 0], [0, 2])
     assert {name: joint for name, (joint, *_) in found.frames.items()} == {"one": 0, "two": 1}
+
+
+@pytest.mark.parametrize(
+    ("work", "deadline", "message"),
+    [
+        pytest.param("while True: pass", 30.0, "takes too long to read and judge", id="computes without an end"),
+        pytest.param("import time; time.sleep(60)", 0.5, "within 0.5 s", id="waits without an end"),
+        pytest.param("x = bytearray(2**30)", 30.0, "too much memory", id="memory"),
+        pytest.param("import os; os.abort()", 30.0, "breaks what reads it", id="abort"),
+        pytest.param("print('noise')", 30.0, None, id="good"),
+    ],
+)
+def test_a_process_ends_at_its_limits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, work: str, deadline: float, message: str | None
+) -> None:
+    (tmp_path / "limited_work.py").write_text(
+        "from ident_service.model.limited_process import answer_within\n"
+        f"def work():\n    {work}\n    return {{'done': True}}\n"
+        "answer_within(2**29, 1, work)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    if message is None:
+        assert ask_process("limited_work", tmp_path, deadline) == {"done": True}
+        return
+    with pytest.raises(ModelError, match=message):
+        ask_process("limited_work", tmp_path, deadline)
 
 
 BITS = [

@@ -16,6 +16,7 @@ from ident_service import __version__
 from ident_service.service.acceptance import settle
 from ident_service.service.api import about, access, arms, descriptions, exports, jobs, maintenance, pruning, runs
 from ident_service.service.api.asking import Service
+from ident_service.service.api.checks import Checks
 from ident_service.service.api.connections import Connections
 from ident_service.service.api.doors import Doors
 from ident_service.service.api.gate import Gate
@@ -61,7 +62,7 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
         lease_factor=settings.lease_factor,
     )
     keeper = Keeper(engine, _webhook(settings, db))
-    service = Service(settings, db, engine, Gate(db), Metrics(), keeper)
+    service = Service(settings, db, engine, Gate(db), Metrics(), keeper, Checks())
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:

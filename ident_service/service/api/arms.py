@@ -9,6 +9,7 @@ from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict, Field
 
 from ident_service.config.simulation import SimulatedDriver
+from ident_service.config.source import MOST_BYTES
 from ident_service.motion.control_file import mover
 from ident_service.service.acceptance import LONGEST_NOTE, accept, acceptances, rollback
 from ident_service.service.api.answers import (
@@ -42,7 +43,7 @@ class _Body(BaseModel):
 class Description(_Body):
     """An arm's description, as YAML, and the files that it names by name."""
 
-    description: Text
+    description: Annotated[str, Field(max_length=MOST_BYTES)]
     files: Annotated[dict[FileName, Text], Field(max_length=16)] = {}
 
 
@@ -73,10 +74,12 @@ def list_arms(service: Serving, _: Viewer) -> list[ArmLine]:
     return [ArmLine(**row) for row in known.arm_names(service.db)]
 
 
-@router.post("/arms", status_code=201)
+@router.post("/arms", status_code=201, responses=failures(503))
 def add_arm(service: Serving, who: Operator, body: Description) -> ArmAnswer:
     """Take a description; a later one of the same name replaces it."""
-    return _arm(service, known.add_arm(service.db, service.state, body.description, body.files, who.name).name)
+    with service.checks.place():
+        added = known.add_arm(service.db, service.state, body.description, body.files, who.name)
+    return _arm(service, added.name)
 
 
 @router.get("/arms/{arm}")

@@ -16,6 +16,7 @@ from fastapi import Depends, HTTPException, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBearer
 
+from ident_service.service.api.checks import Checks
 from ident_service.service.api.gate import Gate, Throttled
 from ident_service.service.api.metrics import Metrics
 from ident_service.service.api.settings import Settings
@@ -38,6 +39,7 @@ class Service:
     gate: Gate
     metrics: Metrics
     keeper: Keeper
+    checks: Checks
 
     @property
     def state(self) -> Path:

@@ -46,6 +46,7 @@ _WORDS: Final = {
     421: "The service is not called that.",
     422: "The request has mistakes; the message names them.",
     429: "Too many failed attempts.",
+    503: "Not at this moment: ask again after `Retry-After` seconds.",
 }
 
 
