@@ -72,7 +72,12 @@ ARM = (
         pytest.param("urdf", urdf(" " * 2**21), "larger than", id="bytes"),
         pytest.param("mjcf", "<mujoco>", "not a MJCF that can be read", id="no end"),
         # With this, pinocchio 3 writes beyond its memory; the daemon that read it died.
-        pytest.param("mjcf", ARM.replace('"slide"', '"universe"', 1).replace('qpos="0 0" ', ""), "breaks what reads it", id="heap"),
+        pytest.param(
+            "mjcf",
+            ARM.replace('"slide"', '"universe"', 1).replace('qpos="0 0" ', ""),
+            "breaks what reads it",
+            id="heap",
+        ),
     ],
 )
 def test_a_file_beyond_the_limits_is_one_clear_error(kind: Kind, text: str, message: str) -> None:
