@@ -242,6 +242,7 @@ LOCAL_ONLY: dict[str, str] = {
     "serve": "it is the daemon",
     "emulate": "it is drives on a bus of this machine, until they are switched off",
     "import": "a run with its recordings is larger than a request may be; copy its folder to the daemon's machine",
+    **dict.fromkeys(("backup", "restore"), "it is an act at the daemon's state folder"),
     "token add": "whoever got hold of an operator's token could make others that outlive it; "
     "it is an act at the daemon's state folder",
 }

@@ -69,7 +69,7 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
         settle(db, settings.state)
         engine.start(lambda: rebuild_runs(db, settings.state))
         keeper.start()
-        refreshing = asyncio.create_task(_refresh(service.gate))
+        refreshing = asyncio.create_task(_refresh(service))
         try:
             yield
         finally:
@@ -100,13 +100,14 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
     return app
 
 
-async def _refresh(gate: Gate) -> None:
+async def _refresh(service: Service) -> None:
     while True:
         await asyncio.sleep(_REFRESH)
         try:
-            await run_in_threadpool(gate.refresh)
+            await run_in_threadpool(service.gate.refresh)
+            await run_in_threadpool(service.db.rest)
         except sqlite3.Error as error:
-            _LOG.error("tokens cannot be read: %s", error)
+            _LOG.error("the registry cannot be looked after: %s", error)
 
 
 def _webhook(settings: Settings, db: Database) -> Webhook | None:

@@ -74,7 +74,7 @@ def list_arms(service: Serving, _: Viewer) -> list[ArmLine]:
     return [ArmLine(**row) for row in known.arm_names(service.db)]
 
 
-@router.post("/arms", status_code=201, responses=failures(503))
+@router.post("/arms", status_code=201)
 def add_arm(service: Serving, who: Operator, body: Description) -> ArmAnswer:
     """Take a description; a later one of the same name replaces it."""
     with service.checks.place():

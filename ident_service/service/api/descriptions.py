@@ -44,7 +44,7 @@ class HomeJoint(BaseModel):
     unit: Literal["rad", "m"]
 
 
-@router.post("/descriptions/check", responses=failures(503))
+@router.post("/descriptions/check")
 def check(service: Serving, _: Operator, body: Description) -> DescriptionAnswer:
     """Judge a description and keep nothing of it; its mistakes are answered with line and column."""
     with service.checks.place(), uploaded(service.state, body.description, body.files) as path:

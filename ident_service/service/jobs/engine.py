@@ -213,6 +213,9 @@ class Engine:
             self.beat = self._now()
             try:
                 self._look()
+            except sqlite3.Error as error:
+                LOG.error("the queue waits for the registry: %s", error)
+                time.sleep(_AGAIN)
             except Exception:  # the queue must go on, whatever one job does to it
                 LOG.exception("the queue stumbled")
                 time.sleep(_AGAIN)
@@ -289,8 +292,9 @@ class Engine:
         while True:
             try:
                 self._finish(live, ended.state, self._kept(live, ended.detail), ended.exit_code)
-            except sqlite3.Error:  # a full disk, say; until there is room, nobody may take this service for a sound one
-                LOG.exception("the end of a job cannot be entered yet", extra={"job": live.job})
+            except sqlite3.Error as error:
+                # A full disk, say; until there is room, nobody may take this service for a sound one.
+                LOG.error("the end of a job cannot be entered yet: %s", error, extra={"job": live.job})
                 self._unwritten.add(live.job)
                 if self._closing.wait(_AGAIN):
                     return  # the next start finds out what became of it
