@@ -11,6 +11,7 @@
     ├── ParameterError (ValueError)    a parameter file or expression that does not parse or does not fit
     ├── SolverError (RuntimeError)     the conic solver stopped anywhere but at an optimum
     ├── MotionRefused (ValueError)     a motion that would leave the arm's limits, refused before anything moves
+    │   └── PersonNeeded               a re-identification that judged nothing: somebody must look at the arm first
     └── ArmError (RuntimeError)        something below the motion loop
         ├── DriverError (OSError)      the arm cannot be opened, enabled or reached
         │   ├── AnotherDrive           a drive answers that the description does not name
@@ -94,6 +95,10 @@ class SolverError(IdentError, RuntimeError):
 
 class MotionRefused(IdentError, ValueError):
     """A motion would leave the arm's limits; nothing has moved."""
+
+
+class PersonNeeded(MotionRefused):
+    """A re-identification was refused by preflight or by the arm, so nothing is known about a change of the arm."""
 
 
 class ArmError(IdentError, RuntimeError):

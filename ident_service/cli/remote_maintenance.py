@@ -11,7 +11,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from ident_service.cli.answer import DONE, FAILED, FAULTED, VERDICT_NO, Answer, StopOnSignal, tell
+from ident_service.cli.answer import DONE, FAILED, VERDICT_NO, Answer, StopOnSignal, tell
+from ident_service.cli.reidentify import EXIT_CODES
 from ident_service.cli.remote import confirmation, motion_id, word_of_address
 from ident_service.cli.schedule import alarm_lines, due_line, schedule_line
 
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from ident_service.service.client import Client
 
 _LOOK = 0.4  # s between looks, and between renewals of the lease
-_CODES = {"unchanged": DONE, "changed": VERDICT_NO, "impossible": VERDICT_NO, "refused": VERDICT_NO, "faulted": FAULTED}
 _API = "/api/v1"
 
 
@@ -108,7 +108,7 @@ def _reidentify(client: Client, arguments: argparse.Namespace) -> Answer:
             time.sleep(_LOOK)
             row = client.get(path)
     text = f"{row['arm']}: {row['detail'] or row['state']}\n" + (f"run {row['run']}\n" if row["run"] else "")
-    return _CODES.get(row["state"], FAILED), text, row
+    return EXIT_CODES.get(row["state"], FAILED), text, row
 
 
 VERBS: dict[str, Callable[[Client, argparse.Namespace], Answer]] = {

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -130,8 +129,7 @@ class _Builder:
 
     def tree(self) -> Tree:
         try:
-            with closing(yaml.parse(self._text, Loader=yaml.CSafeLoader)) as events:
-                self._document(events)
+            self._document(yaml.parse(self._text, Loader=yaml.CSafeLoader))
         except yaml.MarkedYAMLError as error:
             mark = error.problem_mark or error.context_mark
             line, column = (mark.line + 1, mark.column + 1) if mark else (1, 1)
@@ -155,7 +153,7 @@ class _Builder:
                 self._tree.value = self._value(event, (), events, 1)
 
     def _value(self, event: yaml.Event, where: KeyPath, events: Iterator[yaml.Event], depth: int) -> Any:
-        self._tree.places[where] = (self._path, event.start_mark.line + 1, event.start_mark.column + 1)
+        self._tree.places[where] = (self._path, *_place(event))
         self._refuse_unplain(event)
         if isinstance(event, yaml.ScalarEvent):
             return _scalar(event, self._path)
@@ -177,7 +175,7 @@ class _Builder:
     def _mapping(self, where: KeyPath, events: Iterator[yaml.Event], depth: int) -> dict[str, Any]:
         result: dict[str, Any] = {}
         while not isinstance(key_event := next(events), yaml.MappingEndEvent):
-            here = (self._path, key_event.start_mark.line + 1, key_event.start_mark.column + 1)
+            here = (self._path, *_place(key_event))
             if isinstance(key_event, yaml.ScalarEvent) and not (key_event.value == "<<" and key_event.implicit[0]):
                 self._refuse_unplain(key_event)
                 key = str(key_event.value)
@@ -199,7 +197,12 @@ class _Builder:
             self._refused.append(self._problem(event, f"tag {tag!r} is refused"))
 
     def _problem(self, event: yaml.Event, message: str) -> Problem:
-        return Problem(self._path, event.start_mark.line + 1, event.start_mark.column + 1, message)
+        return Problem(self._path, *_place(event), message)
+
+
+def _place(event: yaml.Event) -> tuple[int, int]:
+    mark = event.start_mark
+    return (1, 1) if mark is None else (mark.line + 1, mark.column + 1)
 
 
 def _scalar(event: yaml.ScalarEvent, path: Path) -> Any:
