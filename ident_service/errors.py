@@ -4,7 +4,8 @@
 
     IdentError
     ├── UsageError (ValueError)        a command or call that cannot be meant: missing file, contradictory options
-    │   └── UnknownId (LookupError)    an id that the registry does not have
+    │   ├── UnknownId (LookupError)    an id that the registry does not have
+    │   └── AlreadyThere               a name that is taken, where replacing it was not asked for
     ├── ConfigError (ValueError)       an arm description with mistakes, all of them, each with file:line:column
     ├── ModelError (ValueError)        a mechanism or array shape that the model cannot represent
     ├── RecordingError (ValueError)    a recording that cannot be used: wrong joints, NaN, too short, torn row
@@ -45,6 +46,10 @@ class UsageError(IdentError, ValueError):
 
 class UnknownId(UsageError, LookupError):
     """An arm, motion, run, file or job was named that the registry does not have."""
+
+
+class AlreadyThere(UsageError):
+    """A name is taken, and replacing what has it was not asked for."""
 
 
 @dataclass(frozen=True)

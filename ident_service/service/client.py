@@ -13,6 +13,7 @@ from typing import Any, Final
 from urllib.parse import urlsplit
 
 from ident_service.errors import (
+    AlreadyThere,
     ArmError,
     ConfigError,
     IdentError,
@@ -26,7 +27,7 @@ from ident_service.errors import (
 _PATIENCE = 30.0  # s for one answer
 _MOST = 64 * 2**20
 _KINDS: Final[dict[str, type[IdentError]]] = {
-    kind.__name__: kind for kind in (UsageError, UnknownId, MotionRefused, ParameterError, ArmError)
+    kind.__name__: kind for kind in (UsageError, UnknownId, AlreadyThere, MotionRefused, ParameterError, ArmError)
 }
 
 

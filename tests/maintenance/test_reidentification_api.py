@@ -26,7 +26,7 @@ def daemon(accepted: str, state: Path) -> Iterator[Asked]:
 
 
 def upload(daemon: Asked, text: str) -> None:
-    assert daemon.post("/api/v1/arms", {"description": text}).status_code == 201
+    assert daemon.post("/api/v1/arms", {"description": text, "replace": True}).status_code == 201
 
 
 def followed(daemon: Asked, name: str, *, lease: bool) -> dict[str, Any]:
@@ -129,7 +129,7 @@ def test_the_command_drives_a_daemon(accepted: str, state: Path, capsys: pytest.
 
     with daemon_process(state) as (process, client):
         url = url_of(process, state)
-        client.post("/api/v1/arms", {"description": description(seed=33)})
+        client.post("/api/v1/arms", {"description": description(seed=33), "replace": True})
         assert "next 20" in ident("schedule", "add", ARM, "--cron", "0 6 * * mon")[1]
         assert ident("schedule", "add", ARM, "--maintenance")[0] == 0
         assert ident("schedule", "disable", "1")[1].endswith(", disabled\n")
@@ -154,7 +154,7 @@ def test_the_command_drives_a_daemon(accepted: str, state: Path, capsys: pytest.
 def test_a_kill_in_the_midst_is_told_and_nothing_moves_by_itself(accepted: str, state: Path, step: str) -> None:
     path = "/api/v1/reidentifications"
     with daemon_process(state) as (process, client):
-        client.post("/api/v1/arms", {"description": description(seed=34)})
+        client.post("/api/v1/arms", {"description": description(seed=34), "replace": True})
         word = client.post(f"/api/v1/arms/{ARM}/challenge")["challenge"]
         row = client.post(path, {"arm": ARM, "confirm": {"name": ARM, "challenge": word}})
         while not (row["step"] == step and client.get(f"/api/v1/jobs/{row['job']}")["state"] == "running"):

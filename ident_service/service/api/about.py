@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Request, Response
 from fastapi.responses import PlainTextResponse
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -15,6 +15,7 @@ from ident_service.service.api.answers import AuditLine, HealthAnswer, WhoAnswer
 from ident_service.service.api.asking import COOKIE, Cookie, Serving, Viewer, address_of, throttled, unknown
 from ident_service.service.api.gate import SESSION_SECONDS, Throttled
 from ident_service.service.api.mistakes import failures, failures_of_files
+from ident_service.service.api.paging import PAGES, BeforeNumber, Most, Page
 from ident_service.service.arm_state import fault_file
 from ident_service.service.maintenance.alarms import alarms
 from ident_service.service.maintenance.schedules import dues
@@ -93,13 +94,8 @@ def logout(service: Serving, response: Response, cookie: Cookie = None) -> None:
     response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
 
 
-@router.get("/api/v1/audit")
-def audit(
-    service: Serving,
-    _: Viewer,
-    before: Annotated[int, Query(ge=0, lt=2**62)] | None = None,
-    most: Annotated[int, Query(ge=1, le=500)] = 100,
-) -> list[AuditLine]:
-    """Who did what, the newest first; `before` the id of a line goes on from there."""
+@router.get("/api/v1/audit", responses=PAGES)
+def audit(page: Page, service: Serving, _: Viewer, before: BeforeNumber = None, most: Most = 100) -> list[AuditLine]:
+    """Who did what, the newest first."""
     service.engine.audit.flush(AUDIT_SECONDS)
-    return [AuditLine(**row) for row in trail(service.db, before=before, most=most)]
+    return [AuditLine(**row) for row in page(most, lambda n: trail(service.db, before=before, most=n))]

@@ -24,6 +24,7 @@ from ident_service.service.api.answers import (
 from ident_service.service.api.asking import Operator, Service, Serving, Viewer
 from ident_service.service.api.gate import CHALLENGE_SECONDS
 from ident_service.service.api.mistakes import failures
+from ident_service.service.api.paging import PAGES, BeforeId, Most, Page
 from ident_service.service.arm_state import control_path, fault_file
 from ident_service.service.jobs.asked import ArmName, FileName, Id
 from ident_service.service.registry import arms as known
@@ -45,6 +46,15 @@ class Description(_Body):
 
     description: Annotated[str, Field(max_length=MOST_BYTES)]
     files: Annotated[dict[FileName, Text], Field(max_length=16)] = {}
+
+
+class NewArm(Description):
+    """A description that is to be kept.
+
+    `replace` says that it may take the place of another one of its name; without it that is answered 409.
+    """
+
+    replace: bool = False
 
 
 class MotionUpload(_Body):
@@ -74,11 +84,12 @@ def list_arms(service: Serving, _: Viewer) -> list[ArmLine]:
     return [ArmLine(**row) for row in known.arm_names(service.db)]
 
 
-@router.post("/arms", status_code=201)
-def add_arm(service: Serving, who: Operator, body: Description) -> ArmAnswer:
-    """Take a description; a later one of the same name replaces it."""
+@router.post("/arms", status_code=201, responses=failures(409))
+def add_arm(service: Serving, who: Operator, body: NewArm) -> ArmAnswer:
+    """Take a description; sending the same one again changes nothing."""
+    text, files = body.description, body.files
     with service.checks.place():
-        added = known.add_arm(service.db, service.state, body.description, body.files, who.name)
+        added = known.add_arm(service.db, service.state, text, files, who.name, replace=body.replace)
     return _arm(service, added.name)
 
 
@@ -154,10 +165,13 @@ def roll_back(service: Serving, who: Operator, arm: ArmName, body: Rollback) -> 
     return AcceptanceAnswer(**asdict(rollback(service.db, service.state, name, body.note, who.name, body.to)))
 
 
-@router.get("/motions")
-def list_motions(service: Serving, _: Viewer, arm: ArmName | None = None) -> list[MotionAnswer]:
-    """All motions, or those of an arm, the newest first."""
-    return [MotionAnswer(**row) for row in motions.motions(service.db, arm)]
+@router.get("/motions", responses=PAGES)
+def list_motions(
+    page: Page, service: Serving, _: Viewer, arm: ArmName | None = None, before: BeforeId = None, most: Most = 500
+) -> list[MotionAnswer]:
+    """Motions, or those of an arm, the newest first."""
+    found = page(most, lambda n: motions.motions(service.db, arm, before=before, most=n))
+    return [MotionAnswer(**row) for row in found]
 
 
 @router.post("/motions", status_code=201)

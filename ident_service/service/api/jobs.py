@@ -18,6 +18,7 @@ from ident_service.errors import MotionRefused
 from ident_service.service.api.answers import JobAnswer, JobResult, LeaseAnswer, StopAnswer
 from ident_service.service.api.asking import LeaseKeeper, Near, Operator, Service, Serving, Viewer
 from ident_service.service.api.mistakes import failures, failures_of_files
+from ident_service.service.api.paging import PAGES, BeforeNumber, Most, Page
 from ident_service.service.jobs.asked import MOVES, ArmName, Asked, Id
 from ident_service.service.jobs.commands import JOBS
 from ident_service.service.jobs.outcome import said
@@ -76,17 +77,19 @@ def create_job(service: Serving, who: Operator, body: JobRequest) -> JobAnswer:
     return answer_of(service, service.engine.create(body.job, who.name))
 
 
-@router.get("/jobs")
+@router.get("/jobs", responses=PAGES)
 def list_jobs(
+    page: Page,
     service: Serving,
     _: Viewer,
     state: Annotated[list[State] | None, Query()] = None,
     arm: ArmName | None = None,
-    before: Annotated[int, Query(ge=0, lt=2**62)] | None = None,
-    most: Annotated[int, Query(ge=1, le=500)] = 100,
+    before: BeforeNumber = None,
+    most: Most = 100,
 ) -> list[JobAnswer]:
-    """Jobs, the newest first; `before` the number of one goes on from there."""
-    found = rows.jobs(service.db, states=tuple(state or rows.STATES), arm=arm, before=before, most=most)
+    """Jobs, the newest first."""
+    states = tuple(state or rows.STATES)
+    found = page(most, lambda n: rows.jobs(service.db, states=states, arm=arm, before=before, most=n), "number")
     return [answer_of(service, row) for row in found]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import Annotated
 
-from fastapi import APIRouter, HTTPException, Path, Query
+from fastapi import APIRouter, HTTPException, Path
 from fastapi.concurrency import run_in_threadpool
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -21,6 +21,7 @@ from ident_service.service.api.maintenance_answers import (
     ScheduleAnswer,
 )
 from ident_service.service.api.mistakes import failures
+from ident_service.service.api.paging import PAGES, BeforeId, BeforeNumber, Most, Page
 from ident_service.service.jobs.asked import ArmName, Id
 from ident_service.service.maintenance import alarms as raised
 from ident_service.service.maintenance import schedules as planned
@@ -30,7 +31,6 @@ from ident_service.service.registry.database import Row
 
 router = APIRouter(prefix="/api/v1", tags=["maintenance"], responses=failures(404, 409))
 Number = Annotated[int, Path(ge=1, lt=2**62)]
-Most = Annotated[int, Query(ge=1, le=500)]
 Words = Annotated[str, Field(min_length=1, max_length=planned.LONGEST_NOTE)]
 
 
@@ -102,10 +102,14 @@ def remove_schedule(service: Serving, who: Operator, number: Number) -> None:
     planned.remove_schedule(service.db, number, who.name)
 
 
-@router.get("/arms/{arm}/maintenance")
-def list_maintenance(service: Serving, _: Viewer, arm: ArmName, most: Most = 100) -> list[EventAnswer]:
-    """Maintenance of an arm, the newest first."""
-    return [EventAnswer(**row) for row in planned.events(service.db, _arm(service, arm), most=most)]
+@router.get("/arms/{arm}/maintenance", responses=PAGES)
+def list_maintenance(
+    page: Page, service: Serving, _: Viewer, arm: ArmName, before: BeforeNumber = None, most: Most = 100
+) -> list[EventAnswer]:
+    """Maintenance that was done, the newest first."""
+    name = _arm(service, arm)
+    found = page(most, lambda n: planned.events(service.db, name, before=before, most=n))
+    return [EventAnswer(**row) for row in found]
 
 
 @router.post("/arms/{arm}/maintenance", status_code=201)
@@ -127,12 +131,13 @@ def dismiss_due(service: Serving, who: Operator, number: Number, body: Remark) -
     planned.dismiss(service.db, number, body.note, who.name, time.time())
 
 
-@router.get("/reidentifications")
+@router.get("/reidentifications", responses=PAGES)
 def list_reidentifications(
-    service: Serving, _: Viewer, arm: ArmName | None = None, most: Most = 100
+    page: Page, service: Serving, _: Viewer, arm: ArmName | None = None, before: BeforeId = None, most: Most = 100
 ) -> list[ReidentificationAnswer]:
-    """All of them, or those of an arm, the newest first."""
-    return [_told(service, row) for row in reidentifications(service.db, arm, most=most)]
+    """Re-identifications, the newest first."""
+    found = page(most, lambda n: reidentifications(service.db, arm, before=before, most=n))
+    return [_told(service, row) for row in found]
 
 
 @router.post("/reidentifications", status_code=201)
@@ -163,12 +168,19 @@ async def renew_reidentification(service: Serving, who: LeaseKeeper, name: Id) -
     return LeaseAnswer(job=step[1] or "", seconds=LEASE_SECONDS)
 
 
-@router.get("/alarms")
+@router.get("/alarms", responses=PAGES)
 def list_alarms(
-    service: Serving, _: Viewer, arm: ArmName | None = None, closed: bool = False, most: Most = 100
+    page: Page,
+    service: Serving,
+    _: Viewer,
+    arm: ArmName | None = None,
+    closed: bool = False,
+    before: BeforeNumber = None,
+    most: Most = 100,
 ) -> list[AlarmAnswer]:
-    """Drift alarms that stand, or with `closed` all of them, the newest first."""
-    return [AlarmAnswer(**row) for row in raised.alarms(service.db, arm, closed=closed, most=most)]
+    """Drift alarms that stand, or all that ever were raised, the newest first."""
+    found = page(most, lambda n: raised.alarms(service.db, arm, closed=closed, before=before, most=n))
+    return [AlarmAnswer(**row) for row in found]
 
 
 @router.post("/alarms/{number}/ack")

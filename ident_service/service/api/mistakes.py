@@ -14,6 +14,7 @@ from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
 from ident_service.errors import (
+    AlreadyThere,
     ArmError,
     ConfigError,
     IdentError,
@@ -29,6 +30,7 @@ from ident_service.service.registry.database import RegistryBusy
 
 _STATUS: Final[tuple[tuple[type[IdentError], int], ...]] = (
     (UnknownId, 404),
+    (AlreadyThere, 409),
     (UsageError, 400),
     (ConfigError, 422),
     (ModelError, 422),
@@ -44,7 +46,7 @@ _WORDS: Final = {
     403: "Not with this role, or not from this page.",
     404: "No such thing is known.",
     405: "Not with this method.",
-    409: "Not now: a fault, a lease or another motion stands against it.",
+    409: "Not now: a fault, a lease, another motion, or a name that is taken stands against it.",
     413: "Too large.",
     421: "The service is not called that.",
     422: "The request has mistakes; the message names them.",

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Any
 
-from fastapi import APIRouter, Query
+from fastapi import APIRouter
 from fastapi.responses import FileResponse
 
 from ident_service.errors import UnknownId
 from ident_service.service.api.answers import ParametersAnswer, RecordingAnswer, RunAnswer, RunLine
 from ident_service.service.api.asking import Serving, Viewer
 from ident_service.service.api.mistakes import failures, failures_of_files
+from ident_service.service.api.paging import PAGES, BeforeId, Most, Page
 from ident_service.service.jobs.asked import ArmName, FileName, Id
 from ident_service.service.jobs.commands import REPORTS
 from ident_service.service.registry import runs
@@ -32,12 +33,12 @@ _PAGE: dict[int | str, dict[str, Any]] = {
 }
 
 
-@router.get("/runs")
+@router.get("/runs", responses=PAGES)
 def list_runs(
-    service: Serving, _: Viewer, arm: ArmName | None = None, most: Annotated[int, Query(ge=1, le=500)] = 100
+    page: Page, service: Serving, _: Viewer, arm: ArmName | None = None, before: BeforeId = None, most: Most = 100
 ) -> list[RunLine]:
     """Runs, the newest first."""
-    return [RunLine(**row) for row in runs.runs(service.db, arm, most=most)]
+    return [RunLine(**row) for row in page(most, lambda n: runs.runs(service.db, arm, before=before, most=n))]
 
 
 @router.get("/runs/{run}")

@@ -10,6 +10,7 @@ from ident_service.errors import IdentError, MotionRefused, UsageError
 from ident_service.motion.control_file import in_use
 from ident_service.service.api import arms, jobs
 from ident_service.service.api.asking import Operator, Service, Serving, Viewer
+from ident_service.service.api.mistakes import status_of
 from ident_service.service.arm_state import control_path, fault_file
 from ident_service.service.jobs.asked import MOVES, ArmName
 from ident_service.service.maintenance import schedules as planned
@@ -57,17 +58,17 @@ def list_arms(service: Serving, who: Viewer) -> Response:
 @router.get("/new")
 def describe(who: Operator) -> Response:
     """Ask for a description."""
-    return page("new", who, problem="", text="")
+    return page("new", who, problem="", text="", replace=False)
 
 
 @router.post("/new")
 def take_description(service: Serving, who: Operator, form: Form) -> Response:
     """Take it, or show every mistake in it."""
-    text = form.get("description", "").replace("\r\n", "\n")
+    text, replace = form.get("description", "").replace("\r\n", "\n"), "replace" in form
     try:
-        added = arms.add_arm(service, who, arms.Description(description=text))
+        added = arms.add_arm(service, who, arms.NewArm(description=text, replace=replace))
     except IdentError as error:
-        return page("new", who, 422, problem=str(error), text=text)
+        return page("new", who, status_of(error), problem=str(error), text=text, replace=replace)
     return seen(f"/arms/{added.name}")
 
 
