@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -13,6 +14,7 @@ from daemon.test_doors_shut import refusal
 from ident_service.service.registry import jobs as rows
 from ident_service.service.registry.audit import note, trail
 from ident_service.service.registry.database import Database
+from ident_service.service.registry.tokens import add_token
 
 COUNT = 12
 
@@ -93,6 +95,32 @@ def test_a_page_after_what_is_not_there_is_refused(daemon: Asked) -> None:
     for path in ("runs", "motions", "reidentifications"):
         refusal(daemon.get(f"/api/v1/{path}?before=nothing"), 404)
         refusal(daemon.get(f"/api/v1/{path}?before=../x"), 422)
+
+
+def test_a_computation_that_is_asked_for_twice_is_one_job(daemon: Asked, viewer: str) -> None:
+    base: dict[str, object] = {"job": {"kind": "base", "arm": "planar2"}}
+
+    def post(key: str, body: dict[str, object] = base) -> Any:
+        return daemon.post("/api/v1/jobs", body, headers={"Idempotency-Key": key})
+
+    with ThreadPoolExecutor(8) as clients:
+        answers = list(clients.map(post, ["first"] * 8))
+    assert [answer.status_code for answer in answers] == [201] * 8, [answer.text for answer in answers]
+    assert len({answer.json()["id"] for answer in answers}) == 1
+    assert sorted(answer.headers.get("idempotent-replayed", "") for answer in answers) == ["", *["true"] * 7]
+    assert len(rows.jobs(daemon.service.db)) == 1
+    assert len(list((daemon.service.state / "jobs").iterdir())) == 1
+    refusal(post("first", {"job": {"kind": "base", "arm": "sixaxis"}}), 409, "used for another request")
+    assert post("second").json()["id"] != answers[0].json()["id"]
+    for key in ("a b", "", "x" * 201):
+        refusal(post(key), 422)
+    body = {"job": {"kind": "home", "arm": "planar2"}, "confirm": {"name": "planar2", "challenge": "x"}}
+    refusal(post("third", body), 400, "its challenge counts once")
+    # Another token has keys of its own, and a day later a key is forgotten.
+    daemon.service.db.write("UPDATE idempotency_keys SET at = at - 90000")
+    assert "idempotent-replayed" not in post("first").headers
+    daemon.as_token(add_token(daemon.service.db, "other", "operator", "test"))
+    assert "idempotent-replayed" not in post("second").headers
 
 
 def test_a_name_that_is_taken_is_replaced_where_that_is_asked_for(daemon: Asked) -> None:

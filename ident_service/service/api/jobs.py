@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import json
+import sqlite3
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from typing import Annotated, Any, Final, Literal
 
-from fastapi import APIRouter, HTTPException, Query
+from fastapi import APIRouter, Header, HTTPException, Query, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import PlainTextResponse, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
-from ident_service.errors import MotionRefused
+from ident_service.errors import MotionRefused, UsageError
 from ident_service.service.api.answers import JobAnswer, JobResult, LeaseAnswer, StopAnswer
 from ident_service.service.api.asking import LeaseKeeper, Near, Operator, Service, Serving, Viewer
 from ident_service.service.api.mistakes import failures, failures_of_files
@@ -35,6 +37,22 @@ _STREAM: dict[int | str, dict[str, Any]] = {
     200: {"content": {"text/event-stream": {}}, "description": "Events."},
     **failures_of_files(404, 409),
 }
+_REPLAYED: Final[dict[str, Any]] = {
+    "Idempotent-Replayed": {
+        "description": "`true` where the key had made this job before.",
+        "schema": {"type": "string"},
+    }
+}
+Key = Annotated[
+    str | None,
+    Header(
+        min_length=1,
+        max_length=200,
+        pattern=r"^[\x21-\x7e]+$",
+        description="of computations: within a day, the same token, key and job are answered with the job that was "
+        "made then, and another job with the same key is 409",
+    ),
+]
 State = Literal["queued", "running", "done", "refused", "failed", "faulted", "cancelled", "interrupted"]
 
 
@@ -69,12 +87,31 @@ def require_confirmed(service: Service, arm: str, confirm: Confirmation | None, 
         )
 
 
-@router.post("/jobs", status_code=201)
-def create_job(service: Serving, who: Operator, body: JobRequest) -> JobAnswer:
-    """Queue a job."""
+@router.post("/jobs", status_code=201, responses={201: {"headers": _REPLAYED}})
+def create_job(
+    service: Serving, who: Operator, body: JobRequest, response: Response, idempotency_key: Key = None
+) -> JobAnswer:
+    """Queue a job; a computation that is asked for again with the same `Idempotency-Key` is the same job."""
     if body.job.kind in MOVES:
+        if idempotency_key is not None:
+            raise UsageError("a motion has no Idempotency-Key: its challenge counts once, and it must not begin later")
         require_confirmed(service, getattr(body.job, "arm", ""), body.confirm, who.name)
-    return answer_of(service, service.engine.create(body.job, who.name))
+    if idempotency_key is None:
+        return answer_of(service, service.engine.create(body.job, who.name))
+    asked = hashlib.sha256(body.job.model_dump_json().encode()).hexdigest()
+    if (row := rows.job_of_key(service.db, who.name, idempotency_key, asked)) is None:
+
+        def enter(job: Row) -> None:
+            rows.enter_key(service.db, who.name, idempotency_key, asked, job["id"])
+
+        try:
+            return answer_of(service, service.engine.create(body.job, who.name, entering=enter))
+        except sqlite3.IntegrityError:  # the same request came twice at a time, and the other one was the first
+            row = rows.job_of_key(service.db, who.name, idempotency_key, asked)
+            if row is None:
+                raise
+    response.headers["Idempotent-Replayed"] = "true"
+    return answer_of(service, row)
 
 
 @router.get("/jobs", responses=PAGES)

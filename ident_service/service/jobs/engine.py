@@ -16,6 +16,7 @@ import sqlite3
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -137,6 +138,8 @@ class Engine:
                 entering(row)
         except BaseException:
             self.live.remove(live)
+            with suppress(OSError):
+                (self.state / JOBS / job).rmdir()
             raise
         self.live.enter(live)
         return row
