@@ -36,7 +36,7 @@ class Login(BaseModel):
     "/healthz", responses={503: {"model": HealthAnswer, "description": "Queue or schedule is not looked after."}}
 )
 def healthz(service: Serving, response: Response) -> HealthAnswer:
-    """Whether the service looks after its queue and its schedule; asks for no token."""
+    """Tell whether the service looks after its queue and its schedule; asks for no token."""
     healthy = service.engine.healthy and service.keeper.healthy and not service.engine.closing
     response.status_code = 200 if healthy else 503
     return HealthAnswer(healthy=healthy, version=__version__)
@@ -44,7 +44,7 @@ def healthz(service: Serving, response: Response) -> HealthAnswer:
 
 @router.get("/metrics", response_class=PlainTextResponse, responses=failures_of_files())
 def metrics(service: Serving, _: Viewer) -> PlainTextResponse:
-    """Figures in Prometheus' text format."""
+    """Read the figures of the service in Prometheus' text format."""
     rows = service.db.rows("SELECT kind, state, COUNT(*) AS number FROM jobs GROUP BY kind, state")
     faults, place = dict[str, int](), service.state / "arms"
     for folder in place.iterdir() if place.is_dir() else ():
@@ -61,13 +61,13 @@ def metrics(service: Serving, _: Viewer) -> PlainTextResponse:
 
 @router.get("/api/v1/whoami")
 def whoami(who: Viewer) -> WhoAnswer:
-    """Who asks."""
+    """Tell whose token or session asks."""
     return WhoAnswer(name=who.name, role=who.role)
 
 
 @router.post("/api/v1/login")
 def login(service: Serving, request: Request, response: Response, body: Login) -> WhoAnswer:
-    """Exchange a token for a session, in a cookie that scripts cannot read and other sites do not send."""
+    """Exchange a token for a session; its cookie cannot be read by scripts and is sent by no other site."""
     try:
         found = service.gate.log_in(body.token, address_of(request))
     except Throttled as error:
@@ -88,7 +88,7 @@ def login(service: Serving, request: Request, response: Response, body: Login) -
 
 @router.post("/api/v1/logout", status_code=204)
 def logout(service: Serving, response: Response, cookie: Cookie = None) -> None:
-    """End the session."""
+    """End the session of the page."""
     if cookie is not None:
         service.gate.log_out(cookie)
     response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
@@ -96,6 +96,6 @@ def logout(service: Serving, response: Response, cookie: Cookie = None) -> None:
 
 @router.get("/api/v1/audit", responses=PAGES)
 def audit(page: Page, service: Serving, _: Viewer, before: BeforeNumber = None, most: Most = 100) -> list[AuditLine]:
-    """Who did what, the newest first."""
+    """List who did what, the newest first."""
     service.engine.audit.flush(AUDIT_SECONDS)
     return [AuditLine(**row) for row in page(most, lambda n: trail(service.db, before=before, most=n))]

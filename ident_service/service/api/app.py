@@ -18,6 +18,7 @@ from ident_service.service.api import about, access, arms, descriptions, exports
 from ident_service.service.api.asking import Service
 from ident_service.service.api.checks import Checks
 from ident_service.service.api.connections import Connections
+from ident_service.service.api.description import describe
 from ident_service.service.api.doors import Doors
 from ident_service.service.api.gate import Gate
 from ident_service.service.api.metrics import Metrics
@@ -94,6 +95,7 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
     app.state.live = LiveRuns()
     for router in ROUTERS:
         app.include_router(router)
+    describe(app)
     answer_mistakes(app)
     book = Connections() if connections is None else connections
     app.add_middleware(Doors, settings=settings, metrics=service.metrics, connections=book)

@@ -46,7 +46,7 @@ class HomeJoint(BaseModel):
 
 @router.post("/descriptions/check")
 def check(service: Serving, _: Operator, body: Description) -> DescriptionAnswer:
-    """Judge a description and keep nothing of it; its mistakes are answered with line and column."""
+    """Check a description without keeping it; its mistakes are answered with line and column."""
     with service.checks.place(), uploaded(service.state, body.description, body.files) as path:
         load_arm(path, upload=True)  # most have mistakes that are found here, without a process
         return DescriptionAnswer(**judge_apart(path))
@@ -54,7 +54,7 @@ def check(service: Serving, _: Operator, body: Description) -> DescriptionAnswer
 
 @router.get("/arms/{arm}/home")
 def get_home(service: Serving, _: Viewer, arm: ArmName) -> list[HomeJoint]:
-    """The posture in which an arm must stand when a job of the kind `zero` is asked for; refused for other arms."""
+    """Show the posture in which an arm must stand when it is zeroed; refused for other arms."""
     from ident_service.service.zeroing import home_posture
 
     return [HomeJoint(**asdict(one)) for one in home_posture(known_arm(service.db, service.state, arm).config)]

@@ -91,7 +91,7 @@ def require_confirmed(service: Service, arm: str, confirm: Confirmation | None, 
 def create_job(
     service: Serving, who: Operator, body: JobRequest, response: Response, idempotency_key: Key = None
 ) -> JobAnswer:
-    """Queue a job; a computation that is asked for again with the same `Idempotency-Key` is the same job."""
+    """Begin or queue a job; a computation that is asked for again with the same `Idempotency-Key` is the same job."""
     if body.job.kind in MOVES:
         if idempotency_key is not None:
             raise UsageError("a motion has no Idempotency-Key: its challenge counts once, and it must not begin later")
@@ -124,7 +124,7 @@ def list_jobs(
     before: BeforeNumber = None,
     most: Most = 100,
 ) -> list[JobAnswer]:
-    """Jobs, the newest first."""
+    """List jobs, the newest first."""
     states = tuple(state or rows.STATES)
     found = page(most, lambda n: rows.jobs(service.db, states=states, arm=arm, before=before, most=n), "number")
     return [answer_of(service, row) for row in found]
@@ -132,20 +132,20 @@ def list_jobs(
 
 @router.get("/jobs/{job}")
 def get_job(service: Serving, _: Viewer, job: Id) -> JobAnswer:
-    """One job."""
+    """Show a job: its state, its progress, and why it ended."""
     return answer_of(service, rows.known_job(service.db, job))
 
 
 @router.get("/jobs/{job}/log", response_class=PlainTextResponse, responses=failures_of_files(404, 409))
 def get_log(service: Serving, _: Viewer, job: Id) -> PlainTextResponse:
-    """What its process said, the last of it."""
+    """Read the end of the log of a job."""
     row = rows.known_job(service.db, job)
     return PlainTextResponse(said(service.state / JOBS / row["id"], MOST_LOG).log)
 
 
 @router.get("/jobs/{job}/result")
 def get_result(service: Serving, _: Viewer, job: Id) -> JobResult:
-    """What its command answered."""
+    """Read what the command of a job answered."""
     row = rows.known_job(service.db, job)
     answer = said(service.state / JOBS / row["id"]).answer
     return JobResult(job=row["id"], answer=without_paths(answer, str(service.state)))
@@ -153,21 +153,21 @@ def get_result(service: Serving, _: Viewer, job: Id) -> JobResult:
 
 @router.get("/jobs/{job}/events", response_class=StreamingResponse, responses=_STREAM)
 async def watch_job(service: Serving, _: Viewer, job: Id) -> StreamingResponse:
-    """Server-sent events: `job` whenever it changes, until it has ended."""
+    """Watch a job by server-sent events; `job` whenever it changes, until it has ended."""
     row = await run_in_threadpool(rows.known_job, service.db, job)
     return StreamingResponse(_events(service, row["id"]), media_type="text/event-stream")
 
 
 @router.post("/jobs/{job}/cancel")
 def cancel_job(service: Serving, who: Operator, job: Id) -> JobAnswer:
-    """Have it end; a motion comes to a controlled stop, and the job then says what happened."""
+    """Cancel a job; a motion comes to a controlled stop, and the job then says what happened."""
     service.engine.cancel(job, who.name)
     return answer_of(service, rows.known_job(service.db, job))
 
 
 @router.post("/jobs/{job}/lease")
 async def renew_lease(service: Serving, who: LeaseKeeper, job: Id) -> LeaseAnswer:
-    """Say that whoever asked for the motion is still there; only they can."""
+    """Renew the lease of a motion; only whoever asked for it can."""
     holder = service.engine.live.lease_holder(job)
     if holder is not None and holder != who.name:
         raise HTTPException(403, "the lease of a motion is renewed by whoever asked for it")
@@ -179,13 +179,13 @@ async def renew_lease(service: Serving, who: LeaseKeeper, job: Id) -> LeaseAnswe
 
 @router.post("/stop")
 async def stop_all(service: Serving, who: Near) -> StopAnswer:
-    """Bring all arms to a controlled stop. Needs no lease and no role; on the service's own machine no token either."""
+    """Stop all arms, under control; needs no lease and no role; on the service's own machine no token either."""
     return await _stop(service, None, who)
 
 
 @router.post("/arms/{arm}/stop")
 async def stop_arm(service: Serving, who: Near, arm: ArmName) -> StopAnswer:
-    """Bring an arm to a controlled stop, likewise; one that nobody moves is no mistake."""
+    """Stop an arm, under control; as for all arms; one that nobody moves is no mistake."""
     return await _stop(service, arm, who)
 
 
