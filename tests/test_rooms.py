@@ -47,6 +47,7 @@ DOORS: dict[str, set[str]] = {
     "can": {"drivers", "sim_backend"},
     "fastapi": {"service"},
     "jinja2": {"service"},
+    "prometheus_client": {"service"},
     "starlette": {"service"},
     "uvicorn": {"service"},
 }

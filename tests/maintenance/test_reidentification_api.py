@@ -44,7 +44,7 @@ def test_a_person_asks_and_a_drier_joint_is_found(daemon: Asked, viewer: str) ->
     assert daemon.post("/api/v1/schedules", {"arm": ARM, "maintenance": True}).status_code == 201
     assert daemon.post(f"/api/v1/arms/{ARM}/maintenance", {"what": "belt changed"}).status_code == 201
     (due,) = daemon.get("/api/v1/due").json()
-    assert 'ident_arm_due{arm="quick"} 1\n' in daemon.get("/metrics").text
+    assert 'ident_arm_due{arm="quick"} 1.0\n' in daemon.get("/metrics").text
     assert due["cause"] == "maintenance: belt changed"
     time.sleep(2.0)  # time enough for four looks
     assert daemon.get("/api/v1/jobs").json() == []  # it asks for a person, and does nothing
@@ -71,7 +71,7 @@ def test_a_person_asks_and_a_drier_joint_is_found(daemon: Asked, viewer: str) ->
 
     (alarm,) = daemon.get("/api/v1/alarms").json()
     assert (alarm["run"], "friction of joint elbow" in alarm["what"]) == (ended["run"], True)
-    assert 'ident_arm_drift_alarms{arm="quick"} 1\n' in daemon.get("/metrics").text
+    assert 'ident_arm_drift_alarms{arm="quick"} 1.0\n' in daemon.get("/metrics").text
     looks = {"headers": {"Authorization": f"Bearer {viewer}"}}
     assert daemon.get("/api/v1/alarms", **looks).status_code == 200
     assert daemon.post(f"/api/v1/alarms/{alarm['id']}/ack", {"note": "x"}, **looks).status_code == 403

@@ -21,13 +21,13 @@ from ident_service.service.api.connections import Connections
 from ident_service.service.api.description import describe
 from ident_service.service.api.doors import Doors
 from ident_service.service.api.gate import Gate
-from ident_service.service.api.metrics import Metrics
 from ident_service.service.api.mistakes import answer_mistakes
 from ident_service.service.api.settings import Settings
 from ident_service.service.jobs.engine import Engine
 from ident_service.service.live import LiveRuns
 from ident_service.service.maintenance.keeper import Keeper, note_gave_up
 from ident_service.service.maintenance.webhook import Webhook, read_secret
+from ident_service.service.metrics import Metrics
 from ident_service.service.pages.routes import PAGES
 from ident_service.service.registry.arms import know_shipped
 from ident_service.service.registry.database import Database
@@ -56,14 +56,16 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
     db = Database(settings.state)
     first_token(db, settings.state)
     know_shipped(db)
+    metrics = Metrics()
     engine = Engine(
         *(db, settings.state),
         computing=settings.computing,
         motion_door=settings.motion_door,
         lease_factor=settings.lease_factor,
+        metrics=metrics,
     )
     keeper = Keeper(engine, _webhook(settings, db))
-    service = Service(settings, db, engine, Gate(db), Metrics(), keeper, Checks())
+    service = Service(settings, db, engine, Gate(db), metrics, keeper, Checks())
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:

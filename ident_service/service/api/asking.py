@@ -18,10 +18,10 @@ from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBea
 
 from ident_service.service.api.checks import Checks
 from ident_service.service.api.gate import Gate, Throttled
-from ident_service.service.api.metrics import Metrics
 from ident_service.service.api.settings import Settings
 from ident_service.service.jobs.engine import Engine
 from ident_service.service.maintenance.keeper import Keeper
+from ident_service.service.metrics import Metrics
 from ident_service.service.registry.database import Database
 from ident_service.service.registry.tokens import Access
 
