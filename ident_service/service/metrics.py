@@ -22,7 +22,7 @@ from prometheus_client.core import GaugeMetricFamily, HistogramMetricFamily, Met
 from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector
 
-disable_created_metrics()
+disable_created_metrics()  # type: ignore[no-untyped-call]
 _METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 _STOP: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 _LEASE: Final = (0.05, 0.1, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 5.0)
@@ -145,8 +145,9 @@ class _Lateness(Collector):
         if not isinstance(document, dict):
             return
         edges, counts = document.get("edges_us"), document.get("counts")
-        good = isinstance(edges, list) and isinstance(counts, list) and len(counts) == len(edges) + 1
-        if not good or not all(isinstance(one, int) and one >= 0 for one in (*edges, *counts)):
+        if not (isinstance(edges, list) and isinstance(counts, list) and len(counts) == len(edges) + 1):
+            return
+        if not all(isinstance(one, int) and one >= 0 for one in (*edges, *counts)):
             return
         with self._lock:
             if not self._edges:

@@ -26,6 +26,7 @@ from ident_service.service.jobs.commands import JOBS
 from ident_service.service.jobs.outcome import said
 from ident_service.service.registry import jobs as rows
 from ident_service.service.registry.database import Row
+from ident_service.service.registry.tokens import Access
 
 router = APIRouter(prefix="/api/v1", tags=["jobs"], responses=failures(404, 409))
 MOST_LOG: Final = 2**20
@@ -92,12 +93,10 @@ def create_job(
     service: Serving, who: Operator, body: JobRequest, response: Response, idempotency_key: Key = None
 ) -> JobAnswer:
     """Begin or queue a job; a computation that is asked for again with the same `Idempotency-Key` is the same job."""
-    if body.job.kind in MOVES:
-        if idempotency_key is not None:
-            raise UsageError("a motion has no Idempotency-Key: its challenge counts once, and it must not begin later")
-        require_confirmed(service, getattr(body.job, "arm", ""), body.confirm, who.name)
     if idempotency_key is None:
-        return answer_of(service, service.engine.create(body.job, who.name))
+        return begin_job(service, who, body)
+    if body.job.kind in MOVES:
+        raise UsageError("a motion has no Idempotency-Key: its challenge counts once, and it must not begin later")
     asked = hashlib.sha256(body.job.model_dump_json().encode()).hexdigest()
     if (row := rows.job_of_key(service.db, who.name, idempotency_key, asked)) is None:
 
@@ -112,6 +111,18 @@ def create_job(
                 raise
     response.headers["Idempotent-Replayed"] = "true"
     return answer_of(service, row)
+
+
+def begin_job(service: Service, who: Access, body: JobRequest) -> JobAnswer:
+    """Queue what is asked for, in a request to the API or on a page.
+
+    Raises:
+        MotionRefused: a motion that no person has confirmed.
+        IdentError: as the engine.
+    """
+    if body.job.kind in MOVES:
+        require_confirmed(service, getattr(body.job, "arm", ""), body.confirm, who.name)
+    return answer_of(service, service.engine.create(body.job, who.name))
 
 
 @router.get("/jobs", responses=PAGES)

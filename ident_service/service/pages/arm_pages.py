@@ -113,7 +113,7 @@ def move(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
     asked = _asked(arm, form)
     body = {"job": asked, "confirm": {"name": form.get("name", ""), "challenge": form.get("challenge", "")}}
     try:
-        job = jobs.create_job(service, who, jobs.JobRequest.model_validate(body))
+        job = jobs.begin_job(service, who, jobs.JobRequest.model_validate(body))
     except MotionRefused:
         words = "That was not the arm's name, or this page was open for too long. Nothing has moved; try again."
         return _confirmation(service, who, arm, form, words)
@@ -125,7 +125,7 @@ def compute(service: Serving, who: Operator, arm: ArmName, form: Form) -> Respon
     """Queue a job that moves nothing."""
     if form.get("kind") not in _KINDS:
         raise UsageError("choose what is to be done on the page of the arm")
-    job = jobs.create_job(service, who, jobs.JobRequest.model_validate({"job": _asked(arm, form)}))
+    job = jobs.begin_job(service, who, jobs.JobRequest.model_validate({"job": _asked(arm, form)}))
     return seen(f"/jobs/{job.id}")
 
 
