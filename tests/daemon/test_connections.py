@@ -164,7 +164,7 @@ def test_ten_stops_at_once_while_everything_waits(tmp_path: Path) -> None:
 @pytest.mark.timeout(300)
 def test_a_line_without_a_request_is_closed(state: Path) -> None:
     with daemon_process(state) as (_, client):
-        parts = urlsplit(client._url)
+        parts = urlsplit(client.url)
         lines = []
         for begun in (b"", b"GET / HT", b"POST /api/v1/login HTTP/1.1\r\nHost: 127.0.0.1\r\n"):
             lines.append(socket.create_connection((str(parts.hostname), int(parts.port or 0)), timeout=60))
@@ -194,7 +194,7 @@ def test_handshakes_that_do_not_go_on_have_a_time_too(state: Path, tmp_path: Pat
     os.environ["SSL_CERT_FILE"] = str(tmp_path / "cert")
     try:
         with daemon_process(state, "--tls-cert", str(tmp_path / "cert"), "--tls-key", str(pem)) as (_, client):
-            parts = urlsplit(client._url)
+            parts = urlsplit(client.url)
             silent = socket.create_connection((str(parts.hostname), int(parts.port or 0)), timeout=60)
             context = ssl.create_default_context(cafile=str(tmp_path / "cert"))
             with socket.create_connection((str(parts.hostname), int(parts.port or 0)), timeout=60) as raw:

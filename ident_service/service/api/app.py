@@ -14,7 +14,18 @@ from fastapi.routing import APIRoute
 
 from ident_service import __version__
 from ident_service.service.acceptance import settle
-from ident_service.service.api import about, access, arms, descriptions, exports, jobs, maintenance, pruning, runs
+from ident_service.service.api import (
+    about,
+    access,
+    arms,
+    descriptions,
+    exports,
+    jobs,
+    live_routes,
+    maintenance,
+    pruning,
+    runs,
+)
 from ident_service.service.api.asking import Service
 from ident_service.service.api.checks import Checks
 from ident_service.service.api.connections import Connections
@@ -37,7 +48,16 @@ from ident_service.service.registry.tokens import first_token
 _REFRESH = 1.0  # s between looks for tokens that were made or revoked at a terminal
 _LOG = logging.getLogger("ident.serve")
 ROUTERS = (
-    *(about.router, access.router, arms.router, descriptions.router, jobs.router, runs.router, pruning.router),
+    *(
+        about.router,
+        access.router,
+        arms.router,
+        descriptions.router,
+        jobs.router,
+        live_routes.router,
+        runs.router,
+        pruning.router,
+    ),
     *(exports.router, maintenance.router, *PAGES),
 )
 """In this order."""
