@@ -1,25 +1,7 @@
-"""Drive a daemon from a program: what `ident ... --server URL` uses, too.
-
-```
-from ident_service.client import IdentClient
-
-with IdentClient("https://robot.example:8470", token) as client:
-    ended = client.compute("design", arm="wam7", seconds=30.0)
-    with client.arm("wam7").run(ended.run, confirm="wam7") as job:  # the lease is renewed until the block is left
-        for sample in job.live():
-            print(sample.time, sample.following_error)
-    print(job.ended.state, job.ended.run)
-```
-
-An exception in the block of a motion brings the arm to a controlled stop. The end of the block waits for the motion's.
-Errors are those of `ident_service.errors`: the daemon's own, and `ArmError` where it cannot be reached. A certificate
-is checked as the system does (`SSL_CERT_FILE` names another authority); proxies of the environment are not asked.
-"""
+"""Arms, jobs and motions of a daemon."""
 
 from __future__ import annotations
 
-import json
-import ssl
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -27,32 +9,15 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from types import MappingProxyType, TracebackType
 from typing import Any, Final, Self
-from urllib.parse import quote, urlencode, urlsplit
+from urllib.parse import quote, urlencode
 
-import httpx
-
-from ident_service.errors import (
-    AlreadyThere,
-    ArmError,
-    ConfigError,
-    IdentError,
-    MotionRefused,
-    ParameterError,
-    RecordingError,
-    UnknownId,
-    UsageError,
-)
+from ident_service.client.connection import NOTHING, Connection
+from ident_service.errors import IdentError, MotionRefused, UsageError
 
 _API: Final = "/api/v1"
-_PATIENCE = 30.0  # s for one answer
-_MOST = 64 * 2**20  # bytes of one answer
 _RENEWED: Final = 0.5  # s between renewals of a lease, which lasts four times as long
 _LOOK = 0.3  # s between looks at a job
 _LIVE: Final = ("queued", "running")
-_NOTHING: Final[Mapping[str, Any]] = MappingProxyType({})
-_KINDS: Final[dict[str, type[IdentError]]] = {
-    kind.__name__: kind for kind in (UsageError, UnknownId, AlreadyThere, MotionRefused, ParameterError, ArmError)
-}
 
 
 @dataclass(frozen=True)
@@ -105,94 +70,8 @@ class LiveSample:
     following_error: tuple[float | None, ...]
 
 
-class IdentClient:
+class IdentClient(Connection):
     """A daemon, asked over HTTP; used from any thread."""
-
-    def __init__(self, url: str, token: str | None = None, *, patience: float = _PATIENCE) -> None:
-        """Nothing is asked yet.
-
-        Args:
-            url: of the daemon: scheme, host and port.
-            token: to say who asks; None for a stop on the daemon's own machine.
-            patience: how long to wait for an answer [s].
-
-        Raises:
-            UsageError: not such an address; or one that would send the token in the clear over a network.
-        """
-        try:
-            parts = urlsplit(url)
-            host, _ = parts.hostname or "", parts.port
-        except ValueError as error:
-            raise UsageError(f"{url}: not an address: {error}") from None
-        if parts.scheme not in ("http", "https") or not host or parts.path.strip("/") or parts.query or parts.username:
-            raise UsageError(f"{url}: give scheme, host and port, such as https://robot.example:8470")
-        if parts.scheme == "http" and host not in ("127.0.0.1", "::1", "localhost"):
-            raise UsageError(f"{url}: a token is sent to other machines over https only")
-        self.url = url.rstrip("/")
-        headers = {} if token is None else {"Authorization": f"Bearer {token}"}
-        secure = parts.scheme == "https"
-        # The other one, which nobody is checked by, is made faster.
-        verify = ssl.create_default_context() if secure else ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-        try:
-            self._http = httpx.Client(
-                base_url=self.url, headers=headers, timeout=patience, verify=verify, trust_env=False
-            )
-        except (ValueError, httpx.HTTPError, httpx.InvalidURL) as error:
-            raise UsageError(f"{url}: cannot be asked with this token: {error}") from None
-
-    # --- requests
-
-    def get(self, path: str) -> Any:
-        """Read what stands at a path; raises as `ask`."""
-        return self.ask("GET", path)
-
-    def post(self, path: str, body: Any = None, headers: Mapping[str, str] = _NOTHING) -> Any:
-        """Have something done; raises as `ask`."""
-        return self.ask("POST", path, {} if body is None else body, headers)
-
-    def ask(self, method: str, path: str, body: Any = None, headers: Mapping[str, str] = _NOTHING) -> Any:
-        """Send one request and return its answer as JSON values.
-
-        Raises:
-            IdentError: the daemon refused, with its own error; or it cannot be reached.
-        """
-        return self._document(*self._exchange(method, path, body, headers)[:2])
-
-    def pages(self, path: str) -> Iterator[Any]:
-        """Read a list to its end, page by page; raises as `ask`."""
-        after: str | None = path
-        while after is not None:
-            status, content, after = self._exchange("GET", after, None, {})
-            yield from self._document(status, content)
-
-    def content(self, path: str) -> bytes:
-        """Download a file.
-
-        Raises:
-            IdentError: as `ask`; or it is larger than what is taken.
-        """
-        status, content, _ = self._exchange("GET", path, None, {})
-        if status >= 400:
-            self._document(status, content)
-        if len(content) >= _MOST:
-            raise ArmError(f"{self.url}{path}: has {_MOST} bytes or more; fetch it by other means")
-        return content
-
-    def close(self) -> None:
-        """End the connections."""
-        self._http.close()
-
-    def __enter__(self) -> Self:
-        """Nothing more to do."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close."""
-        self.close()
-
-    # --- arms, jobs and runs
 
     def arms(self) -> list[dict[str, Any]]:
         """List the arms (`ArmLine`)."""
@@ -202,7 +81,7 @@ class IdentClient:
         """Name an arm; nothing is asked yet."""
         return RemoteArm(self, name)
 
-    def add_arm(self, description: str, files: Mapping[str, str] = _NOTHING, *, replace: bool = False) -> RemoteArm:
+    def add_arm(self, description: str, files: Mapping[str, str] = NOTHING, *, replace: bool = False) -> RemoteArm:
         """Add an arm.
 
         Args:
@@ -259,57 +138,6 @@ class IdentClient:
         """Read what the command of a job answered: its one JSON object."""
         found: dict[str, Any] = self.get(f"{_API}/jobs/{_word(job)}/result")["answer"]
         return found
-
-    def events(self, path: str) -> Iterator[tuple[str, Any]]:
-        """Read server-sent events until the daemon ends them: kind and JSON value.
-
-        Raises:
-            IdentError: as `ask`; or the line was cut.
-        """
-        try:
-            with self._http.stream("GET", path) as answer:
-                if answer.status_code >= 400:
-                    self._document(answer.status_code, answer.read())
-                kind = ""
-                for line in answer.iter_lines():
-                    if line.startswith("event: "):
-                        kind = line.removeprefix("event: ")
-                    elif line.startswith("data: "):
-                        yield kind, json.loads(line.removeprefix("data: "))
-        except (httpx.HTTPError, ValueError) as error:
-            raise self._unreachable(error) from None
-
-    def _exchange(self, method: str, path: str, body: Any, headers: Mapping[str, str]) -> tuple[int, bytes, str | None]:
-        """Return status, body (as far as it is taken) and the path of the next page."""
-        content = None if body is None else json.dumps(body).encode()
-        sent = dict(headers) if content is None else {**headers, "Content-Type": "application/json"}
-        # A connection that lay idle may have been closed meanwhile: what only reads is asked again.
-        for last in (False, True) if method == "GET" else (True,):
-            try:
-                with self._http.stream(method, path, content=content, headers=sent) as answer:
-                    taken = bytearray()
-                    for piece in answer.iter_bytes():
-                        taken += piece
-                        if len(taken) >= _MOST:
-                            break
-                    after = answer.links.get("next", {}).get("url")
-                    return answer.status_code, bytes(taken[:_MOST]), after
-            except (httpx.HTTPError, httpx.InvalidURL) as error:
-                if last or isinstance(error, httpx.ConnectError):
-                    raise self._unreachable(error) from None
-        raise AssertionError("the second try ends the loop")
-
-    def _unreachable(self, error: Exception) -> ArmError:
-        return ArmError(f"{self.url}: cannot be reached: {error or type(error).__name__}")
-
-    def _document(self, status: int, content: bytes) -> Any:
-        try:
-            document = json.loads(content) if content else None
-        except ValueError:
-            raise ArmError(f"{self.url}: answered {status} with what is not JSON; is it the daemon?") from None
-        if status >= 400:
-            raise _error(self.url, status, document)
-        return document
 
 
 class RemoteArm:
@@ -455,14 +283,3 @@ def _listed(what: str, arm: str | None) -> str:
 
 def _word(name: str) -> str:
     return quote(name, safe="")
-
-
-def _error(url: str, status: int, document: Any) -> IdentError:
-    said = document.get("error", {}) if isinstance(document, dict) else {}
-    kind, message = str(said.get("kind", "")), str(said.get("message", f"answered {status}"))
-    if kind == ConfigError.__name__:
-        return UsageError(message)
-    if kind == RecordingError.__name__ or kind not in _KINDS:
-        kinds: dict[int, type[IdentError]] = {401: UsageError, 403: UsageError, 404: UnknownId, 422: UsageError}
-        return kinds.get(status, ArmError)(f"{url}: {message}")
-    return _KINDS[kind](message)
