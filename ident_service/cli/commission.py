@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, own_state_folder, tell
 from ident_service.cli.words import FEASIBLE_SETS, Verbs, delay, replicates, seed, weight
+from ident_service.errors import UsageError
 
 if TYPE_CHECKING:
     from ident_service.estimation.identify import Estimate
@@ -29,13 +30,22 @@ def add(verbs: Verbs) -> None:
 
     sub = verbs.add("identify", _identify, "recordings to parameters.json, URDF and report")
     sub.add_argument(
-        "recordings", nargs="+", type=Path, metavar="RECORDING", help="MCAP or CSV; FILE@2:1.5 leaves out 2 s and 1.5 s"
+        "recordings", nargs="+", type=Path, metavar="RECORDING", help="MCAP or CSV; FILE@41:60 reads 41 s to 60 s of it"
     )
     sub.add_argument("--arm", required=True, metavar="ARM", help="description file, or the name of a shipped one")
     sub.add_argument(
         "--validate", action="append", default=[], type=Path, metavar="RECORDING", help="judge on this one too"
     )
-    sub.add_argument("--columns", type=Path, metavar="FILE", help="YAML that says how the recordings are laid out")
+    sub.add_argument(
+        "--columns",
+        action="append",
+        default=[],
+        metavar="[RECORDING=]FILE",
+        help="YAML that says how the recordings are laid out, or RECORDING alone; may be repeated",
+    )
+    sub.add_argument(
+        "--cut-standstill", action="store_true", help="leave out standstill at the start and end of recordings"
+    )
     sub.add_argument("--method", choices=["ols", "wls", "huber", "iv"], help="default: the arm's")
     sub.add_argument("--prior", choices=["none", "euclidean", "entropic"], help="draw the estimate to the arm's prior")
     sub.add_argument("--prior-weight", type=weight, metavar="W", help="default: chosen on held-out data")
@@ -107,11 +117,14 @@ def _identify(arguments: argparse.Namespace) -> Answer:
     from ident_service.service.commission import new_run_folder
     from ident_service.service.identification import Request, identify_files
 
+    columns, columns_of = _columns(arguments.columns)
     request = Request(
         arm=arguments.arm,
         recordings=tuple(arguments.recordings),
         validation=tuple(arguments.validate),
-        columns=arguments.columns,
+        columns=columns,
+        columns_of=columns_of,
+        cut_standstill=arguments.cut_standstill,
         method=arguments.method,
         set_name=arguments.feasible_set,
         prior=arguments.prior,
@@ -133,12 +146,32 @@ def _identify(arguments: argparse.Namespace) -> Answer:
     return _exit_code(estimate, result.unusable), text, document
 
 
+def _columns(given: Sequence[str]) -> tuple[Path | None, dict[Path, Path]]:
+    """Tell the columns file of all recordings from those of one each."""
+    of_all: list[Path] = []
+    of_one: dict[Path, Path] = {}
+    for words in given:
+        recording, equals, file = words.partition("=")
+        if not equals or Path(words).is_file():
+            of_all.append(Path(words))
+        elif Path(recording) in of_one:
+            raise UsageError(f"--columns {words}: {recording} has a columns file already")
+        else:
+            of_one[Path(recording)] = Path(file)
+    if len(of_all) > 1:
+        raise UsageError(
+            f"--columns {of_all[1]}: one file is for all recordings; write RECORDING=FILE for those that differ"
+        )
+    return (of_all[0] if of_all else None), of_one
+
+
 def _exit_code(estimate: Estimate, unusable: Sequence[str]) -> int:
     return DONE if estimate.feasible and not unusable else VERDICT_NO
 
 
 def _estimate_document(estimate: Estimate, unusable: Sequence[str]) -> dict[str, Any]:
     from ident_service.results.parameter_file import convex_document
+    from ident_service.results.rows_and_filter import rows_and_filter
 
     own = estimate.candidates[estimate.chosen]
     return {
@@ -148,6 +181,7 @@ def _estimate_document(estimate: Estimate, unusable: Sequence[str]) -> dict[str,
         "feasible": estimate.feasible,
         "margin": estimate.margin,
         "relative_error_percent": own.identification.relative_percent,
+        "rows_and_filter": list(rows_and_filter(estimate.model.config.identification)),
         "validation": [
             {"recording": score.recording, "relative_error_percent": score.error.relative_percent}
             for score in own.validation

@@ -24,7 +24,7 @@ def add(verbs: Verbs) -> None:
 
     sub = verbs.add("payload", _payload, "what does an identified arm carry? (exit code 3: nothing, or no real body)")
     sub.add_argument("run", type=Path, metavar="RUN", help="folder of results of the arm without the load")
-    sub.add_argument("recordings", nargs="+", type=Path, metavar="RECORDING", help="with the load; FILE@2:1.5 as usual")
+    sub.add_argument("recordings", nargs="+", type=Path, metavar="RECORDING", help="with the load; or FILE@41:60")
     sub.add_argument("--refit-offsets", action="store_true", help="torque offsets may differ from the arm's")
     sub.add_argument(
         "--out", type=Path, metavar="DIR", help="where results go (default: a new folder below the state folder)"

@@ -66,7 +66,12 @@ def _know(sub: Parser) -> None:
     )
     sub.add_argument("--noise", type=Path, metavar="FILE", help="parameters.json whose residuals are the noise")
     sub.add_argument(
-        "--after", action="append", default=[], type=Path, metavar="RECORDING", help="add to what this one taught"
+        "--after",
+        action="append",
+        default=[],
+        type=Path,
+        metavar="RECORDING",
+        help="add to what this one taught; or FILE@41:60",
     )
 
 

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 RELEASED = 0.15  # s without the key, after which it counts as released
 REPEATS = 4  # in a row, each in time, before it counts as held
 KEY = b" "
+_MOST_MISSED = 10  # parameters that are printed
 
 
 class HeldKey:
@@ -218,12 +219,31 @@ def require_terminal(arguments: argparse.Namespace) -> int:
     return sys.stdin.fileno()
 
 
+def _target_text(until: dict[str, Any]) -> str:
+    """Say whether what a run was for is known, and what is not."""
+    if (missed := until["missed"]) is None:
+        return ""
+    if not missed:
+        return f"target of {until['share']:.2%}: reached\n"
+    lines = [
+        f"  {one['parameter']}: " + ("not seen" if one["share"] is None else f"known to {one['share']:.2%}")
+        for one in missed
+    ]
+    head = f"target of {until['share']:.2%}: missed by {len(missed)} parameters (deviation over the larger of size and"
+    return "\n".join([f"{head} reference)", *lines[:_MOST_MISSED], *_further(len(lines))]) + "\n"
+
+
+def _further(count: int) -> list[str]:
+    return [f"  and {count - _MOST_MISSED} more, in --json"] if count > _MOST_MISSED else []
+
+
 def _report_text(report: dict[str, Any]) -> str:
     frames = f"can.log: {report['frames_logged']}\n" if "frames_logged" in report else ""
     warnings = ", ".join(f"{code} {count} times" for code, count in report["warnings"].items()) or "none"
     lateness, compute = report["lateness"], report["compute"]
     early = f"finished early, after {report['motion_seconds']:.1f} s of the motion\n" if "finished" in report else ""
     early += f"not finished early: {report['not_finished']}\n" if "not_finished" in report else ""
+    early += _target_text(report["until"]) if "until" in report else ""
     ended = f"{early}{report['state']} after {report['cycles']} cycles; warnings: {warnings}\n{report['real_time']}"
     if lateness is None or compute is None:
         return f"{ended}: nothing was timed\n{frames}"

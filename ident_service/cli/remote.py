@@ -6,6 +6,7 @@ Boundary: words to requests by id, answers to words. Files that are named here a
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 import time
@@ -339,10 +340,15 @@ def motion_id(client: IdentClient, arm: str, motion: Path | None) -> str | None:
     return str(motion)
 
 
-def recording(path: Path) -> dict[str, str]:
-    """`RUN` or `RUN/NAME`, both as the daemon calls them."""
-    run, _, name = str(path).partition("/")
-    return {"run": run, **({"name": name} if name else {})}
+def recording(path: Path) -> dict[str, str | float]:
+    """Name a recording as the daemon does, from `RUN` or `RUN/NAME`, either with `@START:END`."""
+    from ident_service.record.files import split_range
+
+    named, seconds = split_range(str(path))
+    run, _, name = named.partition("/")
+    given = {"start": seconds[0], "end": seconds[1]} if seconds else {}
+    bounded = {key: value for key, value in given.items() if math.isfinite(value)}
+    return {"run": run, **({"name": name} if name else {}), **bounded}
 
 
 def word_of_address(word: str) -> str:

@@ -10,9 +10,10 @@ from pydantic import ValidationError
 
 from ident_service.config import canopen, design, recording, simulation, workspace
 from ident_service.config.canopen import CanopenDriver
+from ident_service.config.kinematics import DHTable
 from ident_service.config.quantities import MAX_FILE_BYTES, UPLOAD, Section
 from ident_service.config.recording import RecordingFormat
-from ident_service.config.schema import ArmConfig, DHTable, FourierMotion
+from ident_service.config.schema import ArmConfig, FourierMotion
 from ident_service.config.shipped import shipped_arms as shipped_arms
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.config.source import KeyPath, Tree, first_problems, read_tree

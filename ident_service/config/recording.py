@@ -1,4 +1,4 @@
-"""How an arm's recordings lie in files, and the gears between its motors and its joints.
+"""How an arm's recordings lie in files, in what units, and the gears between its motors and its joints.
 
 With `r` the motor's turns per turn of the joint, `C` the coupling and `q0` the offsets: `q_motor = diag(r) C (q - q0)`,
 hence `dq_motor = diag(r) C dq`, and since what the motors put in the joints give out (`tau_motor . dq_motor =
@@ -7,20 +7,122 @@ tau . dq`), `tau = C^T diag(r) tau_motor`. Boundary: data and its own consistenc
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterator, Sequence
-from typing import Annotated, Literal
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import (
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationInfo,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from ident_service.config.quantities import Angle, NonNegative, Number, Positive, Section
 
 # Beyond, rounding would eat half of the digits on the way from motor to joint.
 _WORST_CONDITION = 1e8
 _NUMBERED = re.compile(r"(q|dq|tau)(\d+)")
+_SAME = 0.01  # a factor this near to a unit's own conversion is that conversion a second time
+
+_QUANTITIES = {"t": "time", "q": "position", "dq": "velocity", "tau": "torque"}
+_SI = {"time": "s", "position": "rad or m", "velocity": "rad/s or m/s", "torque": "N m or N"}
+_TURN = 2.0 * math.pi
+# Units with a conversion of their own to SI. Revolutions and degrees are of turning joints, metres of sliding ones.
+_TURNING = {
+    "position": {"rad": 1.0, "mrad": 1e-3, "deg": math.radians(1.0), "rev": _TURN},
+    "velocity": {"rad/s": 1.0, "mrad/s": 1e-3, "deg/s": math.radians(1.0), "rpm": _TURN / 60.0, "rev/s": _TURN},
+    "torque": {"Nm": 1.0, "mNm": 1e-3, "kNm": 1e3},
+}
+_SLIDING = {
+    "position": {"m": 1.0, "mm": 1e-3},
+    "velocity": {"m/s": 1.0, "mm/s": 1e-3},
+    "torque": {"N": 1.0, "kN": 1e3},
+}
+_CONVERTED = {"time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}} | {
+    quantity: _TURNING[quantity] | _SLIDING[quantity] for quantity in _TURNING
+}
+# Units that become a quantity by a constant of the arm alone, with what it then is a factor per.
+_WITH_FACTOR = {
+    "time": {"counts": (1.0, "count")},
+    "position": {"counts": (1.0, "count")},
+    "velocity": {"counts/s": (1.0, "count/s")},
+    "torque": {"A": (1.0, "A"), "mA": (1e-3, "A"), "%": (0.01, "rated torque"), "counts": (1.0, "count")},
+}
 
 ColumnName = Annotated[str, Field(pattern=r"^(t|(q|dq|tau)[1-9]\d{0,3})$")]
+
+
+class Column(Section):
+    """One column of a CSV file: what the file calls it, and how its numbers become SI.
+
+    The value is `factor` times the number converted from `unit`; both may be left out. A negative factor turns the
+    sign. Currents (`A`, `mA`), encoder `counts` and `%` of a rated torque need a factor: N m per A, rad per count,
+    the rated torque in N m. A factor beside any other unit is for what is left, a gear ratio or a sign.
+    """
+
+    column: Annotated[str, Field(min_length=1)]
+    unit: str | None = None
+    factor: Number = 1.0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _by_name_alone(cls, value: Any) -> Any:
+        return {"column": value} if isinstance(value, str) else value
+
+    @field_validator("unit")
+    @classmethod
+    def _spelled(cls, unit: str | None) -> str | None:
+        return None if unit is None else re.sub(r"[\s*\u00b7]", "", unit).replace("\u00b5", "u")
+
+    @field_validator("factor")
+    @classmethod
+    def _finite(cls, factor: float) -> float:
+        if factor == 0.0:
+            raise ValueError("a factor of zero makes every sample zero")
+        return factor
+
+    @model_serializer(mode="wrap")
+    def _name_alone(self, serialized: SerializerFunctionWrapHandler) -> Any:
+        # A plain name keeps the hash that descriptions had before there were units.
+        return self.column if self.unit is None and self.factor == 1.0 else serialized(self)
+
+    def scale(self, name: str) -> float:
+        """Return what a number of this column is multiplied by to be in SI.
+
+        Args:
+            name: ours, such as `tau3`, which says the quantity.
+
+        Raises:
+            ValueError: an unknown unit, one of another quantity, one that needs a factor, or a factor that repeats
+                the unit's own conversion.
+        """
+        quantity = _QUANTITIES[name.rstrip("0123456789")]
+        own, bare = _CONVERTED[quantity], _WITH_FACTOR[quantity]
+        if quantity == "time" and self.factor < 0.0:
+            raise ValueError(f"a factor of {self.factor:g} lets time run backwards")
+        if self.unit is None:
+            return self.factor
+        if self.unit in bare:
+            size, per = bare[self.unit]
+            if self.factor == 1.0:
+                raise ValueError(f"unit {self.unit!r} needs a factor in {_SI[quantity]} per {per}")
+            return self.factor * size
+        if self.unit not in own:
+            others = [other for other in _SI if self.unit in _CONVERTED[other] or self.unit in _WITH_FACTOR[other]]
+            why = f"is a unit of {others[0]}, not of {quantity}" if others else "is not known"
+            raise ValueError(f"unit {self.unit!r} {why}; known are {', '.join((*own, *bare))}")
+        size = own[self.unit]
+        if size != 1.0 and any(abs(abs(self.factor) / one - 1.0) < _SAME for one in (size, 1.0 / size)):
+            raise ValueError(
+                f"unit {self.unit!r} is converted by {size:g} already, and a factor of {self.factor:g} would repeat or "
+                "undo it; leave out one of the two"
+            )
+        return self.factor * size
 
 
 class Transmission(Section):
@@ -65,30 +167,35 @@ class Transmission(Section):
 
 
 class RecordingFormat(Section):
-    """How an arm's recordings are read; `columns`, `joint_names`, `topic`, `side` are for the files of others only.
+    """How an arm's recordings are read; `columns`, `joint_names`, `topic`, sides are for the files of others only.
 
-    `columns` gives a CSV file's own name for each of `t` [s], `q1`, `tau1` and optionally `dq1`; `joint_names` a
-    JointState's own name for a joint of the arm. `side` says where positions and torques were measured. Irregular
-    `stamps` are either when each sample was taken (`sampled`), or when the sample arrived (`arrival`) although it was
-    taken on time: then the samples count as evenly spaced between gaps. `trim` [s] is cut off at start and end; a step
-    of more than `gap` usual periods is a gap; `rate` [Hz] resamples.
+    `columns` gives a CSV file's own name for each of `t`, `q1`, `tau1` and optionally `dq1`, or that name with unit and
+    factor (`Column`); `joint_names` a JointState's own name for a joint of the arm. `side` says where positions,
+    velocities and torques were measured, `torque_side` where torques were if elsewhere. Irregular `stamps` are either
+    when each sample was taken (`sampled`), or when the sample arrived (`arrival`) although it was taken on time: then
+    the samples count as evenly spaced between gaps. `trim` [s] is cut off at start and end; a step of more than `gap`
+    usual periods is a gap; `rate` [Hz] resamples. Samples with a `missing` value (NaN, an empty field) are refused, or
+    left out and counted; `standstill` at the ends is kept, or cut.
     """
 
-    columns: dict[ColumnName, str] = Field(default_factory=dict)
+    columns: dict[ColumnName, Column] = Field(default_factory=dict)
     joint_names: dict[str, str] = Field(default_factory=dict)
     topic: Annotated[str, Field(min_length=1)] = "/joint_states"
     side: Literal["joint", "motor"] = "joint"
+    torque_side: Literal["joint", "motor"] | None = None
     stamps: Literal["sampled", "arrival"] = "sampled"
     trim: tuple[NonNegative, NonNegative] = (0.0, 0.0)
     gap: Annotated[float, Field(gt=1, strict=True)] = 3.0
     rate: Positive | None = None
+    missing: Literal["refuse", "skip"] = "refuse"
+    standstill: Literal["keep", "cut"] = "keep"
 
     @field_validator("columns")
     @classmethod
-    def _complete(cls, columns: dict[str, str]) -> dict[str, str]:
+    def _complete(cls, columns: dict[str, Column]) -> dict[str, Column]:
         if not columns:
             return columns
-        _once("column", columns)
+        _once("column", {name: one.column for name, one in columns.items()})
         joints = _joints(columns)
         wanted = ["t", *(f"{kind}{k}" for kind in ("q", "tau") for k in range(1, joints + 1))]
         if any(name.startswith("dq") for name in columns):
@@ -97,7 +204,27 @@ class RecordingFormat(Section):
             raise ValueError(f"no column for {', '.join(missing)}")
         if joints == 0:
             raise ValueError("no joints")
+        wrong = []
+        for name, one in columns.items():
+            try:
+                one.scale(name)
+            except ValueError as error:
+                wrong.append(f"{name}: {error}")
+        if wrong:
+            raise ValueError("; ".join(wrong))
         return columns
+
+    @model_serializer(mode="wrap")
+    def _unless_default(self, serialized: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # Descriptions without these keys keep the hash that results have named them by.
+        document: dict[str, Any] = serialized(self)
+        later = {"torque_side": None, "missing": "refuse", "standstill": "keep"}
+        return {key: value for key, value in document.items() if key not in later or value != later[key]}
+
+    @property
+    def motor_sides(self) -> tuple[bool, bool]:
+        """Return for positions (with velocities) and for torques whether they were measured at the motors."""
+        return self.side == "motor", (self.torque_side or self.side) == "motor"
 
     @field_validator("joint_names")
     @classmethod
@@ -112,8 +239,34 @@ def _once(what: str, names: dict[str, str]) -> None:
         raise ValueError(f"{what} {', '.join(map(repr, twice))} stands for more than one")
 
 
-def _joints(columns: dict[str, str]) -> int:
+def _joints(columns: Mapping[str, Column]) -> int:
     return max((int(match[2]) for name in columns if (match := _NUMBERED.fullmatch(name))), default=0)
+
+
+def units_of_other_joints(form: RecordingFormat, joints: Sequence[str], revolute: Sequence[bool]) -> Iterator[str]:
+    """Find columns whose unit is of a sliding joint where the arm's joint turns, or the other way round.
+
+    What was measured at a motor turns whatever the joint does, and is not looked at.
+
+    Args:
+        form: the section `recording`.
+        joints: names of the arm's joints.
+        revolute: for each, whether it turns.
+    """
+    positions, torques = form.motor_sides
+    for name, one in form.columns.items():
+        match = _NUMBERED.fullmatch(name)
+        if match is None or one.unit is None or int(match[2]) > len(joints):
+            continue
+        if torques if match[1] == "tau" else positions:
+            continue
+        joint, quantity = int(match[2]) - 1, _QUANTITIES[match[1]]
+        if one.unit in (_SLIDING if revolute[joint] else _TURNING)[quantity]:
+            yield (
+                f"recording.columns.{name}: unit {one.unit!r}, but {joints[joint]} "
+                f"{'turns' if revolute[joint] else 'slides'}; its {quantity} is in "
+                f"{', '.join((_TURNING if revolute[joint] else _SLIDING)[quantity])}"
+            )
 
 
 def disagreements(
@@ -126,8 +279,9 @@ def disagreements(
         transmission: the section `transmission`.
         joints: names of the arm's joints; none where the file does not name them.
     """
-    if form.side == "motor" and transmission is None:
-        yield ("recording", "side"), "recording.side: motor, but there is no transmission"
+    for key, motors in zip(("side", "torque_side"), form.motor_sides, strict=True):
+        if motors and transmission is None and getattr(form, key) == "motor":
+            yield ("recording", key), f"recording.{key}: motor, but there is no transmission"
     if not joints:
         return
     if transmission is not None and len(transmission.ratios) != len(joints):

@@ -20,6 +20,7 @@ from pydantic import (
 
 from ident_service.config.design import Design
 from ident_service.config.drivers import Driver
+from ident_service.config.kinematics import Kinematics
 from ident_service.config.quantities import (
     UPLOAD,
     Angle,
@@ -31,7 +32,6 @@ from ident_service.config.quantities import (
     Positive,
     Section,
     Seed,
-    TextBeside,
     Vector3,
 )
 from ident_service.config.recording import RecordingFormat, Transmission
@@ -43,51 +43,6 @@ Method = Literal["ols", "wls", "huber", "iv"]
 
 
 _FUNCTION = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
-_LARGEST_ANGLE = 6.3  # rad
-_LONGEST_LINK = 20.0  # m; the largest arms that move torque-controlled joints are a tenth of it
-
-
-class DHRow(Section):
-    """One row of a Denavit-Hartenberg table (table 2); the joint variable adds to theta or, if prismatic, to d."""
-
-    type: Literal["revolute", "prismatic"] = "revolute"
-    theta: Angle = 0.0
-    d: Number = 0.0
-    a: Number = 0.0
-    alpha: Angle = 0.0
-
-    @model_validator(mode="after")
-    def _of_an_arm(self) -> DHRow:
-        for name, angle in (("theta", self.theta), ("alpha", self.alpha)):
-            if abs(angle) > _LARGEST_ANGLE:
-                raise ValueError(
-                    f"{name}: {angle:g} rad is more than a turn; numbers are rad, degrees are written '{angle:g} deg'"
-                )
-        for name, length in (("d", self.d), ("a", self.a)):
-            if abs(length) > _LONGEST_LINK:
-                raise ValueError(f"{name}: {length:g} m is longer than the link of any arm; in mm? lengths are metres")
-        return self
-
-
-class DHTable(Section):
-    """A serial chain, standard (distal frames, `Rz(theta) Tz(d) Tx(a) Rx(alpha)`) or modified (Craig) convention."""
-
-    convention: Literal["standard", "modified"]
-    joints: Annotated[dict[str, DHRow], Field(min_length=1)]
-
-
-class Kinematics(Section):
-    """Exactly one description of the mechanism."""
-
-    dh: DHTable | None = None
-    urdf: TextBeside | None = None
-    mjcf: TextBeside | None = None
-
-    @model_validator(mode="after")
-    def _one(self) -> Kinematics:
-        if sum(source is not None for source in (self.dh, self.urdf, self.mjcf)) != 1:
-            raise ValueError("give exactly one of dh, urdf, mjcf")
-        return self
 
 
 class Box(Section):
@@ -225,20 +180,31 @@ class Smoothing(Section):
     """Zero-phase low-pass and derivatives (5.2.2).
 
     `butterworth` of `order`, or `savitzky_golay` polynomials of that degree over a window of about the same cut-off
-    [Hz]. `filter_torque` sends the torque through the Butterworth filter too. `regressor_cutoff` [Hz] filters both
-    sides of eq. 59 alike. `decimate` keeps every so many-th sample, after all filters.
+    [Hz], chosen from the spectra of the positions by default. `filter_torque` sends the torque through the Butterworth
+    filter too. `regressor_cutoff` [Hz] filters both sides of eq. 59 alike, the torque then no second time. `decimate`
+    keeps every so many-th sample, after all filters; chosen, ten a period of the cut-off are left.
     """
 
     method: Literal["butterworth", "savitzky_golay"] = "butterworth"
     order: Annotated[Count, Field(le=8)] = 3
-    cutoff: Positive = 8.0
-    filter_torque: bool = False
+    cutoff: Positive | Literal["choose"] = "choose"
+    filter_torque: bool = True
     regressor_cutoff: Positive | None = None
-    decimate: Count = 1
+    decimate: Count | Literal["choose"] = "choose"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _filtered_once(cls, data: Any) -> Any:
+        if isinstance(data, dict) and data.get("regressor_cutoff") is not None:
+            return {"filter_torque": False} | data
+        return data
 
 
 class Reversal(Section):
-    """Which rows the unknown friction of a joint near standstill excludes from that joint's equations."""
+    """Which rows of a joint are near standstill: slower than `speed`, or within `window` [s] of turning round.
+
+    Their friction is known less well than that of a joint in motion, and they count as their residuals allow.
+    """
 
     speed: NonNegative = 0.05
     window: NonNegative = 0.2
@@ -251,8 +217,8 @@ class FrictionShape(Section):
     `stribeck_velocity` [rad/s or m/s] is v_s of the term `stribeck`.
     """
 
-    presliding: NonNegative | tuple[NonNegative, ...] | Literal["fit"] = 0.0
-    stribeck_velocity: Positive | tuple[Positive, ...] | Literal["fit"] = 0.1
+    presliding: NonNegative | tuple[NonNegative, ...] | Literal["fit"] = "fit"
+    stribeck_velocity: Positive | tuple[Positive, ...] | Literal["fit"] = "fit"
 
 
 class PriorPull(Section):
@@ -269,20 +235,30 @@ class PriorPull(Section):
 class Identification(Section):
     """How a recording becomes equations, and equations an estimate.
 
-    `method` is the estimator; `edge` [s] is left out at both ends of every recording; `block` [s] is what doubt is
-    computed from; `delay` [s] is how much later the torque's stamps are than the position's; `period` [s] averages a
-    periodic motion over its periods.
+    `method` is the estimator, by default the one of `wls` and `huber` that predicts held-out parts of the recordings
+    better; `edge` [s] is left out at both ends of every recording, two periods of the cut-off by default; `block` [s]
+    is what doubt is computed from; `delay` [s] is how much later the torque's stamps are than the position's; `period` [s]
+    averages a periodic motion over its periods, without the filters of the torque.
     """
 
-    method: Method = "ols"
+    method: Method | Literal["choose"] = "choose"
     smoothing: Smoothing = Smoothing()
     reversal: Reversal = Reversal()
     friction: FrictionShape = FrictionShape()
     prior: PriorPull = PriorPull()
-    edge: NonNegative = 0.5
+    edge: NonNegative | Literal["choose"] = "choose"
     block: Positive = 1.0
     delay: Number | Literal["estimate"] = 0.0
     period: Positive | None = None
+
+    @model_validator(mode="after")
+    def _averaged_instead(self) -> Identification:
+        if self.period is None:
+            return self
+        given = self.smoothing.model_fields_set & {"filter_torque", "regressor_cutoff", "decimate"}
+        if used := sorted(key for key in given if getattr(self.smoothing, key) not in (False, None, 1)):
+            raise ValueError(f"period averages instead of filtering; leave out smoothing.{', smoothing.'.join(used)}")
+        return self
 
 
 class FourierJoint(Section):

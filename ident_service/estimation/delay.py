@@ -16,6 +16,7 @@ from ident_service.config.schema import Reversal
 from ident_service.errors import RecordingError
 from ident_service.estimation.equations import Equations, equation_rows, equations
 from ident_service.estimation.least_squares import weighted_least_squares
+from ident_service.estimation.spectra import settled
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
@@ -59,8 +60,9 @@ def estimate_delay(recordings: Sequence[Recording], model: ArmModel, base: BaseP
     """
     # Where a joint turns round its friction jumps, and a jump has no rate: those rows are left out here, always. Noise
     # that a controller answers looks like a delay at high frequencies: both channels are filtered to half the cut-off.
-    options = model.config.identification
-    slow = options.smoothing.model_copy(update={"cutoff": 0.5 * options.smoothing.cutoff, "filter_torque": True})
+    options = settled(model, recordings).config.identification
+    cutoff = 0.5 * float(options.smoothing.cutoff)
+    slow = options.smoothing.model_copy(update={"cutoff": cutoff, "filter_torque": True, "decimate": 1})
     apart = options.model_copy(update={"reversal": Reversal(), "smoothing": slow})
     model = replace(model, config=model.config.model_copy(update={"identification": apart}))
     seconds = 0.0

@@ -109,7 +109,11 @@ def block_covariance(equations: Equations, fit: LeastSquares) -> Array:
 
 
 def verdicts(
-    beta: Array, deviations: Array, units: tuple[str, ...], degrees: Array | None = None
+    beta: Array,
+    deviations: Array,
+    units: tuple[str, ...],
+    degrees: Array | None = None,
+    as_zero: Array | None = None,
 ) -> tuple[Verdict, ...]:
     """Give a word per parameter: its deviation against the larger of its size and the reference of its unit.
 
@@ -119,15 +123,16 @@ def verdicts(
         units: of them.
         degrees: of freedom of the deviations, shape (base,): one from few blocks counts for as much as Student's t at
             95 % is wider than the normal distribution. Known deviations when None.
+        as_zero: sizes below which parameters are as good as zero, shape (base,); the references when None.
     """
     wider = np.ones(len(beta)) if degrees is None else stdtrit(np.maximum(degrees, 1.0), 0.975) / _NORMAL
     return tuple(
         "identified" if share < IDENTIFIED_BELOW else "weak" if share < WEAK_BELOW else "unidentified"
-        for share in shares(beta, deviations * wider, units)
+        for share in shares(beta, deviations * wider, units, as_zero)
     )
 
 
-def shares(beta: Array, deviations: Array, units: tuple[str, ...]) -> Array:
+def shares(beta: Array, deviations: Array, units: tuple[str, ...], as_zero: Array | None = None) -> Array:
     """Each deviation as a share of the larger of the parameter's size and the reference of its unit, shape (base,)."""
-    sizes = [max(abs(beta[k]), REFERENCE.get(unit, 0.0), np.finfo(float).tiny) for k, unit in enumerate(units)]
-    return np.asarray(deviations / np.array(sizes))
+    least = np.array([REFERENCE.get(unit, 0.0) for unit in units]) if as_zero is None else as_zero
+    return np.asarray(deviations / np.maximum(np.maximum(np.abs(beta), least), np.finfo(float).tiny))

@@ -17,6 +17,7 @@ from ident_service.config.schema import Identification
 from ident_service.errors import RecordingError
 from ident_service.estimation.periodic import averaged
 from ident_service.estimation.smoothing import Motion, smoothed, windows
+from ident_service.estimation.spectra import settled
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
@@ -41,9 +42,10 @@ class Rows:
         time: [s] since the recording's first sample, shape (samples,).
         H_b: base regressor, shape (joints, base, samples).
         torque: [N m or N], shape (samples, joints).
-        keep: which of them an estimate is fitted to, shape (samples, joints).
+        keep: which of them are of joints in motion, not near standstill, shape (samples, joints).
         position: smoothed [rad or m], shape (samples, joints).
         velocity: smoothed [rad/s or m/s], shape (samples, joints).
+        moving: where all drives of a joint are faster than `reversal.speed`, shape (samples, joints).
     """
 
     time: Array
@@ -52,6 +54,7 @@ class Rows:
     keep: NDArray[np.bool_]
     position: Array
     velocity: Array
+    moving: NDArray[np.bool_]
 
 
 RowWeights = Callable[[Rows], Array]
@@ -62,38 +65,50 @@ class Equations:
     """What recordings say about the base parameters.
 
     Attributes:
-        blocks: information of consecutive stretches of time, rows near a velocity reversal left out.
+        blocks: information of consecutive stretches of time, rows near standstill apart.
         samples: smoothed samples that went in.
-        left_out: information of the rows that the blocks leave out; eq. 84 is about all rows.
+        near: of the same stretches, the rows near standstill; none where they are among the blocks.
     """
 
     blocks: tuple[Information, ...]
     samples: int
-    left_out: Information | None = None
+    near: tuple[Information, ...] = ()
 
     @cached_property
     def total(self) -> Information:
-        """All blocks together: what an estimate is fitted to."""
+        """All blocks together."""
         return reduce(Information.merged, self.blocks)
 
     @cached_property
+    def left_out(self) -> Information | None:
+        """All rows near standstill together, where they are apart."""
+        return reduce(Information.merged, self.near) if self.near else None
+
+    @cached_property
     def everything(self) -> Information:
-        """All rows, also those that no estimate is fitted to: what an estimate is judged on."""
+        """All rows, those near standstill too: what an estimate is judged on (eq. 84)."""
         return self.total if self.left_out is None else self.total.merged(self.left_out)
 
     def with_torques_times(self, scales: Array) -> Equations:
         """The same equations with each joint's torque multiplied, `scales` of shape (joints,)."""
-        left_out = None if self.left_out is None else self.left_out.with_torques_times(scales)
-        return Equations(tuple(block.with_torques_times(scales) for block in self.blocks), self.samples, left_out)
+        blocks, near = (tuple(one.with_torques_times(scales) for one in part) for part in (self.blocks, self.near))
+        return Equations(blocks, self.samples, near)
+
+    def with_near(self, shares: Array) -> Equations:
+        """The same equations with the rows near standstill among the blocks, multiplied by `shares` per joint."""
+        if not self.near:
+            return self
+        pairs = zip(self.blocks, self.near, strict=True)
+        return Equations(tuple(block.merged(near.times(shares)) for block, near in pairs), self.samples)
 
     def joined(self, other: Equations) -> Equations:
-        """The equations of both."""
-        parts = [part for part in (self.left_out, other.left_out) if part is not None]
-        return Equations(
-            bounded([*self.blocks, *other.blocks]),
-            self.samples + other.samples,
-            reduce(Information.merged, parts) if parts else None,
-        )
+        """The equations of both.
+
+        Raises:
+            ModelError: the two belong to different models.
+        """
+        near = bounded([*self.near, *other.near])
+        return Equations(bounded([*self.blocks, *other.blocks]), self.samples + other.samples, near)
 
 
 @one_blas_thread()
@@ -106,14 +121,17 @@ def equations(
         recording: to read.
         model: its configuration says how to smooth.
         base: grouping of the parameters.
-        row_weights: what each kept row is multiplied by, shape (samples, joints); ones when None.
+        row_weights: what each row is multiplied by, shape (samples, joints); with it, those near standstill are
+            among the blocks.
 
     Raises:
-        RecordingError: the recording does not fit the arm, or no joint moves enough to give an equation.
+        RecordingError: the recording does not fit the arm, or some joint does not move.
     """
+    model = settled(model, [recording])
     joint_supports = supports(model.chain, model.layout, base.base)
     blocks: list[Information] = []
-    left_out: Information | None = None
+    near: list[Information] = []
+    moved = np.zeros(model.chain.joints, dtype=bool)
     samples, current, origin = 0, -1.0, 0.0
     length = _block_seconds(recording, model)
     for rows in equation_rows(recording, model, base):
@@ -125,19 +143,20 @@ def equations(
         weights = None if row_weights is None else row_weights(rows)
         for begin, end in zip([0, *starts], [*starts, len(rows.time)], strict=True):
             part = slice(begin, end)
-            weighted = None if weights is None else weights[part]
-            block = information_of(rows.H_b[:, :, part], rows.torque[part], rows.keep[part], joint_supports, weighted)
-            if number[begin] == current:
-                blocks[-1] = blocks[-1].merged(block)
-            else:
-                blocks.append(block)
+            kinds = [(blocks, rows.keep[part], None), (near, ~rows.keep[part], None)]
+            if weights is not None:
+                kinds = [(blocks, np.ones_like(rows.keep[part]), weights[part])]
+            for found, which, weighted in kinds:
+                block = information_of(rows.H_b[:, :, part], rows.torque[part], which, joint_supports, weighted)
+                if number[begin] == current:
+                    found[-1] = found[-1].merged(block)
+                else:
+                    found.append(block)
             current = number[begin]
-        rest = information_of(rows.H_b, rows.torque, ~rows.keep, joint_supports)
-        left_out = rest if left_out is None else left_out.merged(rest)
-        blocks = list(bounded(blocks))
-    result = Equations(tuple(blocks), samples, left_out)
-    still = [name for name, count in zip(model.chain.names, result.total.rows, strict=True) if count == 0]
-    if still:
+        moved |= rows.moving.any(axis=0)
+        blocks, near = list(bounded(blocks)), list(bounded(near))
+    result = Equations(tuple(blocks), samples, tuple(near))
+    if still := [name for name, moves in zip(model.chain.names, moved, strict=True) if not moves]:
         raise RecordingError(
             recording.path,
             f"{', '.join(still)}: never faster than identification.reversal.speed, nothing to identify from",
@@ -152,7 +171,7 @@ def _block_seconds(recording: Recording, model: ArmModel) -> float:
         seconds = float(options.period)
     else:
         stamps = grid(recording, model.config.recording)
-        seconds = (stamps.last_ns - stamps.first_ns) * 1e-9 - 2.0 * options.edge
+        seconds = (stamps.last_ns - stamps.first_ns) * 1e-9 - 2.0 * float(options.edge)
     return min(options.block, max(seconds, 0.0) / LEAST_BLOCKS) or options.block
 
 
@@ -166,6 +185,7 @@ def equation_rows(recording: Recording, model: ArmModel, base: BaseParameters) -
         raise RecordingError(
             recording.path, f"has {recording.joints} joints but the arm {model.config.name} has {model.chain.joints}"
         )
+    model = settled(model, [recording])
     options = model.config.identification
     if options.smoothing.regressor_cutoff is not None:
         yield from _filtered_rows(recording, model, base, options.smoothing.regressor_cutoff)
@@ -181,7 +201,7 @@ def equation_rows(recording: Recording, model: ArmModel, base: BaseParameters) -
             reuse = H if H is not None and H.shape[2] >= len(part.time) else None
             regressor = _regressor(part, model, base, reuse)
             H = regressor if reuse is None else H
-            yield Rows(part.time, regressor, part.torque, part.keep, part.position, part.velocity)
+            yield _rows(part, regressor, part.torque, model)
 
 
 def _regressor(motion: Motion, model: ArmModel, base: BaseParameters, out: Array | None = None) -> Array:
@@ -201,7 +221,7 @@ def _filtered_rows(recording: Recording, model: ArmModel, base: BaseParameters, 
     """Both sides of eq. 59 through the same zero-phase low-pass, so that what it does to one it does to the other."""
     options = model.config.identification
     slowest = 2.0 * np.pi * cutoff * np.sin(np.pi / (2 * options.smoothing.order))
-    step, offset = options.smoothing.decimate, 0
+    step, offset = int(options.smoothing.decimate), 0
     memory = _DECAY / slowest
     for window in windows(recording, options, model.chain.coupling, model.config.recording, memory):
         motion = window.motion
@@ -215,7 +235,13 @@ def _filtered_rows(recording: Recording, model: ArmModel, base: BaseParameters, 
             filtered[joint, support] = columns[inner].T
         torque = low_pass(motion.torque, options.smoothing.order, cutoff, rate)
         motion = motion[inner]
-        yield Rows(motion.time, filtered, torque[inner], motion.keep, motion.position, motion.velocity)
+        yield _rows(motion, filtered, torque[inner], model)
+
+
+def _rows(motion: Motion, H_b: Array, torque: Array, model: ArmModel) -> Rows:
+    slow = np.abs(motion.velocity @ model.chain.coupling.T) <= model.config.identification.reversal.speed
+    moving = ~(slow @ (model.chain.coupling != 0.0))
+    return Rows(motion.time, H_b, torque, motion.keep, motion.position, motion.velocity, moving)
 
 
 def bounded(blocks: list[Information]) -> tuple[Information, ...]:

@@ -1,7 +1,7 @@
 """From recordings to an unconstrained fit: what has to be found before, the estimator, and its covariance.
 
-Order: the shape of the friction, the delay between the channels, the equations, the factors of the torque constants,
-the estimator. Each step looks at the recordings that are fitted to, never at those that validate.
+Order: the filter, the delay between the channels, the shape of the friction, the equations, the factors of the torque
+constants, the estimator. Each step looks at the recordings that are fitted to, never at those that validate.
 """
 
 from __future__ import annotations
@@ -9,11 +9,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
+from typing import Literal
 
 import numpy as np
 
 from ident_service.config.schema import Method
 from ident_service.estimation import instruments, robust
+from ident_service.estimation.choices import Choice, chosen
 from ident_service.estimation.delay import Delay, estimate_delay, with_delay
 from ident_service.estimation.doubt import uncertainty
 from ident_service.estimation.equations import Equations, equations
@@ -23,7 +25,9 @@ from ident_service.estimation.feasible.torque_scales import constrained_least_sq
 from ident_service.estimation.friction_fit import fit_friction
 from ident_service.estimation.instruments import instrumental_variables
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares, weighted_least_squares
-from ident_service.estimation.robust import huber
+from ident_service.estimation.robust import held_out_errors, huber
+from ident_service.estimation.spectra import settled
+from ident_service.estimation.standstill import standstill_shares
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
@@ -39,12 +43,14 @@ class Prepared:
         equations: of all recordings, torques multiplied by `torque_scales`.
         delay: between position and torque, where it was estimated.
         torque_scales: what each joint's measured torque was multiplied by, shape (joints,).
+        choices: of what the configuration left to be chosen.
     """
 
     model: ArmModel
     equations: Equations
     delay: Delay | None
     torque_scales: Array
+    choices: tuple[Choice, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -56,14 +62,20 @@ class Fit:
         equations: what it solves, with row weights where the method has them.
         covariance: from blocks of scores, shape (base, base).
         degrees: degrees of freedom of its diagonal, shape (base,).
+        shares: what rows near standstill are multiplied by, shape (joints,).
+        method: estimator.
         remarks: what a person should know of how it was found, in words.
+        choices: between estimators, where there was one.
     """
 
     fit: LeastSquares
     equations: Equations
     covariance: Array
     degrees: Array
+    shares: Array
+    method: Method
     remarks: tuple[str, ...] = ()
+    choices: tuple[Choice, ...] = ()
 
 
 def prepare(
@@ -76,11 +88,13 @@ def prepare(
         ParameterError: bounds of torque constants that mean nothing.
         SolverError: the solver stopped without an optimum.
     """
-    model = fit_friction(recordings, model, base)
+    model = settled(model, recordings)
     delay = None
+    # Before the friction, whose turning round would take a delay for a longer way.
     if model.config.identification.delay == "estimate":
         delay = estimate_delay(recordings, model, base)
         model = with_delay(model, delay.seconds)
+    model = fit_friction(recordings, model, base)
     gathered = gather(recordings, model, base)
     scales = np.ones(model.chain.joints)
     if bounds := scale_bounds(model.config, model.chain.names):
@@ -96,34 +110,42 @@ def gather(recordings: Sequence[Recording], model: ArmModel, base: BaseParameter
 
 
 def unconstrained(
-    method: Method,
+    method: Method | Literal["choose"],
     recordings: Sequence[Recording],
     prepared: Prepared,
     base: BaseParameters,
     conditions: FeasibleSet,
 ) -> Fit:
-    """The estimate of a method.
+    """The estimate of a method, or of the one of `wls` and `huber` that predicts held-out thirds better.
 
     Raises:
         RecordingError: a recording cannot be used.
         ModelError: the joints' weights do not settle, or instruments say nothing.
         SolverError: the solver stopped without an optimum.
     """
-    model, gathered = prepared.model, prepared.equations
+    model = prepared.model
+    shares = standstill_shares(prepared.equations)
+    gathered = prepared.equations.with_near(shares)
     if method == "ols":
-        return _doubted(ordinary_least_squares(gathered.total), gathered)
+        return _doubted("ols", ordinary_least_squares(gathered.total), gathered, shares)
     fit = weighted_least_squares(gathered.total)
     if method == "wls":
-        return _doubted(fit, gathered)
-    if method == "huber":
-        fit, reweighted, change = huber(recordings, model, base, fit, prepared.torque_scales)
-        return replace(_doubted(fit, reweighted), remarks=_unsettled("Huber's weights", change, robust.SETTLED))
+        return _doubted("wls", fit, gathered, shares)
+    choices: tuple[Choice, ...] = ()
+    if method == "choose":
+        choices = (chosen("method", held_out_errors(recordings, model, base, fit, prepared.torque_scales, shares)),)
+        if choices[0].value == "wls":
+            return replace(_doubted("wls", fit, gathered, shares), choices=choices)
+    if method != "iv":
+        fit, reweighted, change = huber(recordings, model, base, fit, prepared.torque_scales, shares)
+        found = _doubted("huber", fit, reweighted, shares)
+        return replace(found, choices=choices, remarks=_unsettled("Huber's weights", change, robust.SETTLED))
     delta = constrained_least_squares(fit, base, conditions).delta
     refined = instrumental_variables(recordings, model, base, conditions, fit, delta)
     moved = replace(fit, beta=refined.beta, rho1=fit.R1 @ refined.beta, standard_deviations=refined.standard_deviations)
     # The instruments' variances come from as many blocks, each of which counts the same.
     remarks = _unsettled("the instrumental estimate", refined.change, instruments.SETTLED)
-    return Fit(moved, gathered, refined.covariance, uncertainty(gathered, fit).degrees, remarks)
+    return Fit(moved, gathered, refined.covariance, uncertainty(gathered, fit).degrees, shares, "iv", remarks)
 
 
 def _unsettled(what: str, change: float, settled: float) -> tuple[str, ...]:
@@ -135,6 +157,6 @@ def _unsettled(what: str, change: float, settled: float) -> tuple[str, ...]:
     )
 
 
-def _doubted(fit: LeastSquares, equations: Equations) -> Fit:
+def _doubted(method: Method, fit: LeastSquares, equations: Equations, shares: Array) -> Fit:
     found = uncertainty(equations, fit)
-    return Fit(fit, equations, found.covariance, found.degrees)
+    return Fit(fit, equations, found.covariance, found.degrees, shares, method)

@@ -67,6 +67,8 @@ def fit_friction(recordings: Sequence[Recording], model: ArmModel, base: BasePar
     wanted = [key for key in _GRIDS if getattr(shape, key) == "fit"]
     if "stribeck" not in model.layout.terms:
         wanted = [key for key in wanted if key != "stribeck_velocity"]
+    if not {"coulomb", "stribeck"} & set(model.layout.terms):
+        wanted = []
     joints = model.chain.joints
     values = {
         key: np.full(joints, 0.1 if key == "stribeck_velocity" else 0.0)
@@ -202,7 +204,7 @@ def _thinned(model: ArmModel, recordings: Sequence[Recording]) -> ArmModel:
     options = model.config.identification
     first = next(iter(recordings[0].blocks()), None)
     period = 1e-3 if first is None else float(np.median(np.diff(first.stamp_ns))) * 1e-9
-    step = max(options.smoothing.decimate, int(1.0 / (_RATE * period)))
+    step = max(int(options.smoothing.decimate), int(1.0 / (_RATE * period)))
     smoothing = options.smoothing.model_copy(update={"decimate": step})
     config = model.config.model_copy(update={"identification": options.model_copy(update={"smoothing": smoothing})})
     return replace(model, config=config)

@@ -136,30 +136,26 @@ class FrictionTrials:
         self._travels = [_Travel() for _ in range(joints)]
         rates, self._filters = [], []
         tables: list[list[Array]] = [[] for _ in range(joints)]
-        keeps = []
+        moved = np.zeros(joints, dtype=bool)
         for recording in recordings:
-            time, rate, keep, columns = _thinned_rows(recording, model, base, kept)
+            time, rate, moving, columns = _thinned_rows(recording, model, base, kept)
             self._follow(recording, model, time, rate)
             self._filters.append(_filter(model, time))
             rates.append(rate)
-            keeps.append(keep)
+            moved |= moving
             for table, more in zip(tables, columns, strict=True):
                 table.append(more)
         self._rate = np.concatenate(rates)
         self._lengths = [len(rate) for rate in rates]
-        keep = np.concatenate(keeps)
-        thirds = np.array_split(np.arange(len(keep)), FOLDS)
-        self._rows = len(keep)
+        self._rows = len(self._rate)
         self._parts = []
-        for third in thirds:
+        for third in np.array_split(np.arange(self._rows), FOLDS):
             part = []
             for joint in range(joints):
-                samples = third[keep[third, joint]]
-                Q, R = np.linalg.qr(np.concatenate(tables[joint])[samples])
-                part.append(_Kept(samples, Q, R))
+                Q, R = np.linalg.qr(np.concatenate(tables[joint])[third])
+                part.append(_Kept(third, Q, R))
             self._parts.append(part)
-        still = [name for joint, name in enumerate(model.chain.names) if not keep[:, joint].any()]
-        if still:
+        if still := [name for joint, name in enumerate(model.chain.names) if not moved[joint]]:
             raise RecordingError(
                 recordings[0].path,
                 f"{', '.join(still)}: never faster than identification.reversal.speed, nothing to identify from",
@@ -250,8 +246,8 @@ def _full_rate(recording: Recording, model: ArmModel) -> Iterator[tuple[Array, A
 def _thinned_rows(
     recording: Recording, model: ArmModel, base: BaseParameters, columns: Sequence[Sequence[int]]
 ) -> tuple[Array, Array, NDArray[np.bool_], list[Array]]:
-    """Give times [s], drive velocities, which rows count, and per joint its columns with the torque as the last."""
-    parts: list[tuple[Array, Array, NDArray[np.bool_], list[Array]]] = []
+    """Give times [s], drive velocities, which joints move, and per joint its columns with the torque as the last."""
+    parts: list[_Part] = []
     every, count, seen = 1, 0, 0
     for rows in equation_rows(recording, model, base):
         picked = np.arange((-seen) % every, len(rows.time), every)
@@ -272,15 +268,15 @@ def _part(rows: Rows, picked: NDArray[np.intp], columns: Sequence[Sequence[int]]
         np.column_stack([rows.H_b[joint][np.array(own)[:, None], picked].T, rows.torque[picked, joint]])
         for joint, own in enumerate(columns)
     ]
-    return rows.time[picked], rows.velocity[picked] @ model.chain.coupling.T, rows.keep[picked], tables
+    return rows.time[picked], rows.velocity[picked] @ model.chain.coupling.T, rows.moving.any(axis=0), tables
 
 
 def _joined(parts: Sequence[_Part], every: int) -> _Part:
-    time, rate, keep, tables = zip(*parts, strict=True)
+    time, rate, moving, tables = zip(*parts, strict=True)
     return (
         np.concatenate(time)[::every],
         np.concatenate(rate)[::every],
-        np.concatenate(keep)[::every],
+        np.any(moving, axis=0),
         [np.concatenate(joint)[::every] for joint in zip(*tables, strict=True)],
     )
 

@@ -21,6 +21,7 @@ from ident_service.errors import RecordingError
 from ident_service.estimation.doubt import Verdict, uncertainty, verdicts
 from ident_service.estimation.equations import Equations, Rows, bounded, equation_rows
 from ident_service.estimation.least_squares import ordinary_least_squares
+from ident_service.estimation.spectra import USUAL
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import base_parameters
 from ident_service.model.chain import Array
@@ -69,7 +70,12 @@ class GrowingInformation:
             model: of the arm; averaging over periods and trimming, which need a whole recording, are left out.
             in_blocks: whether the information of each block is kept, and deviations are as careful as the result's.
         """
-        options = model.config.identification.model_copy(update={"period": None})
+        options = model.config.identification
+        smoothing = options.smoothing
+        if smoothing.cutoff == "choose":  # windows of a few seconds do not say what the motion is
+            smoothing = smoothing.model_copy(update={"cutoff": USUAL})
+        self._edge = 2.0 / USUAL if options.edge == "choose" else options.edge
+        options = options.model_copy(update={"period": None, "smoothing": smoothing, "edge": self._edge})
         config = model.config.model_copy(update={"identification": options, "recording": RecordingFormat()})
         self._model = replace(model, config=config)
         self.base = base_parameters(model.chain, model.layout)
@@ -104,7 +110,7 @@ class GrowingInformation:
             self._need = min(1.5 * self._need, _LONGEST)
             return False
         # The next window looks at the end of this one again, because its own edges are left out.
-        edge = self._model.config.identification.edge
+        edge = self._edge
         keep = int(np.searchsorted(whole.stamp_ns, self._done_ns - int((edge + 0.1) * 1e9)))
         self._waiting = [cut(whole, max(keep, 0), len(whole.stamp_ns))]
         return found

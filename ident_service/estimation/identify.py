@@ -11,6 +11,7 @@ import numpy as np
 
 from ident_service.config.schema import FeasibleSetName, Method
 from ident_service.errors import UsageError
+from ident_service.estimation.choices import Choice
 from ident_service.estimation.custom import CustomFunction
 from ident_service.estimation.doubt import Verdict, verdicts
 from ident_service.estimation.equations import Equations, equations
@@ -38,6 +39,7 @@ from ident_service.model.base import BaseParameters, base_parameters
 from ident_service.model.chain import Array
 from ident_service.model.information import Information
 from ident_service.model.threads import one_blas_thread
+from ident_service.record.part import overlap
 from ident_service.record.recording import Recording
 
 _HELD_OUT = 1.0 / 3.0
@@ -117,10 +119,12 @@ class Estimate:
         samples: smoothed samples used.
         prepared: the equations, and what had to be found before them: friction's shape, delay, torque constants.
         fitted: the equations that the fit solves, for what else is to be asked of them (bootstrap, essential ones).
+        information: the rows, in motion and near standstill, without a robust method's weights; what is kept of them.
         prior: what the constrained estimates were drawn to, where they were.
         recordings: name and hash of what it was fitted to.
         candidates: the estimates of table 8, this one's among them.
         chosen: index of this estimate among the candidates.
+        choices: what the configuration left to be chosen, and by how much it was better.
         remarks: what a person should know of how it was found, in words.
         custom: further knowledge in the estimate, where the description names some and it is constrained; neither
             `margin` nor a certificate is about it.
@@ -145,10 +149,12 @@ class Estimate:
     samples: int
     prepared: Prepared
     fitted: Equations
+    information: Information
     prior: Prior | None
     recordings: tuple[tuple[str, str], ...]
     candidates: tuple[Candidate, ...]
     chosen: int
+    choices: tuple[Choice, ...] = ()
     remarks: tuple[str, ...] = ()
     custom: CustomKnowledge | None = None
     second: SecondOpinion | None = None
@@ -190,8 +196,8 @@ def identify(
         RecordingError: a recording does not fit the arm or cannot be used.
         SolverError: the solver stopped without an optimum.
     """
-    method = method or model.config.identification.method
-    _check(method, recordings, validation)
+    wanted = method or model.config.identification.method
+    _check(wanted, recordings, validation)
     _check_convex(model, set_name, custom, solver, again=again)
     base = base_parameters(model.chain, model.layout)
     sets = {name: feasible_set(name, base.names, model.config) for name in _SETS}
@@ -199,7 +205,7 @@ def identify(
     conditions = sets[kind]
 
     prepared = prepare(recordings, model, base, conditions)
-    found = unconstrained(method, recordings, prepared, base, conditions)
+    found = unconstrained(wanted, recordings, prepared, base, conditions)
     unseen = [(recording, _unseen(recording, prepared, base)) for recording in validation]
     prior = _prior(prepared.model, found, base, conditions)
     test = feasibility_test(found.fit.beta, base, conditions)
@@ -214,7 +220,8 @@ def identify(
             for name, one in sets.items()
         }
         without = constrained_least_squares(found.fit, base, conditions, prior)
-        errors = (torque_error(prepared.equations.total, one.beta) for one in (held[kind], without))
+        weighed = prepared.equations.with_near(found.shares).total
+        errors = (torque_error(weighed, one.beta) for one in (held[kind], without))
         knowledge = CustomKnowledge(custom, by.lower(), *(error.relative_percent for error in errors))
     deviations = np.sqrt(np.diag(found.covariance))
     second = None
@@ -227,7 +234,7 @@ def identify(
         held[kind] = held[kind].centred(base, conditions)
 
     everything, total = prepared.equations.everything, prepared.equations.total
-    label = method.upper()
+    label = found.method.upper()
 
     def candidate(name: str, beta: Array, margin: float) -> Candidate:
         scores = tuple(
@@ -251,7 +258,7 @@ def identify(
     return Estimate(
         model=prepared.model,
         base=base,
-        method=method,
+        method=found.method,
         conditions=conditions,
         constrained=not free,
         beta=beta,
@@ -267,10 +274,12 @@ def identify(
         samples=prepared.equations.samples,
         prepared=prepared,
         fitted=found.equations,
+        information=prepared.equations.with_near(found.shares).total,
         prior=prior,
         recordings=tuple((recording.path.name, recording.sha256) for recording in recordings),
         candidates=tuple(candidates),
         chosen=chosen,
+        choices=(*prepared.choices, *found.choices),
         remarks=(*found.remarks, *_remarks_on_friction(model, prepared.model)),
         custom=None if free else knowledge,
         second=second,
@@ -285,16 +294,14 @@ def _remarks_on_friction(described: ArmModel, fitted: ArmModel) -> tuple[str, ..
 
 
 def _check(method: str, recordings: Sequence[Recording], validation: Sequence[Recording]) -> None:
-    if method not in METHODS:
+    if method not in (*METHODS, "choose"):
         raise UsageError(f"method {method!r} is not one of {', '.join(METHODS)}")
     if not recordings:
         raise UsageError("give at least one recording to identify from")
-    fitted: set[str] = set()
-    for recording in recordings:
-        if recording.sha256 in fitted:
+    for index, recording in enumerate(recordings):
+        if any(overlap(recording, other) for other in recordings[:index]):
             raise UsageError(f"{recording.path}: the same recording twice would make the doubt too small")
-        fitted.add(recording.sha256)
-    if seen := [str(recording.path) for recording in validation if recording.sha256 in fitted]:
+    if seen := [str(one.path) for one in validation if any(overlap(one, other) for other in recordings)]:
         raise UsageError(f"{', '.join(seen)}: a recording that is fitted to cannot validate the fit")
 
 

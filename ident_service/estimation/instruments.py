@@ -37,6 +37,7 @@ from ident_service.estimation.equations import MAX_BLOCKS, Rows, equation_rows
 from ident_service.estimation.feasible.feasibility import constrained_least_squares
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.least_squares import LeastSquares
+from ident_service.estimation.spectra import settled
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
@@ -50,6 +51,7 @@ SETTLED = 0.02  # of a standard deviation
 _MOST_ROUNDS = 10
 _RANK_TOLERANCE = 1e-12
 _ORDER = 3  # of the low-pass on what is followed
+_SLOWEST = 2.0  # Hz, of it where that is measured; motions of arms are slower
 _STIFFNESS = 60.0  # rad/s, of the loop around an arm whose own is not known
 _LARGEST_STEP = 0.5  # of the velocity loop's time constant
 _RUNAWAY = 1e4  # rad/s or m/s
@@ -109,7 +111,7 @@ def instrumental_variables(
         delta: feasible link parameters near it, to simulate first, shape (parameters,).
         references: per recording what its arm followed, as positions at the same stamps; the measured ones when None.
         cutoff: of the low-pass on what is followed [Hz]; the smoothing's own where references are given, else a
-            quarter of it.
+            quarter of it, but at least 2 Hz.
         progress: called after each round with its number and the change in standard deviations.
 
     Raises:
@@ -123,7 +125,10 @@ def instrumental_variables(
     follow = recordings if references is None else references
     if not recordings or len(follow) != len(recordings):
         raise ModelError(f"{len(recordings)} recordings and {len(follow)} references; each recording needs its own")
-    frequency = cutoff or model.config.identification.smoothing.cutoff * (0.25 if references is None else 1.0)
+    # The arms that are simulated below are smoothed as the recordings are.
+    model = settled(model, recordings)
+    smoothed = float(model.config.identification.smoothing.cutoff)
+    frequency = cutoff or (smoothed if references is not None else max(0.25 * smoothed, _SLOWEST))
     beta = fit.beta
     best: InstrumentalEstimate | None = None
     for number in range(1, _MOST_ROUNDS + 1):

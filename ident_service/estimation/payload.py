@@ -13,22 +13,28 @@ motion looks like a payload: x depends on beta by -G = -(K_x^T W^T W K_x)^-1 K_x
 A body that was added has a pseudo-inertia >= 0, one that was taken off has the negative of one. Of both sets the point
 nearest to x in the metric of its covariance is sought, and told by its distance (`drift.probability`) and by the torque
 that lies between: too far from both means that no single body explains the recording, as when one tool was exchanged
-for another.
+for another. So does a recording without a payload whose residual is far above that of the identification: a small body
+is easily lost in it, and the arm does not move as it was identified.
+
+A parameter's verdict compares its deviation with the larger of its size and what is as good as zero: what makes 1 % of
+a joint's torque on this motion, or what a body of this mass has 5 cm from the frame, if that is less; at most the
+reference of its unit, which is made for whole links.
 
 Boundary: pure computation, no I/O.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from ident_service.errors import ParameterError, SolverError
-from ident_service.estimation.doubt import Verdict, block_covariance, verdicts
+from ident_service.estimation.doubt import REFERENCE, Verdict, uncertainty, verdicts
 from ident_service.estimation.drift import (
     ALPHA,
+    RELEVANT_TORQUE,
     Identified,
     Motion,
     Test,
@@ -52,6 +58,8 @@ from ident_service.model.threads import one_blas_thread
 
 Word = Literal["none", "added", "removed", "infeasible"]
 
+_ARM = 0.05  # m
+FAR = 4.0  # times the residual of the identification, as in `plausibility.py`
 _NO_VARIANCE = 1e-10  # of an eigenvalue of the correlations, against the largest
 _FELT = 1e-9  # of the arm's doubt in a parameter, below which a payload does not depend on it
 
@@ -66,6 +74,8 @@ class KnownArm:
         beta: base parameters in SI units, shape (base,).
         covariance: of them, infinite on the diagonal where nothing was seen, shape (base, base).
         blocks: that the covariance comes from; None where it is known exactly.
+        residual: root mean square of what was left unexplained at each joint where it was identified [N m or N], over
+            all rows, shape (joints,); None where nobody knows.
     """
 
     model: ArmModel
@@ -73,6 +83,7 @@ class KnownArm:
     beta: Array
     covariance: Array
     blocks: int | None = None
+    residual: Array | None = None
 
     def __post_init__(self) -> None:
         size = self.base.size
@@ -123,6 +134,7 @@ class Payload:
         body: that was added or taken off; None otherwise.
         without: torque error of the arm as it was identified, on this recording.
         fitted: torque error with the body, or with the unconstrained estimate where no body explains it.
+        excess: per joint, the residual of `fitted` over that of the identification; None where that is not known.
     """
 
     base: BaseParameters
@@ -140,6 +152,14 @@ class Payload:
     body: Body | None
     without: TorqueError
     fitted: TorqueError
+    excess: Array | None = None
+
+    def far(self) -> tuple[int, ...]:
+        """Find joints whose residual is far above that of the identification, and matters beside their torque."""
+        if self.excess is None:
+            return ()
+        matters = self.fitted.joint_relative_percent > 100.0 * RELEVANT_TORQUE
+        return tuple(np.flatnonzero(matters & (self.excess > FAR)).tolist())
 
 
 @one_blas_thread()
@@ -159,7 +179,8 @@ def identify_payload(arm: KnownArm, recorded: Equations, *, refit_offsets: bool 
     base, T, own = _columns(arm, refit_offsets)
     reduced = _reduced(recorded, arm.beta, T)
     fit = weighted_least_squares(reduced.total)
-    noise = block_covariance(reduced, fit)
+    from_blocks = uncertainty(reduced, fit)
+    noise = from_blocks.covariance
     G = _dependence(recorded.total, T, fit)
     covariance, doubt = _with_doubt(arm, noise, G)
     total = recorded.total
@@ -191,7 +212,7 @@ def identify_payload(arm: KnownArm, recorded: Equations, *, refit_offsets: bool 
     moved = np.zeros(base.size) if word == "none" else fit.beta if body is None else body.b
     everything = recorded.everything
     deviations = np.sqrt(np.diag(covariance))
-    return Payload(
+    payload = Payload(
         base=base,
         T=T,
         fit=fit,
@@ -199,15 +220,17 @@ def identify_payload(arm: KnownArm, recorded: Equations, *, refit_offsets: bool 
         G=G,
         covariance=covariance,
         standard_deviations=deviations,
-        verdicts=verdicts(fit.beta, deviations, base.units),
+        verdicts=verdicts(fit.beta, deviations, base.units, from_blocks.degrees, _as_zero(motion, base, fit.beta)),
         blocks=blocks,
         test=test,
         torque_share=motion.change(only) / np.maximum(measured, np.finfo(float).tiny),
         verdict=word,
         body=body,
         without=torque_error(everything, arm.beta),
-        fitted=torque_error(everything, arm.beta + T @ moved),
+        fitted=(fitted := torque_error(everything, arm.beta + T @ moved)),
+        excess=None if arm.residual is None else fitted.joint_rms / np.maximum(arm.residual, np.finfo(float).tiny),
     )
+    return replace(payload, verdict="infeasible") if word == "none" and payload.far() else payload
 
 
 def loaded_covariance(arm: KnownArm, payload: Payload) -> Array:
@@ -250,8 +273,19 @@ def _reduced(recorded: Equations, beta: Array, T: Array) -> Equations:
         supports = tuple(np.arange(T.shape[1]) for _ in factors)
         return Information(supports, tuple(factors), information.rows.copy(), T.shape[1])
 
-    left_out = None if recorded.left_out is None else one(recorded.left_out)
-    return Equations(tuple(one(block) for block in recorded.blocks), recorded.samples, left_out)
+    blocks, near = (tuple(one(block) for block in part) for part in (recorded.blocks, recorded.near))
+    return Equations(blocks, recorded.samples, near)
+
+
+def _as_zero(motion: Motion, base: BaseParameters, beta: Array) -> Array:
+    """Return sizes below which parameters of a payload are as good as zero, shape (payload,): see above."""
+    mass = max((abs(beta[k]) for k, unit in enumerate(base.units) if unit == "kg"), default=0.0)
+    mass = max(mass, REFERENCE["kg"])
+    near = {"kg m^2": mass * _ARM**2, "kg m": mass * _ARM}
+    of_units = np.array([min(REFERENCE.get(unit, 0.0), near.get(unit, np.inf)) for unit in base.units])
+    changes = np.array([motion.change(one) for one in np.eye(base.size)])
+    shares = (changes / np.maximum(motion.torque, np.finfo(float).tiny)).max(axis=1)
+    return np.asarray(np.minimum(of_units, RELEVANT_TORQUE / np.maximum(shares, np.finfo(float).tiny)))
 
 
 def _dependence(information: Information, T: Array, fit: LeastSquares) -> Array:

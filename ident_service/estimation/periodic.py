@@ -17,6 +17,7 @@ from ident_service.config.schema import Identification
 from ident_service.errors import RecordingError
 from ident_service.estimation.direction import direction
 from ident_service.estimation.smoothing import Motion
+from ident_service.estimation.spectra import with_filter
 from ident_service.model.zero_phase import widened
 from ident_service.record.grid import grid
 from ident_service.record.recording import Recording
@@ -65,6 +66,7 @@ def averaged(
             does not repeat itself.
     """
     fmt = fmt or RecordingFormat()
+    options = with_filter([recording], options, fmt)
     stamps = grid(recording, fmt)
     step = stamps.period_s
     length = max(round(period / step), 1)
@@ -111,7 +113,7 @@ def _motion(
     length, joints = q.shape
     harmonics = 2j * np.pi * np.fft.rfftfreq(length, step)[:, None]
     spectrum = np.fft.rfft(q, axis=0)
-    spectrum[np.abs(harmonics[:, 0]) > 2.0 * np.pi * options.smoothing.cutoff] = 0.0
+    spectrum[np.abs(harmonics[:, 0]) > 2.0 * np.pi * float(options.smoothing.cutoff)] = 0.0
     position, velocity, acceleration = (np.fft.irfft(spectrum * harmonics**order, length, axis=0) for order in range(3))
     if held:
         torque = 0.5 * (torque + np.roll(torque, 1, axis=0))

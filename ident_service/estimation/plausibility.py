@@ -12,8 +12,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ident_service.config.schema import JointTerm
+from ident_service.estimation.feasible.feasibility import constrained_least_squares
 from ident_service.estimation.identify import Candidate, Estimate
-from ident_service.estimation.least_squares import TorqueError
+from ident_service.estimation.least_squares import TorqueError, ordinary_least_squares, torque_error
 from ident_service.model.arm_model import ArmModel
 from ident_service.record.quality import JointQuality
 
@@ -22,7 +23,10 @@ MUCH_WORSE, WORSE_FROM = 4.0, 10.0  # times the error on what was fitted to, and
 CONSTRAINED_WORSE, CONSTRAINED_FROM = 1.8, 2.0  # times the unconstrained error, and percent from which that counts
 WRONG_SIGN = 8.0  # deviations by which friction is negative
 CONSTRAINED_WORSE_WITH_SIGN, PERHAPS_WRONG_SIGN = 1.3, 4.0  # both together
+MIRRORED_FROM, MIRRORED_WORSE = 20.0, 1.4  # percent, and times the unconstrained error, from which a joint is turned
+MIRRORED = 1.3  # times smaller is its error with the torque negated, and again near the unconstrained one
 _OUTSIDE = 0.1  # of a joint's range: what limits of a description may be off
+_NOISE = 1e-3  # of a joint's range: what an encoder's noise at a limit may be
 _TURNS = 100.0  # rad, for joints without limits
 _TOO_FAST, _TOO_STRONG = 4.0, 4.0  # times the limit of the description
 _JUMP = 20.0  # times the usual step between samples
@@ -54,6 +58,37 @@ def reasons_in_recording(recording: str, joints: Sequence[JointQuality], model: 
         for reason in _of_joint(model.chain.names[index], seen, model, revolute=model.chain.revolute[index])
     ]
     return (*found, *(f"{recording}: {reason}" for reason in _weight(joints, model)))
+
+
+def remarks_on_limits(recording: str, joints: Sequence[JointQuality], model: ArmModel) -> tuple[str, ...]:
+    """Name joints that leave their position limits by less than what makes a recording unusable.
+
+    Args:
+        recording: its name, for the words.
+        joints: what was seen of its joints.
+        model: the arm and its limits.
+    """
+    found = []
+    for name, seen, revolute in zip(model.chain.names, joints, model.chain.revolute, strict=True):
+        described = model.config.joints.get(name)
+        limits = None if described is None else described.position
+        if limits is None:
+            continue
+        span = limits[1] - limits[0]
+        excess = max(limits[0] - seen.position[0], seen.position[1] - limits[1])
+        if _NOISE * span < excess <= _OUTSIDE * span:
+            value, when = _farthest(seen, limits)
+            found.append(
+                f"{recording}: {name} is at {value:.4g} {'rad' if revolute else 'm'} {when:.4g} s after the first"
+                f" sample, outside its limits of {limits[0]:.4g} and {limits[1]:.4g}: correct the limits, or the offset"
+            )
+    return tuple(found)
+
+
+def _farthest(seen: JointQuality, limits: tuple[float, float]) -> tuple[float, float]:
+    """Return the position farthest outside [rad or m], and when it was [s]."""
+    side = int(seen.position[1] - limits[1] > limits[0] - seen.position[0])
+    return seen.position[side], seen.position_at[side]
 
 
 def _errors(own: Candidate) -> Iterator[str]:
@@ -92,11 +127,34 @@ def _against_the_unconstrained(estimate: Estimate) -> Iterator[str]:
             f"the torque, or the position, may have the wrong sign at {which}: without conditions, the friction of"
             f" {name} drives it ({torque:.3g} +- {deviation:.2g} at its usual speed)" + (f"; {words}" if much else "")
         )
+    elif mirrored := _mirrored(estimate) if held else "":
+        yield f"{mirrored}; {words}"
     elif much:
         yield (
             f"{words}: gravity, signs, order or units of the columns, or the description's bodies, contradict the"
             " recording"
         )
+
+
+def _mirrored(estimate: Estimate) -> str:
+    """Name the joint whose torques the conditions of a real body allow better with the other sign; none is empty."""
+    free, own = (estimate.candidates[place].moving.joint_relative_percent for place in (0, estimate.chosen))
+    information, weights = estimate.information, estimate.fit.weights
+    for joint, name in enumerate(estimate.model.chain.names):
+        if own[joint] < max(MIRRORED_FROM, MIRRORED_WORSE * free[joint]):
+            continue
+        signs = np.ones(information.joints)
+        signs[joint] = -1.0
+        fit = ordinary_least_squares(information.with_torques_times(signs), weights)
+        beta = constrained_least_squares(fit, estimate.base, estimate.conditions).beta
+        turned = torque_error(estimate.prepared.equations.total.with_torques_times(signs), beta)
+        error = turned.joint_relative_percent[joint]
+        if MIRRORED * error < own[joint] and error < MIRRORED_WORSE * free[joint]:
+            return (
+                f"the torque, or the position, may have the wrong sign at {name}: its torque error is"
+                f" {own[joint]:.0f} %, and {error:.0f} % with the torque negated"
+            )
+    return ""
 
 
 def _driving_friction(estimate: Estimate, deviations: float) -> list[tuple[str, float, float]]:
@@ -137,9 +195,11 @@ def _of_joint(name: str, seen: JointQuality, model: ArmModel, *, revolute: bool)
     if limits is not None:
         room = _OUTSIDE * (limits[1] - limits[0])
         if low < limits[0] - room or high > limits[1] + room:
+            _, when = _farthest(seen, limits)
             yield (
-                f"{name} is recorded from {low:.4g} to {high:.4g} {unit}, and its limits are {limits[0]:.4g} and"
-                f" {limits[1]:.4g}: are the positions in {small}, or those of another joint?"
+                f"{name} is recorded from {low:.4g} to {high:.4g} {unit}, farthest outside its limits of"
+                f" {limits[0]:.4g} and {limits[1]:.4g} at {when:.4g} s after the first sample: are the positions in"
+                f" {small}, or those of another joint?"
             )
             return
     elif revolute and max(-low, high) > _TURNS:

@@ -1,37 +1,45 @@
 """Robust regression: equations that fit badly count less (Huber 1964), by iteratively reweighted least squares.
 
-Each round reads the recordings again, because a weight belongs to a row and rows are not kept. The scale of a joint's
-residuals is the median of their absolute values, which bad rows cannot move far; it is taken from a spread of rows.
+The weights are found on a spread of rows that is kept, so that memory does not grow with the recording; then each row
+gets its weight in one more reading. The scale of a joint's residuals is the median of their absolute values, which bad
+rows cannot move far.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import reduce
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ident_service.errors import ModelError
 from ident_service.estimation.equations import Equations, Rows, equation_rows, equations
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
+from ident_service.model.information import Information, supports, triangle
+from ident_service.model.threads import one_blas_thread
 from ident_service.record.recording import Recording
 
 _TUNING = 1.345  # 95 % efficiency where the noise is normal after all
 _CONSISTENT = 1.4826  # of the median absolute deviation, for normal noise
-_SPREAD = 20_000  # rows per joint that the scale is taken from
+_SPREAD = 5_000  # samples that the weights are found on
 SETTLED = 1e-3  # of a white standard deviation
 _MOST_ROUNDS = 50
+_FOLDS = 3
+_FOLD_ROUNDS = 15
 
 
+@one_blas_thread()
 def huber(
     recordings: Sequence[Recording],
     model: ArmModel,
     base: BaseParameters,
     start: LeastSquares,
     torque_scales: Array | None = None,
+    shares: Array | None = None,
 ) -> tuple[LeastSquares, Equations, float]:
     """Find Huber's estimate, the reweighted equations that it solves, and by how much the last round changed it.
 
@@ -39,56 +47,162 @@ def huber(
     above `SETTLED` says so.
 
     Args:
-        recordings: to fit to.
+        recordings: to fit to; each is read twice.
         model: the arm.
         base: grouping of the parameters.
         start: an estimate to begin from.
         torque_scales: what each joint's measured torque is multiplied by, shape (joints,); ones when None.
+        shares: what rows near standstill are multiplied by, shape (joints,); ones when None.
 
     Raises:
         RecordingError: a recording cannot be used.
     """
-    fit = start
-    best: tuple[LeastSquares, Equations, float] | None = None
+    shares = np.ones(model.chain.joints) if shares is None else shares
     times = np.ones(model.chain.joints) if torque_scales is None else torque_scales
-    for _ in range(_MOST_ROUNDS):
-        scales = _scales(recordings, model, base, fit.beta, times)
+    spread = _spread(recordings, model, base, times, shares)
+    beta, change = spread.huber(start.beta, _MOST_ROUNDS)
+    scales = spread.scales(beta)
 
-        def weights(rows: Rows, beta: Array = fit.beta, scales: Array = scales) -> Array:
-            size = np.abs(_residuals(rows, beta, times)) / scales
-            # A row counts with the square of what it is multiplied by; over the scale, so that joints are comparable.
-            return np.asarray(np.sqrt(np.minimum(1.0, _TUNING / np.maximum(size, 1e-12))) / scales)
+    def weights(rows: Rows) -> Array:
+        count = np.where(rows.keep, 1.0, shares)
+        residuals = count * (rows.torque * times - np.einsum("jps,p->sj", rows.H_b, beta))
+        return np.asarray(count * _weights(residuals, scales))
 
-        gathered = reduce(Equations.joined, (equations(recording, model, base, weights) for recording in recordings))
-        gathered = gathered.with_torques_times(times)
-        better = ordinary_least_squares(gathered.total)
-        deviations = np.where(np.isfinite(better.standard_deviations), better.standard_deviations, np.inf)
-        change = float(np.max(np.abs(better.beta - fit.beta) / np.maximum(deviations, np.finfo(float).tiny)))
-        fit = better
-        if best is None or change < best[2]:
-            best = (fit, gathered, change)
-        if change < SETTLED:
-            break
-    if best is None:
-        raise ModelError("the weights of the rows need at least one round")
-    return best
+    gathered = reduce(Equations.joined, (equations(recording, model, base, weights) for recording in recordings))
+    gathered = gathered.with_torques_times(times)
+    return ordinary_least_squares(gathered.total), gathered, change
 
 
-def _residuals(rows: Rows, beta: Array, times: Array) -> Array:
-    return np.asarray(rows.torque * times - np.einsum("jps,p->sj", rows.H_b, beta))
+def held_out_errors(
+    recordings: Sequence[Recording],
+    model: ArmModel,
+    base: BaseParameters,
+    start: LeastSquares,
+    torque_scales: Array,
+    shares: Array,
+) -> dict[str, float]:
+    """Predict each third of the torques from estimates of the other two, with and without Huber's weights.
+
+    Args:
+        recordings: to fit to; each is read once.
+        model: the arm.
+        base: grouping of the parameters.
+        start: weighted least squares of all of them; its weights make the joints' errors comparable.
+        torque_scales: what each joint's measured torque is multiplied by, shape (joints,).
+        shares: what rows near standstill are multiplied by, shape (joints,).
+
+    Returns:
+        Relative torque error [percent] of `wls` and of `huber`, the joints weighed as `start` has it.
+
+    Raises:
+        RecordingError: a recording cannot be used.
+    """
+    spread = _spread(recordings, model, base, torque_scales, shares)
+    errors, torques = np.zeros(2), 0.0
+    for number in range(_FOLDS):
+        rest, unseen = spread.without(number), spread.only(number)
+        plain = ordinary_least_squares(rest.information(), start.weights).beta
+        robust, _ = rest.huber(plain, _FOLD_ROUNDS)
+        seen = unseen.information()
+        errors += [float(np.sum(start.weights**2 * seen.squared_residuals(beta))) for beta in (plain, robust)]
+        torques += float(np.sum(start.weights**2 * seen.squared_torques()))
+    relative = 100.0 * np.sqrt(errors / max(torques, np.finfo(float).tiny))
+    return {"wls": float(relative[0]), "huber": float(relative[1])}
 
 
-def _scales(recordings: Sequence[Recording], model: ArmModel, base: BaseParameters, beta: Array, times: Array) -> Array:
-    """Robust standard deviation of each joint's residuals [N m or N], shape (joints,)."""
-    found: list[list[Array]] = [[] for _ in range(model.chain.joints)]
+def _weights(residuals: Array, scales: Array) -> Array:
+    # A row counts with the square of what it is multiplied by; over the scale, so that joints are comparable.
+    size = np.abs(residuals) / scales
+    return np.asarray(np.sqrt(np.minimum(1.0, _TUNING / np.maximum(size, 1e-12))) / scales)
+
+
+@dataclass(frozen=True)
+class _Spread:
+    """Per joint, the columns of rows that count, with the torque as the last; evenly spread over the recordings."""
+
+    supports: tuple[NDArray[np.intp], ...]
+    base: int
+    tables: tuple[Array, ...]
+
+    def huber(self, beta: Array, rounds: int) -> tuple[Array, float]:
+        """Of at most so many rounds, the estimate that changed least, and by how many white deviations it did."""
+        best = (beta, np.inf)
+        for _ in range(rounds):
+            better = ordinary_least_squares(self._reweighted(beta))
+            deviations = np.where(np.isfinite(better.standard_deviations), better.standard_deviations, np.inf)
+            change = float(np.max(np.abs(better.beta - beta) / np.maximum(deviations, np.finfo(float).tiny)))
+            if change < best[1]:
+                best = (better.beta, change)
+            beta = better.beta
+            if change < SETTLED:
+                break
+        return best
+
+    def information(self) -> Information:
+        """The rows, each once."""
+        return self._of([triangle(table) for table in self.tables])
+
+    def only(self, part: int) -> _Spread:
+        """One third of the rows."""
+        return self._with([np.array_split(table, _FOLDS)[part] for table in self.tables])
+
+    def without(self, part: int) -> _Spread:
+        """The other two thirds."""
+        return self._with(
+            [
+                np.concatenate([one for number, one in enumerate(np.array_split(table, _FOLDS)) if number != part])
+                for table in self.tables
+            ]
+        )
+
+    def residuals(self, beta: Array) -> list[Array]:
+        pairs = zip(self.tables, self.supports, strict=True)
+        return [table[:, -1] - table[:, :-1] @ beta[support] for table, support in pairs]
+
+    def scales(self, beta: Array) -> Array:
+        """Robust standard deviation of each joint's residuals [N m or N], shape (joints,)."""
+        return np.array([max(_CONSISTENT * float(np.median(np.abs(one))), 1e-9) for one in self.residuals(beta)])
+
+    def _reweighted(self, beta: Array) -> Information:
+        # The rows as often as their residuals allow.
+        pairs = zip(self.tables, self.residuals(beta), self.scales(beta), strict=True)
+        return self._of([triangle(table * _weights(residual, scale)[:, None]) for table, residual, scale in pairs])
+
+    def _of(self, factors: Sequence[Array]) -> Information:
+        rows = np.array([len(table) for table in self.tables], dtype=np.int64)
+        return Information(self.supports, tuple(factors), rows, self.base)
+
+    def _with(self, tables: Sequence[Array]) -> _Spread:
+        return _Spread(self.supports, self.base, tuple(tables))
+
+
+def _spread(
+    recordings: Sequence[Recording], model: ArmModel, base: BaseParameters, times: Array, shares: Array
+) -> _Spread:
+    """Read every recording once; of long ones every second, every fourth ... sample is kept.
+
+    Raises:
+        RecordingError: a recording cannot be used.
+    """
+    felt = supports(model.chain, model.layout, base.base)
+    kept: list[tuple[Array, ...]] = []
+    every, samples, seen = 1, 0, 0
     for recording in recordings:
         for rows in equation_rows(recording, model, base):
-            errors = _residuals(rows, beta, times)
-            for joint, sizes in enumerate(found):
-                sizes.append(np.abs(errors[rows.keep[:, joint], joint]))
-    scales = []
-    for sizes in found:
-        every = np.concatenate(sizes)
-        every = every[:: max(1, len(every) // _SPREAD)]
-        scales.append(max(_CONSISTENT * float(np.median(every)), 1e-9))
-    return np.array(scales)
+            picked = np.arange((-seen) % every, len(rows.time), every)
+            seen += len(rows.time)
+            count = np.where(rows.keep[picked], 1.0, shares)
+            torque = rows.torque[picked] * times
+            kept.append(
+                tuple(
+                    np.column_stack([rows.H_b[joint][support[:, None], picked].T, torque[:, joint]])
+                    * count[:, joint, None]
+                    for joint, support in enumerate(felt)
+                )
+            )
+            samples += len(picked)
+            while samples > 2 * _SPREAD:
+                kept = [tuple(np.concatenate(parts)[::2] for parts in zip(*kept, strict=True))]
+                every, samples = 2 * every, samples // 2
+    tables = tuple(np.concatenate(parts) for parts in zip(*kept, strict=True))
+    return _Spread(felt, base.size, tables)

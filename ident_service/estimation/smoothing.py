@@ -21,6 +21,7 @@ from ident_service.config.recording import RecordingFormat
 from ident_service.config.schema import Identification
 from ident_service.errors import RecordingError
 from ident_service.estimation.direction import direction
+from ident_service.estimation.spectra import with_filter
 from ident_service.model.zero_phase import local_polynomial, low_pass, widened
 from ident_service.record.grid import grid
 from ident_service.record.recording import Block, Recording
@@ -89,7 +90,8 @@ def smoothed(
     Raises:
         RecordingError: too short for the filter, or what reading the recording raises.
     """
-    step = options.smoothing.decimate
+    options = with_filter([recording], options, fmt)
+    step = int(options.smoothing.decimate)
     offset = 0
     for window in windows(recording, options, coupling, fmt):
         inner = window.motion[window.inner]
@@ -113,11 +115,13 @@ def windows(
     fmt = fmt or RecordingFormat()
     stamps = grid(recording, fmt)
     period = stamps.period_s
+    options = with_filter([recording], options, fmt)
     smoother = _Smoother(recording, options, period, coupling)
-    edge = int(np.ceil(options.edge / period))
+    left_out = float(options.edge)
+    edge = int(np.ceil(left_out / period))
     # A window that is not the last must never hold samples of the recording's end edge.
     margin = max(smoother.margin + int(np.ceil(extra_margin / period)), edge)
-    shortest = max(2.0 * options.edge + 1.0, 2 * margin * period)
+    shortest = max(2.0 * left_out + 1.0, 2 * margin * period)
     pieces = uniform(recording, fmt, stamps, shortest_s=shortest, samples=_WINDOW)
     for window, start, stop, opens, closes in _overlapping(pieces, margin):
         motion = smoother(window, stamps.first_ns, opens, slice(max(stop - margin, 0), stop))
@@ -133,10 +137,11 @@ class _Smoother:
 
     def __init__(self, recording: Recording, options: Identification, period: float, coupling: Array | None) -> None:
         smoothing = options.smoothing
-        if smoothing.cutoff >= 0.5 / period:
+        self._cutoff = float(smoothing.cutoff)
+        if self._cutoff >= 0.5 / period:
             raise RecordingError(
                 recording.path,
-                f"sampled at {1.0 / period:.4g} Hz, too slow for a cut-off of {smoothing.cutoff:g} Hz; "
+                f"sampled at {1.0 / period:.4g} Hz, too slow for a cut-off of {self._cutoff:g} Hz; "
                 "lower identification.smoothing.cutoff",
             )
         self._options, self._period, self._held = options, period, recording.torque_held
@@ -147,11 +152,11 @@ class _Smoother:
         self._presliding = np.broadcast_to(np.asarray(presliding, dtype=float), (recording.joints,))
         self._direction = np.zeros((0, recording.joints))
         self._delay = 0.0 if options.delay == "estimate" else float(options.delay)
-        slowest = 2.0 * np.pi * smoothing.cutoff * np.sin(np.pi / (2 * smoothing.order))
+        slowest = 2.0 * np.pi * self._cutoff * np.sin(np.pi / (2 * smoothing.order))
         memory = _DECAY / slowest
         if smoothing.method == "savitzky_golay":
             # The polynomial's window that has about the cut-off asked for (Schafer 2011).
-            half = max(smoothing.order + 2, round((smoothing.order + 1) / (3.2 * 2 * smoothing.cutoff * period) + 0.7))
+            half = max(smoothing.order + 2, round((smoothing.order + 1) / (3.2 * 2 * self._cutoff * period) + 0.7))
             self._length = 2 * half + 1
             memory = max(half * period, memory if smoothing.filter_torque else 0.0)
         reach = options.reversal.window + abs(self._delay)
@@ -199,8 +204,8 @@ class _Smoother:
 
     def _low_pass(self, values: Array) -> Array:
         smoothing = self._options.smoothing
-        pad = min(3 * int(1.0 / (smoothing.cutoff * self._period)), len(values) - 1)
-        return low_pass(values, smoothing.order, smoothing.cutoff, 1.0 / self._period, pad)
+        pad = min(3 * int(1.0 / (self._cutoff * self._period)), len(values) - 1)
+        return low_pass(values, smoothing.order, self._cutoff, 1.0 / self._period, pad)
 
     def _differenced(self, values: Array) -> Array:
         padded = np.pad(values, ((2, 2), (0, 0)), mode="edge")

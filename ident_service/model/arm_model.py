@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ident_service.config.recording import units_of_other_joints
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import ModelError
 from ident_service.model.chain import Array, Chain, chain_from_dh
@@ -36,7 +37,7 @@ def arm_model(config: ArmConfig) -> ArmModel:
 
     Raises:
         ModelError: a mechanism that is not a tree of one-degree-of-freedom joints, or joints of the configuration
-            that the mechanism does not have.
+            that the mechanism does not have, or recorded columns in units of other joints.
         ParameterError: prior parameters that the arm does not have.
     """
     kinematics = config.kinematics
@@ -48,9 +49,9 @@ def arm_model(config: ArmConfig) -> ArmModel:
         from ident_service.model.rigid_body import read_mjcf, read_urdf
 
         if kinematics.urdf is not None:
-            chain, inertias = read_urdf(kinematics.urdf, config.gravity)
+            chain, inertias = read_urdf(kinematics.urdf, config.gravity, kinematics)
         elif kinematics.mjcf is not None:
-            chain, inertias = read_mjcf(kinematics.mjcf, config.gravity)
+            chain, inertias = read_mjcf(kinematics.mjcf, config.gravity, kinematics)
         else:
             raise ModelError(f"{config.name}: no kinematics")
     offsets = np.maximum(np.abs(chain.translation), np.abs(chain.link_translation)).max(axis=1)
@@ -64,6 +65,8 @@ def arm_model(config: ArmConfig) -> ArmModel:
             f"{config.name}: joints are configured as {', '.join(config.joints)} "
             f"but the mechanism has {', '.join(chain.names)}, in this order"
         )
+    if wrong := list(units_of_other_joints(config.recording, chain.names, chain.revolute)):
+        raise ModelError(f"{config.name}: {'; '.join(wrong)}")
     gears = config.transmission
     if gears is not None and gears.coupling is not None and gears.drive_terms == "motors":
         chain = replace(chain, coupling=np.array(gears.coupling, dtype=float))

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ident_service.config.schema import DHTable
+from ident_service.config.kinematics import DHTable
 from ident_service.errors import ModelError
 
 Array = NDArray[np.float64]

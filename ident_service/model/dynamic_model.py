@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 import pinocchio as pin
 
+from ident_service.config.kinematics import Kinematics
 from ident_service.config.quantities import TextFile
 from ident_service.config.schema import Joint
 from ident_service.errors import ModelError
@@ -138,12 +139,23 @@ def _set_limits(model: pin.Model, arm: ArmModel) -> None:
         model.velocityLimit, model.effortLimit = speed, torque
 
 
-def read_back(file: TextFile, kind: Literal["urdf", "mjcf"], gravity: tuple[float, float, float]) -> WrittenArm:
+def read_back(
+    file: TextFile,
+    kind: Literal["urdf", "mjcf"],
+    gravity: tuple[float, float, float],
+    kinematics: Kinematics | None = None,
+) -> WrittenArm:
     """Read a file that was written, for comparison.
+
+    Args:
+        file: what was written.
+        kind: of file.
+        gravity: in the base frame [m/s^2].
+        kinematics: which part of the file is the arm; all of it when None.
 
     Raises:
         ModelError: it cannot be read.
     """
-    found = read_mechanism(file, kind, own=True)
+    found = read_mechanism(file, kind, kinematics, own=True)
     chain, bodies = chain_of(found, gravity)
     return WrittenArm(chain, bodies, found.armature.copy(), found.damping.copy(), found.dry_friction.copy())

@@ -80,6 +80,11 @@ class Information:
         ]
         return np.array([float(error @ error) for error in errors])
 
+    def times(self, weights: Array) -> Information:
+        """The same equations with each joint's rows multiplied, `weights` of shape (joints,)."""
+        factors = tuple(weight * factor for weight, factor in zip(weights, self.factors, strict=True))
+        return Information(self.supports, factors, self.rows.copy(), self.base)
+
     def with_torques_times(self, scales: Array) -> Information:
         """The same equations with each joint's torque multiplied, `scales` of shape (joints,)."""
         factors = []

@@ -15,12 +15,13 @@ from typing import Any
 from ident_service.errors import ModelError
 
 
-def ask_process(module: str, path: Path, deadline: float) -> dict[str, Any]:
+def ask_process(module: str, path: Path, deadline: float, *more: str) -> dict[str, Any]:
     """Run a module on a file and return what it answers.
 
     Args:
         module: its `main` calls `answer_within`.
         path: of the file.
+        more: words after it.
         deadline: how long a busy machine may take [s]; the process limits its own computing.
 
     Raises:
@@ -29,7 +30,7 @@ def ask_process(module: str, path: Path, deadline: float) -> dict[str, Any]:
     paths = os.pathsep.join(one or str(Path.cwd()) for one in sys.path)
     try:
         done = subprocess.run(  # noqa: S603 - our own interpreter and module
-            [sys.executable, "-P", "-m", module, str(path)],
+            [sys.executable, "-P", "-m", module, str(path), *more],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,

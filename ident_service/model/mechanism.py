@@ -8,6 +8,7 @@ another. An MJCF is read in a process of its own, with limits of memory and time
 
 from __future__ import annotations
 
+import json
 import re
 import tempfile
 from collections.abc import Mapping
@@ -20,6 +21,7 @@ from xml.parsers import expat
 import numpy as np
 from numpy.typing import NDArray
 
+from ident_service.config.kinematics import Kinematics
 from ident_service.config.quantities import TextFile
 from ident_service.errors import ModelError
 from ident_service.model.limited_process import ask_process
@@ -31,7 +33,7 @@ MOST_LINKS: Final = 256
 DEEPEST_LINKS: Final = 64  # a level takes 2 kB of the stack, of which a thread may have 512 kB
 _DEEPEST_ELEMENTS = 128
 _DEADLINE = 30.0  # s of waiting on a busy machine; the process itself may compute for five
-_FORBIDDEN = re.compile(r"<!\s*(DOCTYPE|ENTITY)|<\s*(include|mimic)\b|\bxi:include\b", re.IGNORECASE)
+_FORBIDDEN = re.compile(r"<!\s*(DOCTYPE|ENTITY)|<\s*include\b|\bxi:include\b", re.IGNORECASE)
 Array = NDArray[np.float64]
 
 
@@ -50,6 +52,7 @@ class Mechanism:
         armature: [kg m^2 or kg], shape (joints,).
         damping: [N m s/rad or N s/m], shape (joints,).
         dry_friction: [N m or N], shape (joints,).
+        held: where all other movable joints are held [rad or m].
         frames: name of each link to its joint (-1: the world), and its rotation and translation in that joint's frame.
     """
 
@@ -63,29 +66,38 @@ class Mechanism:
     armature: Array
     damping: Array
     dry_friction: Array
+    held: Mapping[str, float]
     frames: Mapping[str, tuple[int, Array, Array]]
 
 
-@lru_cache(maxsize=8)
-def read_mechanism(file: TextFile, kind: Kind, *, own: bool = False) -> Mechanism:
-    """Read a file.
+def read_mechanism(file: TextFile, kind: Kind, kinematics: Kinematics | None = None, *, own: bool = False) -> Mechanism:
+    """Read the arm in a file.
 
     Args:
         file: its name and text.
         kind: of the file.
+        kinematics: which part of it is the arm; all of it when None.
         own: whether this process has just written it, so that nobody else has a word in it.
 
     Raises:
         ModelError: not such a file, beyond the limits, entities or includes in it, or a joint that is neither
-            revolute, continuous nor prismatic.
+            revolute, continuous nor prismatic, or mimics a joint of the arm; no such base, tip or locked joint.
     """
+    part = None
+    if kinematics is not None:
+        part = json.dumps({"base": kinematics.base, "tip": kinematics.tip, "lock": kinematics.lock})
+    return _read(file, kind, part, own)
+
+
+@lru_cache(maxsize=8)
+def _read(file: TextFile, kind: Kind, part: str | None, own: bool) -> Mechanism:
     count_mechanism(file, kind)
     if kind == "urdf":
         from ident_service.model.mechanism_process import urdf_document
 
-        document = urdf_document(file.text)
+        document = urdf_document(file, part)
     else:
-        document = _mjcf_document(file, own=own)
+        document = _mjcf_document(file, part, own=own)
     if (error := document.get("error")) is not None:
         raise ModelError(f"{file.name}: {error}")
     return _mechanism(document)
@@ -165,7 +177,7 @@ class _Counter:
         raise ModelError(f"{self._name}: {what}; an arm has fewer")
 
 
-def _mjcf_document(file: TextFile, *, own: bool) -> dict[str, Any]:
+def _mjcf_document(file: TextFile, part: str | None, *, own: bool) -> dict[str, Any]:
     # Pinocchio reads MJCF from a path only; alone in a folder, the file cannot reach any other.
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "arm.xml"
@@ -173,9 +185,11 @@ def _mjcf_document(file: TextFile, *, own: bool) -> dict[str, Any]:
         if own:
             from ident_service.model.mechanism_process import mjcf_document
 
-            return mjcf_document(str(path))
+            return mjcf_document(str(path), part)
         try:
-            return ask_process("ident_service.model.mechanism_process", path, _DEADLINE)
+            return ask_process(
+                "ident_service.model.mechanism_process", path, _DEADLINE, *([] if part is None else [part])
+            )
         except ModelError as error:
             return {"error": str(error)}
 
@@ -198,6 +212,7 @@ def _mechanism(document: Mapping[str, Any]) -> Mechanism:
         armature=array("armature", n),
         damping=array("damping", n),
         dry_friction=array("dry_friction", n),
+        held=document["held"],
         frames={
             name: (joint, np.array(rotation).reshape(3, 3), np.array(translation))
             for name, joint, rotation, translation in document["frames"]

@@ -5,15 +5,21 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from ident_service.errors import ModelError
 from ident_service.model.limited_process import answer_within
+from ident_service.model.mechanism_part import Mimic, Part, arm_part, mimics
+
+if TYPE_CHECKING:  # as there
+    from ident_service.config.quantities import TextFile
 
 MOST_MEMORY: Final = 512 * 2**20  # bytes of addresses, of which the libraries take 230 MB
 MOST_SECONDS: Final = 5  # of computing
@@ -21,14 +27,14 @@ _SUPPORTED = ("JointModelR", "JointModelP")
 _UNSUPPORTED = ("JointModelPlanar",)
 
 
-def urdf_document(text: str) -> dict[str, Any]:
-    """Read a URDF whose links were counted."""
-    return _document("URDF", lambda: pin.buildModelFromXML(text))
+def urdf_document(file: TextFile, part: str | None) -> dict[str, Any]:
+    """Read the arm in a URDF whose links were counted; `part` is JSON of a `Part`, all of it when None."""
+    return _document("URDF", lambda: pin.buildModelFromXML(file.text), part or "{}", lambda: mimics(file))
 
 
-def mjcf_document(path: str) -> dict[str, Any]:
-    """Read an MJCF."""
-    return _document("MJCF", lambda: pin.buildModelFromMJCF(path))
+def mjcf_document(path: str, part: str | None) -> dict[str, Any]:
+    """Read the arm in an MJCF; `part` as for a URDF."""
+    return _document("MJCF", lambda: pin.buildModelFromMJCF(path), part, dict)
 
 
 def delta_from_inertia(inertia: pin.Inertia) -> NDArray[np.float64]:
@@ -37,9 +43,16 @@ def delta_from_inertia(inertia: pin.Inertia) -> NDArray[np.float64]:
     return np.array([xx, xy, xz, yy, yz, zz, mx, my, mz, m])
 
 
-def _document(kind: str, build: Callable[[], pin.Model]) -> dict[str, Any]:
+def _document(
+    kind: str, build: Callable[[], pin.Model], part: str | None, followers: Callable[[], dict[str, Mimic]]
+) -> dict[str, Any]:
+    held: dict[str, float] = {}
     try:
         model = build()
+        if part is not None:
+            model, held = arm_part(model, Part(**json.loads(part)), followers(), "")
+    except ModelError as error:
+        return {"error": str(error).removeprefix(": ")}
     except MemoryError:
         return {"error": f"not a {kind} that can be read: too much memory"}
     except Exception as error:  # noqa: BLE001  # pinocchio raises whatever its XML libraries raise
@@ -70,6 +83,7 @@ def _document(kind: str, build: Callable[[], pin.Model]) -> dict[str, Any]:
         "armature": model.armature.tolist(),
         "damping": model.damping.tolist(),
         "dry_friction": dry.tolist(),
+        "held": held,
         "frames": [
             [one.name, int(one.parentJoint) - 1, one.placement.rotation.tolist(), one.placement.translation.tolist()]
             for one in model.frames
@@ -80,7 +94,7 @@ def _document(kind: str, build: Callable[[], pin.Model]) -> dict[str, Any]:
 
 def main(words: list[str]) -> int:
     """Read one file within the limits."""
-    return answer_within(MOST_MEMORY, MOST_SECONDS, lambda: mjcf_document(words[0]))
+    return answer_within(MOST_MEMORY, MOST_SECONDS, lambda: mjcf_document(words[0], words[1] if words[1:] else None))
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
+from ident_service.config.kinematics import Kinematics
 from ident_service.config.quantities import TextFile
 from ident_service.errors import ModelError
 from ident_service.model.chain import WORLD, Array, Chain
@@ -20,8 +21,15 @@ from ident_service.model.layout import TERM_SYMBOLS, Layout
 from ident_service.model.mechanism import Mechanism, read_mechanism
 
 
-def read_urdf(file: TextFile, gravity: tuple[float, float, float]) -> tuple[Chain, Array]:
-    """Chain and link inertias of a URDF; fixed joints are merged into their parents.
+def read_urdf(
+    file: TextFile, gravity: tuple[float, float, float], kinematics: Kinematics | None = None
+) -> tuple[Chain, Array]:
+    """Chain and link inertias of a URDF; fixed joints, and those held still, are merged into their parents.
+
+    Args:
+        file: the URDF.
+        gravity: in the base frame [m/s^2].
+        kinematics: which part of it is the arm; all of it when None.
 
     Returns:
         The chain, and the ten inertial parameters per link (eq. 13) in SI units, shape (joints, 10).
@@ -29,12 +37,14 @@ def read_urdf(file: TextFile, gravity: tuple[float, float, float]) -> tuple[Chai
     Raises:
         ModelError: as `read_mechanism`.
     """
-    return chain_of(read_mechanism(file, "urdf"), gravity)
+    return chain_of(read_mechanism(file, "urdf", kinematics), gravity)
 
 
-def read_mjcf(file: TextFile, gravity: tuple[float, float, float]) -> tuple[Chain, Array]:
+def read_mjcf(
+    file: TextFile, gravity: tuple[float, float, float], kinematics: Kinematics | None = None
+) -> tuple[Chain, Array]:
     """As `read_urdf`, for an MJCF file of hinge and slide joints."""
-    return chain_of(read_mechanism(file, "mjcf"), gravity)
+    return chain_of(read_mechanism(file, "mjcf", kinematics), gravity)
 
 
 def chain_of(mechanism: Mechanism, gravity: tuple[float, float, float]) -> tuple[Chain, Array]:

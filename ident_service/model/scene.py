@@ -53,8 +53,7 @@ def scene(model: ArmModel) -> Scene:
     chain, config = model.chain, model.config
     _check_names(model)
     links = [body for name, capsules in config.geometry.items() for body in _link(chain, name, capsules)]
-    if config.kinematics.urdf is not None:
-        links += urdf_solids(config.kinematics.urdf, chain, frozenset(config.geometry))
+    links += urdf_solids(config.kinematics, chain, frozenset(config.geometry))
     around = [*_obstacles(config.workspace), *_inside(config.workspace)]
     bodies = (*links, *around)
     if around and not links:

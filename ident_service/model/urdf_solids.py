@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 import pinocchio as pin
 
-from ident_service.config.quantities import TextFile
+from ident_service.config.kinematics import Kinematics
 from ident_service.config.workspace import BASE
 from ident_service.errors import ModelError
 from ident_service.model.chain import WORLD, Array, Chain
@@ -20,18 +20,21 @@ from ident_service.model.mechanism import read_mechanism
 from ident_service.model.solids import Body, Box, Capsule, Cylinder, Solid, turned
 
 
-def urdf_solids(file: TextFile, chain: Chain, skip: frozenset[str]) -> list[Body]:
+def urdf_solids(kinematics: Kinematics, chain: Chain, skip: frozenset[str]) -> list[Body]:
     """The solids of all links but some.
 
     Args:
-        file: the URDF the chain was read from.
+        kinematics: the URDF that the chain was read from, and which part of it is the arm.
         chain: the mechanism.
         skip: joint names (or `base`) of links whose geometry is known from elsewhere.
 
     Raises:
         ModelError: a mesh, or a shape or number that cannot be read, in a link that is not skipped.
     """
-    frames = read_mechanism(file, "urdf").frames
+    file = kinematics.urdf
+    if file is None:
+        return []
+    frames = read_mechanism(file, "urdf", kinematics).frames
     bodies = []
     # Entities were refused when the chain was read from the same text.
     for link in ET.fromstring(file.text).iter("link"):  # noqa: S314

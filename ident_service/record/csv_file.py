@@ -1,6 +1,7 @@
 """Reads CSV recordings: header `t,q1..qN,tau1..tauN`, optional `dq1..dqN`, in any order, plain or gzip.
 
-Time `t` is in seconds and becomes integer nanoseconds by decimal arithmetic, so that a UTC time keeps all its digits.
+Time `t` becomes integer nanoseconds by decimal arithmetic, so that a UTC time keeps all its digits. A column map
+(`RecordingFormat.columns`) reads other names and units, and no other columns than those it names.
 Torque counts as sampled at its stamp. A CSV file has no end mark: a row that does not fit is an error, not a tear.
 """
 
@@ -15,11 +16,12 @@ from typing import IO, Final, cast
 
 import numpy as np
 
+from ident_service.config.recording import Column
 from ident_service.errors import RecordingError
 from ident_service.record.assemble import assemble
 from ident_service.record.csv_header import CsvColumns, parse_header
 from ident_service.record.files import require_file, sha256
-from ident_service.record.recording import BLOCK_SAMPLES, Block
+from ident_service.record.recording import BLOCK_SAMPLES, Block, Matrix
 
 GZIP_MAGIC: Final = b"\x1f\x8b"
 MAX_EXPANDED: Final = 4 << 30
@@ -28,6 +30,7 @@ MAX_RATIO: Final = 200
 _STEP: Final = 1 << 20
 _RATIO_FROM: Final = 64 << 20
 _MAX_SECONDS: Final = 9.2e9
+_MISSING: Final = frozenset({"", "nan", "na", "n/a", "null", "none"})
 _FIRST_ROW: Final = 2  # line numbers count from 1, and the header is line 1
 
 
@@ -47,15 +50,22 @@ class CsvRecording:
     torn = False
 
     def __init__(
-        self, path: Path | str, *, columns: Mapping[str, str] | None = None, joints: Sequence[str] | None = None
+        self,
+        path: Path | str,
+        *,
+        columns: Mapping[str, Column] | None = None,
+        joints: Sequence[str] | None = None,
+        skip_missing: bool = False,
     ) -> None:
         """Open the file and read its header.
 
         Args:
             path: the file.
-            columns: for a file with another header, its name for each of `t`, `q1`, `tau1`, ...; columns that are
+            columns: for a file with another header, its column for each of `t`, `q1`, `tau1`, ...; columns that are
                 not named here are then left out.
             joints: names of the joints 1..N, where they are known.
+            skip_missing: whether to leave out rows in which a value other than the time is missing (an empty field,
+                `nan`, `NA`, `null`).
 
         Raises:
             UsageError: no such file.
@@ -71,6 +81,7 @@ class CsvRecording:
             header = first[0].decode("utf-8-sig")
         except UnicodeDecodeError as error:
             raise RecordingError(self.path, "line 1: the header is not text") from error
+        self._skip_missing = skip_missing
         self._columns: CsvColumns = parse_header(self.path, header, columns)
         self.joints = self._columns.joints
         self.joint_names: tuple[str, ...] = tuple(joints or ())
@@ -85,7 +96,14 @@ class CsvRecording:
                 runs backwards or repeats with other values, a damaged or oversized gzip file; names the line.
         """
         names = self.joint_names or [str(joint + 1) for joint in range(self.joints)]
-        return assemble(self._pieces(), samples, self.path, names, place=lambda index: f"line {index + _FIRST_ROW}")
+        return assemble(
+            self._pieces(),
+            samples,
+            self.path,
+            names,
+            place=lambda index: f"line {index + _FIRST_ROW}",
+            skip_missing=self._skip_missing,
+        )
 
     def _pieces(self) -> Iterator[Block]:
         line = 1
@@ -112,29 +130,50 @@ class CsvRecording:
         separators = columns.fields - 1
         if any(row.count(b",") != separators for row in rows):
             self._explain(rows, first)
+        text = b",".join(rows)
         try:
-            fields = b",".join(rows).decode("ascii").split(",")
-            values = np.array(list(map(float, fields))).reshape(len(rows), columns.fields)
+            fields = text.decode("utf-8", errors="replace").split(",")
+            if len(columns.used) == columns.fields and not self._skip_missing:
+                values = np.array(list(map(float, fields))).reshape(len(rows), columns.fields)
+            else:
+                values = self._values(fields, len(rows))
         except ValueError:
             self._explain(rows, first)
-        # Python reads 1_000 as a number; in a data file it is a slip.
-        if any(b"_" in row for row in rows):
+        # Python reads 1_000 as a number, and digits of other scripts; in a data file they are slips.
+        if not text.isascii() or b"_" in text:
             self._explain(rows, first)
         times = fields[columns.time :: columns.fields]
-        bad = ~(np.abs(values[:, columns.time]) < _MAX_SECONDS)
+        bad = ~(np.abs(values[:, columns.time]) * float(columns.nanoseconds) < _MAX_SECONDS * 1e9)
         if bad.any():
             index = int(np.argmax(bad))
-            raise RecordingError(self.path, f"line {first + index}: time t is {times[index].strip()}; not in seconds?")
+            raise RecordingError(
+                self.path,
+                f"line {first + index}: time t is {times[index].strip()}; not in seconds? "
+                "Name its unit: recording.columns: {t: {column: NAME, unit: ns}}",
+            )
         try:
-            stamps = np.array([round(Decimal(time) * 1_000_000_000) for time in times], np.int64)
+            stamps = np.array([round(Decimal(time) * columns.nanoseconds) for time in times], np.int64)
         except ArithmeticError as error:
             raise RecordingError(self.path, f"line {first} or later: a time t is beyond all exponents") from error
+        if columns.scale is not None:
+            values *= columns.scale
         velocity = None if columns.velocity is None else values[:, columns.velocity]
         return Block(stamps, values[:, columns.position], values[:, columns.torque], velocity)
 
+    def _values(self, fields: Sequence[str], rows: int) -> Matrix:
+        """Parse the columns that are read, shape (rows, fields): NaN for missing values, zeros in other columns."""
+        columns = self._columns
+        values = np.zeros((rows, columns.fields))
+        for index in columns.used:
+            words = fields[index :: columns.fields]
+            if self._skip_missing and index != columns.time:
+                words = ["nan" if _is_missing(word) else word for word in words]
+            values[:, index] = list(map(float, words))
+        return values
+
     def _explain(self, rows: list[bytes], first: int) -> None:
-        """Raise for the first row that does not fit."""
-        names = self._columns.names
+        """Raise for the first row that does not fit; return where none of the columns that are read is wrong."""
+        names, used = self._columns.names, set(self._columns.used)
         for line, row in enumerate(rows, first):
             if not row.strip():
                 raise RecordingError(self.path, f"line {line}: is empty; a row is missing, remove the line")
@@ -145,9 +184,11 @@ class CsvRecording:
                     f"line {line}: has {len(fields)} fields but the header has {len(names)}; "
                     "the row is torn or malformed, remove it if it is the last one",
                 )
-            for name, field in zip(names, fields, strict=True):
-                if not _is_number(field):
-                    raise RecordingError(self.path, f"line {line}: {name} is {field[:40]!r}, not a number")
+            for index, (name, field) in enumerate(zip(names, fields, strict=True)):
+                missing = _is_missing(field) and index != self._columns.time
+                if index in used and not _is_number(field) and not (missing and self._skip_missing):
+                    hint = "; recording.missing: skip leaves such rows out" if missing else ""
+                    raise RecordingError(self.path, f"line {line}: {name} is {field[:40]!r}, not a number{hint}")
 
     def _lines(self) -> Iterator[list[bytes]]:
         """The file's lines, some at a time, without their ends."""
@@ -180,6 +221,10 @@ class CsvRecording:
         except (EOFError, zlib.error, OSError) as error:
             # gzip's own BadGzipFile is an OSError.
             raise RecordingError(self.path, f"cannot be read beyond {total} bytes of text: {error}") from error
+
+
+def _is_missing(field: str) -> bool:
+    return field.strip().lower() in _MISSING
 
 
 def _is_number(field: str) -> bool:

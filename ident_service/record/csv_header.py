@@ -1,16 +1,18 @@
-"""The header of a CSV recording: which column is what, or everything that is wrong with it at once."""
+"""The header of a CSV recording: which column is what in which unit, or everything that is wrong with it at once."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ident_service.config.recording import Column
 from ident_service.errors import RecordingError
 
 _NAME: Final = re.compile(r"(q|dq|tau)([1-9]\d{0,3})")
@@ -22,10 +24,13 @@ class CsvColumns:
 
     Attributes:
         names: of all columns, as the file has them.
-        time: index of the time [s].
+        time: index of the time.
         position: indices of the positions, joint 1 first, shape (joints,).
         torque: indices of the torques, shape (joints,).
         velocity: indices of the velocities, shape (joints,), or None.
+        nanoseconds: in one unit of the time column.
+        scale: what each column's numbers are multiplied by to be in SI, shape (fields,); None where all are.
+        used: indices of all columns above, in the order of the file.
     """
 
     names: tuple[str, ...]
@@ -33,6 +38,9 @@ class CsvColumns:
     position: NDArray[np.intp]
     torque: NDArray[np.intp]
     velocity: NDArray[np.intp] | None
+    nanoseconds: Decimal
+    scale: NDArray[np.float64] | None
+    used: tuple[int, ...]
 
     @property
     def fields(self) -> int:
@@ -45,13 +53,13 @@ class CsvColumns:
         return len(self.position)
 
 
-def parse_header(path: Path, header: str, columns: Mapping[str, str] | None = None) -> CsvColumns:
+def parse_header(path: Path, header: str, columns: Mapping[str, Column] | None = None) -> CsvColumns:
     """Find the columns.
 
     Args:
         path: for messages.
         header: the first line.
-        columns: the file's name for each of ours, where it has others; None reads ours.
+        columns: the file's column for each of ours, where it has others; None reads ours, in SI.
 
     Raises:
         RecordingError: the message lists all problems.
@@ -63,8 +71,8 @@ def parse_header(path: Path, header: str, columns: Mapping[str, str] | None = No
     if columns is None:
         place = {name: index for index, name in enumerate(names)}
     else:
-        problems += [f"no column {theirs!r} for {ours}" for ours, theirs in columns.items() if theirs not in names]
-        place = {ours: names.index(theirs) for ours, theirs in columns.items() if theirs in names}
+        problems += [f"no column {one.column!r} for {ours}" for ours, one in columns.items() if one.column not in names]
+        place = {ours: names.index(one.column) for ours, one in columns.items() if one.column in names}
     numbers: dict[str, set[int]] = {"q": set(), "dq": set(), "tau": set()}
     for name in place:
         if match := _NAME.fullmatch(name):
@@ -88,4 +96,20 @@ def parse_header(path: Path, header: str, columns: Mapping[str, str] | None = No
         return np.array([place[f"{kind}{number}"] for number in range(1, joints + 1)], np.intp)
 
     velocity = indices("dq") if numbers["dq"] else None
-    return CsvColumns(names, place["t"], indices("q"), indices("tau"), velocity)
+    nanoseconds, scale = Decimal(10**9), np.ones(len(names))
+    for ours, one in (columns or {}).items():
+        if ours == "t":
+            # Powers of ten and short decimals, as they are written: times keep all their digits.
+            nanoseconds *= Decimal(repr(one.scale(ours)))
+        else:
+            scale[place[ours]] = one.scale(ours)
+    return CsvColumns(
+        names=names,
+        time=place["t"],
+        position=indices("q"),
+        torque=indices("tau"),
+        velocity=velocity,
+        nanoseconds=nanoseconds,
+        scale=None if (scale == 1.0).all() else scale,
+        used=tuple(sorted(place.values())),
+    )

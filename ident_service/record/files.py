@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
+import re
 import secrets
 from pathlib import Path
 from typing import Final
@@ -11,6 +13,25 @@ from typing import Final
 from ident_service.errors import RecordingError, UsageError
 
 _STEP: Final = 1 << 20
+_RANGE: Final = re.compile(r"^(?P<path>.+)@(?P<start>\d+(?:\.\d*)?)?:(?P<end>\d+(?:\.\d*)?)?$")
+
+
+def split_range(path: str) -> tuple[str, tuple[float, float] | None]:
+    """Split `FILE@START:END` into the file and seconds of its recording, whatever files there are.
+
+    Raises:
+        UsageError: the range ends before it begins.
+    """
+    match = _RANGE.match(path)
+    if match is None:
+        return path, None
+    start, end = float(match["start"] or 0.0), float(match["end"] or math.inf)
+    if not start < end:
+        raise UsageError(
+            f"{path}: a range ends after it begins; FILE@START:END are the seconds of the recording that are read (to "
+            "leave out seconds at the ends: recording.trim)"
+        )
+    return match["path"], (start, end)
 
 
 def require_file(path: Path) -> None:

@@ -56,6 +56,7 @@ class Grid:
         last_ns: stamp of the last sample [ns].
         samples: their number, repeated ones not counted.
         repeats: number of samples left out because they repeat the one before.
+        skipped: number of samples left out because a value is missing.
         regular: whether all steps but gaps are `own_period_s` to 0.1 %.
         resampled: whether uniform samples have to be read off curves between the recorded ones.
         jitter_std_s: standard deviation of the steps, gaps excepted, from the usual step [s].
@@ -70,6 +71,7 @@ class Grid:
     last_ns: int
     samples: int
     repeats: int
+    skipped: int
     regular: bool
     resampled: bool
     jitter_std_s: float
@@ -101,17 +103,30 @@ def grid(recording: Recording, fmt: RecordingFormat) -> Grid:
             that is too far from the recording's own; and whatever reading the blocks raises.
     """
     steps = _Steps()
-    first_ns = last_ns = samples = repeats = 0
+    first_ns = last_ns = samples = repeats = skipped = 0
+    lost: list[tuple[int, int]] = []
     for block in trimmed(recording.blocks(), fmt.trim):
         stamps = block.stamp_ns
         first_ns = first_ns if samples else int(stamps[0])
-        steps.add(stamps if samples == 0 else np.concatenate([[last_ns], stamps]))
+        run = stamps if samples == 0 else np.concatenate([[last_ns], stamps])
+        if block.skipped is None:
+            steps.add(run)
+        else:
+            # A step over what was left out says nothing of how evenly samples were taken.
+            skipped += int(block.skipped.sum())
+            behind = np.flatnonzero(block.skipped) + len(run) - len(stamps)
+            for part in np.split(run, behind):
+                steps.add(part)
+            lost += [(int(run[index - 1]), int(run[index])) for index in behind[behind > 0]]
         last_ns = int(stamps[-1])
         samples += len(stamps)
         repeats += block.repeats
     if samples < 2:
         cause = f"after trimming {fmt.trim[0]:g} s and {fmt.trim[1]:g} s " if any(fmt.trim) else ""
         raise RecordingError(recording.path, f"holds no samples {cause}".rstrip() + "; record the motion again")
+    if steps.none:  # no two samples without one between them that was left out
+        for pair in lost:
+            steps.add(np.array(pair, np.int64))
     own = steps.usual()
     gap = fmt.gap * own
     low, high, deviation = steps.spread(own, gap)
@@ -122,10 +137,20 @@ def grid(recording: Recording, fmt: RecordingFormat) -> Grid:
             f"more than {MAX_GAPS} steps longer than {gap * 1e-6:.4g} ms, where {own * 1e-6:.4g} ms are usual; "
             "find out where the samples went, or raise recording.gap",
         )
+    # Samples that are spaced evenly must not close up over one that was left out.
+    apart = [pair for pair in lost if fmt.stamps == "arrival" or pair[1] - pair[0] > gap]
+    if apart:
+        longer = np.unique(np.concatenate([longer, np.array(apart, np.int64)]), axis=0)
+        if len(longer) > MAX_GAPS:
+            raise RecordingError(
+                recording.path,
+                f"samples that lack a value leave more than {MAX_GAPS} gaps; raise recording.gap, or, if each stamp "
+                "says when its sample was taken, set recording.stamps: sampled",
+            )
     edges = [first_ns, *(int(stamp) for pair in longer for stamp in pair), last_ns]
     period = _period(recording, fmt, own)
     furthest = max(high - own, own - low)
-    regular = furthest <= REGULAR * own
+    regular = furthest <= REGULAR * own and len(apart) == len(lost)
     return Grid(
         period_s=period * 1e-9,
         own_period_s=own * 1e-9,
@@ -133,6 +158,7 @@ def grid(recording: Recording, fmt: RecordingFormat) -> Grid:
         last_ns=last_ns,
         samples=samples,
         repeats=repeats,
+        skipped=skipped,
         regular=regular,
         resampled=period != own or not (regular or fmt.stamps == "arrival"),
         jitter_std_s=deviation * 1e-9,
@@ -209,6 +235,11 @@ class _Steps:
         last = order[-(MAX_GAPS + 1) :]
         pairs = np.concatenate([self._longest, np.column_stack([stamps[last], stamps[last + 1]])])
         self._longest = pairs[np.argsort(pairs[:, 1] - pairs[:, 0], kind="stable")[-(MAX_GAPS + 1) :]]
+
+    @property
+    def none(self) -> bool:
+        """Tell whether no step was counted."""
+        return not self._count.any()
 
     def usual(self) -> float:
         """The usual step [ns]."""

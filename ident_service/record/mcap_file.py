@@ -57,7 +57,7 @@ class McapRecording:
             path: the file.
             topic: with sensor_msgs/msg/JointState on it; None takes `/joint_states`, or in a bag what `bag` says.
             order: joints to read, in the order of the columns; None takes the first message's.
-            bag: topic of a bag, and its own names for joints that have others.
+            bag: topic of a bag, its own names for joints that have others, and what to do with missing values.
 
         Raises:
             UsageError: no such file.
@@ -80,6 +80,7 @@ class McapRecording:
         self.own = bool(self.metadata)
         form = RecordingFormat() if self.own or bag is None else bag
         self._topic = form.topic if topic is None else topic
+        self._skip_missing = form.missing == "skip"
         theirs = form.joint_names
         wanted = None if order is None else tuple(theirs.get(name, name) for name in order)
         layout, payload = self._first(wanted)
@@ -101,7 +102,8 @@ class McapRecording:
             RecordingError: values that are not finite, stamps that run backwards or repeat with other values,
                 messages whose joints change; names the first one.
         """
-        return assemble(self._pieces(min(samples, BLOCK_SAMPLES)), samples, self.path, self.joint_names)
+        pieces = self._pieces(min(samples, BLOCK_SAMPLES))
+        return assemble(pieces, samples, self.path, self.joint_names, skip_missing=self._skip_missing)
 
     def read_extras(self) -> Extras:
         """Read what stands beside the samples: metadata, attachments, events, the arm's description.

@@ -60,9 +60,11 @@ def open_recording(
     elif not start.startswith(GZIP_MAGIC) and b"\x00" in start:
         raise RecordingError(path, "is neither MCAP nor CSV (plain or gzip)")
     else:
-        recording = CsvRecording(path, columns=fmt.columns or None, joints=joints)
-    if fmt.side == "joint":
+        skip = fmt.missing == "skip"
+        recording = CsvRecording(path, columns=fmt.columns or None, joints=joints, skip_missing=skip)
+    if not any(fmt.motor_sides):
         return recording
     if transmission is None:
         raise UsageError(f"{path}: recorded on the motor side, but no transmission leads from there to the joints")
-    return JointSideRecording(recording, transmission)
+    positions, torques = fmt.motor_sides
+    return JointSideRecording(recording, transmission, positions=positions, torques=torques)

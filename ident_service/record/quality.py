@@ -41,6 +41,7 @@ class JointQuality:
             extreme torque five times in a row or more.
         standstill: share of the time that the joint is slower than 0.005 rad/s or m/s over 20 ms.
         position: smallest and largest [rad or m].
+        position_at: when it is there [s] after the first sample.
         torque: smallest and largest [N m or N].
         smallest_step: of the position between samples [rad or m], which estimates the encoder's resolution; 0 for a
             joint that never moves.
@@ -62,6 +63,7 @@ class JointQuality:
     where: float = 0.0
     usual_step: float = 0.0
     steps: int = 0
+    position_at: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,7 @@ class Quality:
         torn: whether the file was cut off or damaged.
         first_ns: stamp of the first sample [ns].
         joints: in order.
+        skipped: samples left out because a value is missing.
     """
 
     samples: int
@@ -100,6 +103,7 @@ class Quality:
     torn: bool
     first_ns: int
     joints: tuple[JointQuality, ...]
+    skipped: int = 0
 
     def warnings(self) -> tuple[str, ...]:
         """What a person should know, in words; empty for a good recording."""
@@ -113,6 +117,9 @@ class Quality:
             found.append(f"{count}, the longest {self.longest_gap_s:.4g} s, {after:.4g} s after the first sample")
         if self.repeats:
             found.append(f"{self.repeats} samples repeat the one before; they are left out")
+        if self.skipped:
+            share = 100.0 * self.skipped / (self.samples + self.skipped)
+            found.append(f"{self.skipped} samples ({share:.2g} %) lack a value; they are left out")
         if self.jitter_std_s * self.rate_hz > MUCH_JITTER:
             found.append(
                 f"stamps jitter by {self.jitter_std_s * 1e3:.3g} ms, "
@@ -174,6 +181,7 @@ def quality(
         torn=recording.torn,
         first_ns=stamps.first_ns,
         joints=joints.result(),
+        skipped=stamps.skipped,
     )
 
 
@@ -186,6 +194,7 @@ class _Joints:
         self._lag = max(1, round(STANDSTILL_OVER / stamps.own_period_s))
         self._tail: Block | None = None
         self._position = (np.full(joints, np.inf), np.full(joints, -np.inf))
+        self._position_at = np.zeros((2, joints))
         self._torque = (np.full(joints, np.inf), np.full(joints, -np.inf))
         self._step = np.full(joints, np.inf)
         self._largest, self._squares = np.zeros((3, joints)), np.zeros(joints)
@@ -198,6 +207,12 @@ class _Joints:
     def add(self, block: Block) -> None:
         """Take the next samples."""
         position, torque = block.position, block.torque
+        for side, (index, farther) in enumerate(
+            ((position.argmin(axis=0), np.less), (position.argmax(axis=0), np.greater))
+        ):
+            beyond = farther(np.take_along_axis(position, index[None], axis=0)[0], self._position[side])
+            elapsed = (block.stamp_ns[index] - self._stamps.first_ns) * 1e-9
+            self._position_at[side] = np.where(beyond, elapsed, self._position_at[side])
         self._position = _wider(self._position, position)
         self._torque = _wider(self._torque, torque)
         self._timing.add(block)
@@ -267,6 +282,7 @@ class _Joints:
                     where=float(self._largest[2, k]),
                     usual_step=self._usual(k),
                     steps=self._steps,
+                    position_at=(float(self._position_at[0, k]), float(self._position_at[1, k])),
                 )
             )
         return tuple(found)

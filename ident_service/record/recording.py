@@ -30,6 +30,8 @@ class Block:
         velocity: [rad/s or m/s], shape (samples, joints), or None where the recording has none.
         repeats: samples of the file that were left out before the last one here because they repeat, stamp and
             values, the one before them; a recording's blocks together count every one.
+        skipped: samples of the file that were left out directly before each one here, and behind the file's last,
+            because a value is missing; shape (samples,), None where there are none.
     """
 
     stamp_ns: Stamps
@@ -37,6 +39,7 @@ class Block:
     torque: Matrix
     velocity: Matrix | None = None
     repeats: int = 0
+    skipped: Stamps | None = None
 
 
 def join(blocks: Sequence[Block]) -> Block:
@@ -50,6 +53,11 @@ def join(blocks: Sequence[Block]) -> Block:
         np.concatenate([block.torque for block in blocks]),
         np.concatenate(velocities) if velocities else None,
         sum(block.repeats for block in blocks),
+        None
+        if all(block.skipped is None for block in blocks)
+        else np.concatenate(
+            [np.zeros_like(block.stamp_ns) if block.skipped is None else block.skipped for block in blocks]
+        ),
     )
 
 
@@ -58,7 +66,8 @@ def cut(block: Block, start: int, stop: int) -> Block:
     part = slice(start, stop)
     velocity = None if block.velocity is None else block.velocity[part]
     repeats = block.repeats if start == 0 else 0
-    return Block(block.stamp_ns[part], block.position[part], block.torque[part], velocity, repeats)
+    skipped = None if block.skipped is None else block.skipped[part]
+    return Block(block.stamp_ns[part], block.position[part], block.torque[part], velocity, repeats, skipped)
 
 
 class Recording(Protocol):

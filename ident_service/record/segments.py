@@ -7,8 +7,12 @@ nearest (two on either side): its error is at most 3/128 h^4 |q''''|, at 200 Hz 
 line errs by h^2/8 |q''| (1e-4 at 1 Hz, and twice differenced a percent of the acceleration); shape-preserving cubics
 (PCHIP) flatten where the motion turns round, which is where friction is read; a spline is smoother but global.
 
+A sample that was left out because a value is missing is a step like any other: the cubic spans it up to
+`RecordingFormat.gap`, beyond it is a gap.
+
 Stamps that only say when a sample arrived jitter where the motion does not, and curves through them would put that
-jitter into the motion: such samples are spaced evenly instead and keep their values.
+jitter into the motion: such samples are spaced evenly instead and keep their values. There, a sample that was left out
+is a gap, as even spacing would close up over it.
 
 A torque that is held from stamp to stamp is no curve: its mean over each new interval is taken, which keeps the
 impulse.
@@ -17,7 +21,7 @@ impulse.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import itemgetter
 
@@ -126,7 +130,7 @@ def _evenly(blocks: Iterable[Block], stamps: Grid, segment: Segment) -> Iterator
         numbers = np.arange(number, number + len(block.stamp_ns))
         even: Stamps = segment.first_ns + np.rint(numbers * (stamps.own_period_s * 1e9)).astype(np.int64)
         even.flags.writeable = False
-        yield Block(even, block.position, block.torque, block.velocity, block.repeats)
+        yield replace(block, stamp_ns=even)
         number += len(even)
 
 

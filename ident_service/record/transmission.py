@@ -1,4 +1,4 @@
-"""A recording of the motors, seen from the joints.
+"""A recording of the motors, or of the motors' torques alone, seen from the joints.
 
 `q = C^-1 diag(1/r) q_motor + q0`, `dq = C^-1 diag(1/r) dq_motor`, `tau = C^T diag(r) tau_motor`: what the motors put
 in, the joints give out (`config/recording.py` has the symbols). Losses in the gears are the joints' friction.
@@ -21,12 +21,16 @@ class JointSideRecording:
     Attributes are the other recording's.
     """
 
-    def __init__(self, motors: Recording, transmission: Transmission) -> None:
+    def __init__(
+        self, motors: Recording, transmission: Transmission, *, positions: bool = True, torques: bool = True
+    ) -> None:
         """Take the motors' recording.
 
         Args:
             motors: one column a motor, position [rad] and torque [N m] at the motor.
             transmission: from the motors to the joints.
+            positions: whether positions and velocities are the motors'; the joints' otherwise.
+            torques: whether torques are the motors'; the joints' otherwise.
 
         Raises:
             RecordingError: not as many columns as the transmission has ratios.
@@ -42,6 +46,7 @@ class JointSideRecording:
         self.torque_held = motors.torque_held
         self.torn = motors.torn
         self._motors = motors
+        self._positions, self._torques = positions, torques
         self._ratios = np.array(transmission.ratios)
         self._offsets = np.array(transmission.offsets or np.zeros(self.joints))
         self._coupling = None if transmission.coupling is None else np.array(transmission.coupling)
@@ -49,15 +54,17 @@ class JointSideRecording:
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
         """Read the samples in order, as the other recording does; see `Recording.blocks`."""
         for block in self._motors.blocks(samples):
-            velocity = None if block.velocity is None else self._turned(block.velocity)
-            torque = block.torque * self._ratios
-            if self._coupling is not None:
-                torque = torque @ self._coupling
-            position = self._turned(block.position) + self._offsets
+            position, velocity, torque = block.position, block.velocity, block.torque
+            if self._positions:
+                position = self._turned(position) + self._offsets
+                velocity = None if velocity is None else self._turned(velocity)
+            if self._torques:
+                torque = torque * self._ratios
+                torque = torque if self._coupling is None else torque @ self._coupling
             for array in (position, torque, velocity):
                 if array is not None:
                     array.flags.writeable = False
-            yield Block(block.stamp_ns, position, torque, velocity, block.repeats)
+            yield Block(block.stamp_ns, position, torque, velocity, block.repeats, block.skipped)
 
     def _turned(self, motors: Matrix) -> Matrix:
         """Turns of the motors as turns of the joints, shape (samples, joints)."""

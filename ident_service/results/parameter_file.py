@@ -29,6 +29,7 @@ from ident_service.model.expressions import parse_expression
 from ident_service.model.notation import NOTATIONS, Notation, regrouped, translate
 from ident_service.results.files import write_atomically
 from ident_service.results.information_document import information_document
+from ident_service.results.rows_and_filter import rows_and_filter
 from ident_service.results.schemas import require_schema
 from ident_service.results.strict_json import strict_json
 
@@ -189,8 +190,9 @@ def parameters_document(estimate: Estimate, described: ArmConfig | None = None) 
             "blocks": len(estimate.fitted.blocks),
             "condition_number": estimate.fit.condition_number if np.isfinite(estimate.fit.condition_number) else None,
             **_errors(own.identification, model.chain.names),
+            "rows_and_filter": list(rows_and_filter(options)),
         },
-        "information": information_document(estimate.prepared.equations.total),
+        "information": information_document(estimate.information),
         "validation": [
             {"recording": s.recording, "sha256": s.sha256, **_errors(s.error, model.chain.names)}
             for s in own.validation

@@ -25,6 +25,7 @@ from ident_service.model.chain import Array
 from ident_service.model.layout import INERTIAL
 from ident_service.results.files import write_atomically
 from ident_service.results.information_document import information_document
+from ident_service.results.rows_and_filter import rows_and_filter_text
 from ident_service.results.schemas import require_schema
 
 _WORDS: Mapping[Word, tuple[str, str]] = {
@@ -87,6 +88,7 @@ def payload_document(payload: Payload, arm: KnownArm, arm_sha256: str, recording
             "p": payload.test.p,
         },
         "torque_share": payload.torque_share.tolist(),
+        "residual_over_identified": None if payload.excess is None else payload.excess.tolist(),
         "relative_error_percent": {
             "without": payload.without.relative_percent,
             "fitted": payload.fitted.relative_percent,
@@ -122,9 +124,15 @@ def payload_text(payload: Payload, arm: KnownArm) -> str:
     lines = [
         f"{word}: {meaning}",
         f"against no payload: {test.sigma:.3g} sigma in {test.directions} directions, p = {test.p:.2g}",
-        f"torque error on the recording: {payload.without.relative_percent:.3f} % with the arm as identified, "
-        f"{payload.fitted.relative_percent:.3f} % with what was found",
+        f"torque error on all rows of the recording: {payload.without.relative_percent:.3f} % with the arm as "
+        f"identified, {payload.fitted.relative_percent:.3f} % with what was found (eq. 84)",
     ]
+    if payload.excess is not None and (far := payload.far()):
+        worst = max(far, key=lambda joint: payload.excess[joint])  # type: ignore[index]
+        lines.append(
+            f"what is left is {payload.excess[worst]:.0f} times as large at joint {names[worst]} as when the arm was "
+            "identified: friction, the arm or the recording has changed in what no body explains"
+        )
     lines += [
         f"  joint {name}: {share:.2%} of its torque" for name, share in zip(names, payload.torque_share, strict=True)
     ]
@@ -155,6 +163,7 @@ def payload_text(payload: Payload, arm: KnownArm) -> str:
         ]
         body = zip(payload.base.names, rounded(payload.body.delta[: len(INERTIAL)]), strict=False)
         lines.append("  " + "  ".join(f"{name} {value:.4g}" for name, value in body))
+    lines += ["", *rows_and_filter_text(arm.model.config.identification)]
     return "\n".join(lines) + "\n"
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from ident_service.estimation.doubt import IDENTIFIED_BELOW, WEAK_BELOW
 from ident_service.estimation.identify import Candidate, Estimate
 from ident_service.estimation.least_squares import TorqueError
+from ident_service.results.rows_and_filter import rows_and_filter_text
 
 
 def summary(estimate: Estimate, unusable: Sequence[str] = ()) -> str:
@@ -46,6 +47,7 @@ def summary(estimate: Estimate, unusable: Sequence[str] = ()) -> str:
             for whole, moving in _errors(own)
         ]
         lines.append(_row(f"  {name}", cells))
+    lines += ["", *rows_and_filter_text(estimate.model.config.identification)]
     lines += _found_before(estimate)
     counts = {word: estimate.verdicts.count(word) for word in ("identified", "weak", "unidentified")}
     lines += [

@@ -17,6 +17,7 @@ from ident_service.estimation.custom import CustomFunction
 from ident_service.estimation.equations import equations
 from ident_service.estimation.feasible.feasible_set import SetName
 from ident_service.estimation.identify import Estimate, identify
+from ident_service.estimation.plausibility import remarks_on_limits
 from ident_service.excitation.excitation import Excitation
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import ArmModel, arm_model
@@ -32,7 +33,8 @@ from ident_service.record.recorder_process import RecorderProcess
 from ident_service.results.files import appearing_folder, write_atomically
 from ident_service.results.report_files import write_report
 from ident_service.results.run_folder import write_manifest, write_results
-from ident_service.service.identification import recording_quality, unusable_because
+from ident_service.service.identification import unusable_because
+from ident_service.service.recordings import recording_quality
 from ident_service.service.score import Score, score, true_parameters
 from sim_backend.arm import SimulatedArm, Truth
 from sim_backend.remote_arm import RemoteArm
@@ -173,6 +175,7 @@ def simulate(
         write_results(staging, estimate, unusable=unusable, described=config if described is None else described)
         write_atomically(staging / "score.json", json.dumps(score_document(scored), indent=1) + "\n")
         warnings = [f"{one.path.name}: {line}" for one, seen in found for line in seen.warnings()]
+        warnings += [line for one, seen in found for line in remarks_on_limits(one.path.name, seen.joints, model)]
         warnings += estimate.remarks
         write_report(staging, estimate, recordings[:1], recordings[1:], warnings)
         write_manifest(staging)

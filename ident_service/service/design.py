@@ -28,12 +28,13 @@ from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.information import Information
 from ident_service.motion.surroundings import touching_stop
-from ident_service.record.open import open_recording
+from ident_service.record.part import overlap
 from ident_service.results.files import appearing_folder, require_place, write_atomically
 from ident_service.results.parameter_file import read_parameters
 from ident_service.service.motion_drawings import DRAWINGS, drawings
 from ident_service.service.preview import Preview, preview, preview_document, recorded_noise
 from ident_service.service.preview_text import preview_text
+from ident_service.service.recordings import open_for
 
 MOTION, SEARCH, PREVIEW, DOCUMENT = "motion.json", "search.json", "preview.txt", "preview.json"
 FILES = (MOTION, SEARCH, PREVIEW, DOCUMENT, *DRAWINGS)
@@ -185,13 +186,11 @@ def known_information(model: ArmModel, base: BaseParameters, knowledge: Knowledg
     """Information of the recordings, whitened by `noise` of shape (joints,), shape (base, base); None without any."""
     if not knowledge.recordings:
         return None
-    config = model.config
-    parts = [
-        equations(
-            open_recording(path, model.chain.names, fmt=config.recording, transmission=config.transmission), model, base
-        ).total
-        for path in knowledge.recordings
-    ]
+    opened = [open_for(path, model) for path in knowledge.recordings]
+    for index, recording in enumerate(opened):
+        if any(overlap(recording, other) for other in opened[:index]):
+            raise UsageError(f"{recording.path}: the same recording twice would count as twice as much")
+    parts = [equations(recording, model, base).total for recording in opened]
     R = reduce(Information.merged, parts).stacked(1.0 / noise)[:-1, :-1]
     return np.asarray(R.T @ R)
 

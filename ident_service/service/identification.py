@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +19,16 @@ from ident_service.estimation.feasible.convex import convex_least_squares
 from ident_service.estimation.feasible.feasible_set import SetName
 from ident_service.estimation.identify import Estimate, identify
 from ident_service.estimation.least_squares import LeastSquares
-from ident_service.estimation.plausibility import reasons_against, reasons_in_recording
+from ident_service.estimation.plausibility import reasons_against, reasons_in_recording, remarks_on_limits
 from ident_service.estimation.proof.sdpa import bpfc_sdpa, bpft_sdpa, fbpe_sdpa
-from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.model.arm_model import arm_model
 from ident_service.model.chain import Array
-from ident_service.record.kept import KeptRecording
-from ident_service.record.open import open_recording
-from ident_service.record.part import TrimmedRecording
-from ident_service.record.quality import Quality, quality
+from ident_service.record.quality import Quality
 from ident_service.record.recording import Recording
 from ident_service.results.files import appearing_folder, write_atomically
 from ident_service.results.report_files import write_report
 from ident_service.results.run_folder import MANIFEST, write_manifest, write_results
+from ident_service.service.recordings import open_for, own_formats, recording_quality, standstill_left_out
 
 
 @dataclass(frozen=True)
@@ -40,9 +37,11 @@ class Request:
 
     Attributes:
         arm: description file or name of a shipped one.
-        recordings: to fit to; a path may end in `@START:END`, seconds to leave out of that recording.
+        recordings: to fit to; a path may end in `@START:END`, the seconds of that recording to read.
         validation: to judge on; likewise.
         columns: a YAML file with the keys of the arm's `recording` section, instead of it.
+        columns_of: such a file for one recording each, of those above.
+        cut_standstill: whether to leave out standstill at the ends of every recording.
         method: estimator, the arm's when None.
         set_name: feasible set, the arm's when None.
         prior: `none`, `euclidean` or `entropic`, the arm's when None.
@@ -59,6 +58,8 @@ class Request:
     recordings: tuple[Path, ...]
     validation: tuple[Path, ...] = ()
     columns: Path | None = None
+    columns_of: Mapping[Path, Path] = field(default_factory=dict)
+    cut_standstill: bool = False
     method: Method | None = None
     set_name: SetName | None = None
     prior: str | None = None
@@ -69,9 +70,6 @@ class Request:
     sdpa: bool = False
     solver: str | None = None
     second_opinion: bool = False
-
-
-_TRIMMED = re.compile(r"^(?P<path>.+)@(?P<start>\d+(?:\.\d*)?):(?P<end>\d+(?:\.\d*)?)$")
 
 
 @dataclass(frozen=True)
@@ -109,8 +107,13 @@ def identify_files(request: Request, folder: Path, tell: Callable[[str], None] =
     described = load_arm(request.arm)
     model = arm_model(_config(described, request))
     custom = custom_of(request.arm, described)
-    recordings = [open_for(path, model) for path in request.recordings]
-    validation = [open_for(path, model) for path in request.validation]
+    forms = own_formats(request.columns_of, [*request.recordings, *request.validation], model)
+    recordings = [open_for(path, model, forms.get(path)) for path in request.recordings]
+    validation = [open_for(path, model, forms.get(path)) for path in request.validation]
+    for recording in (*recordings, *validation):
+        start, end = standstill_left_out(recording)
+        if start or end:
+            tell(f"{recording.path.name}: standstill left out, {start:.2f} s at the start and {end:.2f} s at the end")
     found = [(recording, recording_quality(recording, model)) for recording in [*recordings, *validation]]
     warnings = tuple(f"{recording.path}: {line}" for recording, seen in found for line in seen.warnings())
     try:
@@ -132,6 +135,8 @@ def identify_files(request: Request, folder: Path, tell: Callable[[str], None] =
             for reason in reasons_in_recording(recording.path.name, seen.joints, model):
                 raise RecordingError(recording.path, reason) from error
         raise
+    for recording, seen in found:
+        warnings += remarks_on_limits(recording.path.name, seen.joints, model)
     warnings += estimate.remarks
     unusable = unusable_because(estimate, found)
     more: dict[str, Any] = {"recording_quality": [_quality_document(recording, seen) for recording, seen in found]}
@@ -182,6 +187,9 @@ def unusable_because(estimate: Estimate, found: Sequence[tuple[Recording, Qualit
 def _config(config: ArmConfig, request: Request) -> ArmConfig:
     if request.columns is not None:
         config = config.model_copy(update={"recording": load_recording_format(request.columns)})
+    if request.cut_standstill:
+        form = config.recording.model_copy(update={"standstill": "cut"})
+        config = config.model_copy(update={"recording": form})
     options = config.identification
     pull = options.prior
     if request.prior is not None:
@@ -196,29 +204,6 @@ def _config(config: ArmConfig, request: Request) -> ArmConfig:
     return config.model_copy(update={"identification": options.model_copy(update=changes)})
 
 
-def open_for(path: Path, model: ArmModel) -> Recording:
-    """A recording as its arm's description says it is to be read; FILE@2:1.5 leaves out 2 s and 1.5 s.
-
-    Raises:
-        UsageError: no such file.
-        RecordingError: it does not fit the arm.
-    """
-    start, end = 0.0, 0.0
-    if not path.exists() and (match := _TRIMMED.match(str(path))):
-        path, start, end = Path(match["path"]), float(match["start"]), float(match["end"])
-    form, gears = model.config.recording, model.config.transmission
-    # Quality, friction, equations and evidence each read it.
-    recording = KeptRecording(open_recording(path, model.chain.names, fmt=form, transmission=gears))
-    return TrimmedRecording(recording, start, end) if start or end else recording
-
-
-def recording_quality(recording: Recording, model: ArmModel) -> Quality:
-    """What a recording is worth, held against the arm's torque limits."""
-    joints = [model.config.joints.get(name) for name in model.chain.names]
-    limits = np.array([np.nan if joint is None or joint.torque is None else joint.torque for joint in joints])
-    return quality(recording, model.config.recording, limits)
-
-
 def _quality_document(recording: Recording, seen: Quality) -> dict[str, Any]:
     return {
         "recording": recording.path.name,
@@ -228,6 +213,8 @@ def _quality_document(recording: Recording, seen: Quality) -> dict[str, Any]:
         "jitter_seconds": {"standard_deviation": seen.jitter_std_s, "largest": seen.jitter_max_s},
         "gaps": len(seen.gaps),
         "repeats": seen.repeats,
+        "skipped": seen.skipped,
+        "standstill_left_out_seconds": list(standstill_left_out(recording)),
         "torn": seen.torn,
         "per_joint": [
             {"joint": joint.name, "saturated": joint.saturated, "standstill": joint.standstill} for joint in seen.joints

@@ -13,6 +13,8 @@ from ident_service.errors import ParameterError, UsageError
 from ident_service.estimation.fit import gather
 from ident_service.estimation.payload import KnownArm, Payload, identify_payload
 from ident_service.model.arm_model import arm_model
+from ident_service.record.part import overlap
+from ident_service.record.recording import Recording
 from ident_service.results.comparison.comparison import Comparison, compare
 from ident_service.results.comparison.sides import Side, read_side
 from ident_service.results.export.urdf_file import write_urdf
@@ -27,7 +29,7 @@ from ident_service.results.payload_document import (
 )
 from ident_service.results.run_folder import ARM, MANIFEST, PARAMETERS, URDF, VERIFIER, write_manifest, write_verifier
 from ident_service.service.comparison import write_comparison_files
-from ident_service.service.identification import open_for
+from ident_service.service.recordings import open_for, require_no_fault
 
 DOCUMENT, TEXT = "payload.json", "payload.txt"
 
@@ -58,13 +60,13 @@ def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_off
 
     Args:
         run: folder of results of the arm.
-        recordings: with the load; a path may end in `@START:END`, seconds to leave out.
+        recordings: with the load; a path may end in `@START:END`, the seconds to read.
         out: where results go; existing files of other names stay.
         refit_offsets: whether torque offsets may differ from those of the arm.
 
     Raises:
         UsageError, ConfigError, ParameterError: the folder cannot be used, or is no folder of results.
-        RecordingError: a recording cannot be used.
+        RecordingError: a recording cannot be used, or ended in a fault.
         SolverError: the solver stopped without an optimum.
     """
     require_place(out)
@@ -75,7 +77,9 @@ def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_off
     side = read_side(run)
     arm = known_arm(side)
     opened = [open_for(path, arm.model) for path in recordings]
-    _require_new(side, [(one.path, one.sha256) for one in opened])
+    _require_new(side, opened)
+    for path, recording in zip(recordings, opened, strict=True):
+        require_no_fault(path, recording)
     scales = np.array(side.content.get("torque_scales", np.ones(arm.model.chain.joints)), dtype=float)
     recorded = gather(opened, arm.model, arm.base).with_torques_times(scales)
     payload = identify_payload(arm, recorded, refit_offsets=refit_offsets)
@@ -113,18 +117,19 @@ def known_arm(side: Side) -> KnownArm:
         raise ParameterError(f"{side.path}: its parameters have no covariance; identify the arm again")
     model = arm_model(side.config)
     file = read_parameters(side.path / PARAMETERS, model.layout.names)
-    return KnownArm(model, file.base, file.values, side.covariance, side.content.get("fit", {}).get("blocks"))
+    fit = side.content.get("fit", {})
+    residual = np.array([one["rms"] for one in fit.get("per_joint", [])], dtype=float)
+    known = residual if residual.shape == (model.chain.joints,) else None
+    return KnownArm(model, file.base, file.values, side.covariance, fit.get("blocks"), known)
 
 
-def _require_new(side: Side, recordings: Sequence[tuple[Path, str]]) -> None:
+def _require_new(side: Side, recordings: Sequence[Recording]) -> None:
     fitted = {one["sha256"] for one in side.content.get("provenance", {}).get("recordings", [])}
-    seen: set[str] = set()
-    for path, sha256 in recordings:
-        if sha256 in fitted:
-            raise UsageError(f"{path}: the arm was identified from it; give a recording with the load")
-        if sha256 in seen:
-            raise UsageError(f"{path}: the same recording twice would make the doubt too small")
-        seen.add(sha256)
+    for index, recording in enumerate(recordings):
+        if recording.sha256 in fitted:
+            raise UsageError(f"{recording.path}: the arm was identified from it; give a recording with the load")
+        if any(overlap(recording, other) for other in recordings[:index]):
+            raise UsageError(f"{recording.path}: the same recording twice would make the doubt too small")
 
 
 def _compared(side: Side, staging: Path, out: Path) -> Comparison:

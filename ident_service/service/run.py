@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ident_service.config.schema import ArmConfig
-from ident_service.errors import MotionRefused, RecordingError, UsageError
+from ident_service.errors import IdentError, MotionRefused, RecordingError, UsageError
 from ident_service.estimation.target import Target
 from ident_service.excitation.excitation import Excitation
 from ident_service.model.arm_model import arm_model
@@ -166,7 +166,20 @@ def run_motion(
     if reaching is None or until is None:
         return Ran(folder, ending.report)
     wanted = {"share": until.share, "parameters": list(until.parameters), "reached": reaching.said}
+    wanted["missed"] = [] if reaching.said is not None else _missed(folder, until, tell)
     return Ran(folder, {**ending.report, "until": wanted})
+
+
+def _missed(folder: Path, until: Target, tell: Callable[[str], None]) -> list[dict[str, Any]] | None:
+    """Say what a run that went on to its end has not taught; None where its recording cannot be judged."""
+    # Loads the estimator, which nobody waits for while the arm moves.
+    from ident_service.service.target_process import missed
+
+    try:
+        return missed(folder, until)
+    except IdentError as error:
+        tell(f"which parameters missed the target is not known: {error}")
+        return None
 
 
 def _keep(folder: Path, error: BaseException) -> None:

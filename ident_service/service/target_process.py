@@ -13,10 +13,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ident_service.config.load import arm_from_json
+from ident_service.estimation.doubt import shares
 from ident_service.estimation.growing import GrowingInformation
-from ident_service.estimation.target import Target, worst_share
+from ident_service.estimation.target import LEAST_BLOCKS, Target, worst_share
 from ident_service.model.arm_model import arm_model
+from ident_service.record.open import open_recording
 from ident_service.record.recording import Block
 from ident_service.record.tail import RecordingTail
 
@@ -63,6 +67,39 @@ def watch(folder: Path, target: Target, least: float) -> dict[str, Any] | None:
         row = row + 1 if seconds >= least and worst <= target.share else 0
         if row >= _IN_A_ROW:
             return {"seconds": round(seconds, 3), "share": worst}
+
+
+def missed(folder: Path, target: Target) -> list[dict[str, Any]]:
+    """Judge by the whole recording of a run which of the chosen parameters are not known as well as was asked.
+
+    Args:
+        folder: of the run, which is over.
+        target: that was not reached on the way.
+
+    Returns:
+        Expression and share of each, the least known first; the share is None where the recording says nothing of it.
+
+    Raises:
+        IdentError: the recording or the description cannot be read.
+    """
+    model = arm_model(arm_from_json(folder / "arm.json"))
+    growing = GrowingInformation(model, in_blocks=True)
+    for block in open_recording(folder / "run.mcap", model.chain.names).blocks():
+        growing.add(block)
+        while growing.step():
+            pass
+    places, doubt = target.places(growing.base, model.config.name), growing.doubt()
+    if doubt is None or doubt.blocks < LEAST_BLOCKS:
+        known = np.full(len(places), np.inf)
+    else:
+        known = shares(doubt.beta, doubt.deviations, growing.base.units)[places]
+    found = [
+        (growing.base.expressions[place], float(share))
+        for place, share in zip(places.tolist(), known, strict=True)
+        if not share <= target.share
+    ]
+    found.sort(key=lambda one: -one[1] if np.isfinite(one[1]) else -np.inf)
+    return [{"parameter": name, "share": share if np.isfinite(share) else None} for name, share in found]
 
 
 def _opened(folder: Path) -> RecordingTail | None:

@@ -16,7 +16,7 @@ from compare.conftest import Ident
 
 from ident_service.config.load import load_arm
 from ident_service.errors import ParameterError, UsageError
-from ident_service.estimation.least_squares import ordinary_least_squares
+from ident_service.estimation.least_squares import weighted_least_squares
 from ident_service.results.comparison.comparison import compare
 from ident_service.results.comparison.findings import findings
 from ident_service.results.comparison.sides import read_side
@@ -53,7 +53,7 @@ def test_a_drier_elbow_is_named(commissioned: Path, ident: Ident) -> None:
     lines = out.splitlines()
     at = lines.index("CHANGED")
     assert lines[at + 1].startswith("  friction of joint elbow: ")
-    assert "+30% at 1 rad/s" in lines[at + 1]
+    assert "+30% at 0.81 rad/s" in lines[at + 1]
     assert "lubrication" in lines[at + 2]
     assert lines[at + 3] == ""
 
@@ -81,7 +81,7 @@ def test_the_findings_have_known_sizes(commissioned: Path) -> None:
 def test_the_information_in_the_file_is_that_of_the_fit(commissioned: Path) -> None:
     side = read_side(commissioned / "accepted")
     assert side.information is not None
-    fit = ordinary_least_squares(side.information)
+    fit = weighted_least_squares(side.information)
     np.testing.assert_allclose(fit.beta, side.content["base_parameters"]["unconstrained_values"], rtol=1e-7, atol=1e-12)
     assert information_document(side.information) == side.content["information"]
     broken = [dict(joint) for joint in side.content["information"]]

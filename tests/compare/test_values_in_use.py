@@ -129,7 +129,7 @@ def test_another_way_to_the_values_is_a_note_with_its_size(commissioned: Path, t
     code, out, _ = ident("compare", accepted, path)
     assert code == 0
     (note,) = [line for line in out.splitlines() if "come about in two ways" in line]
-    assert "(ols, pseudo_inertia; ols, none) and change the torque of joint " in note
+    assert "(wls, pseudo_inertia; wls, none) and change the torque of joint " in note
     assert "note: both were fitted to the same recording" in out
 
 

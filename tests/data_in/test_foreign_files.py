@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -109,6 +110,25 @@ def test_motor_side_is_brought_to_the_joints(tmp_path: Path, samples: Block) -> 
         open_recording(path, ["one", "two"], fmt=form)
     with pytest.raises(RecordingError, match="has 2 motors but the transmission has 1 ratios"):
         open_recording(path, fmt=form, transmission=Transmission(ratios=(3.0,)))
+
+
+@pytest.mark.parametrize(("side", "torque_side"), [("joint", "motor"), ("motor", "joint")])
+def test_torques_may_be_measured_on_the_other_side_than_positions(
+    side: Literal["joint", "motor"], torque_side: Literal["joint", "motor"], tmp_path: Path, samples: Block
+) -> None:
+    path = write_csv(tmp_path / "run.csv.gz", samples)
+    form = RecordingFormat.model_validate({"columns": COLUMNS, "side": side, "torque_side": torque_side})
+    block = whole(open_recording(path, ["one", "two"], fmt=form, transmission=COUPLED))
+    motors = form.model_copy(update={"side": "motor", "torque_side": None})
+    brought = whole(open_recording(path, ["one", "two"], fmt=motors, transmission=COUPLED))
+    positions, torques = (samples, brought) if side == "joint" else (brought, samples)
+    assert np.array_equal(block.position, positions.position)
+    assert block.velocity is not None
+    assert positions.velocity is not None
+    assert np.array_equal(block.velocity, positions.velocity)
+    assert np.array_equal(block.torque, torques.torque)
+    with pytest.raises(UsageError, match="no transmission"):
+        open_recording(path, ["one", "two"], fmt=form)
 
 
 def ratios() -> st.SearchStrategy[float]:

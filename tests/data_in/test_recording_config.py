@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -100,6 +101,15 @@ def test_motor_side_needs_a_transmission(tmp_path: Path) -> None:
     path.write_text(ARM[:start] + ARM[stop:])
     with pytest.raises(ConfigError, match=r"6:3: recording\.side: motor, but there is no transmission"):
         load_arm(path)
+    path.write_text(path.read_text().replace("side: motor", "torque_side: motor"))
+    with pytest.raises(ConfigError, match=r"6:3: recording\.torque_side: motor, but there is no transmission"):
+        load_arm(path)
+
+
+def test_descriptions_without_later_keys_keep_their_hash() -> None:
+    # Of the version before: results name descriptions by it.
+    known = set(json.loads(load_arm("ur10").model_dump_json(include={"recording"}))["recording"])
+    assert known == {"columns", "joint_names", "topic", "side", "stamps", "trim", "gap", "rate"}
 
 
 def test_the_format_alone(tmp_path: Path) -> None:

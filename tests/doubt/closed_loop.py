@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from estimation.synthetic import SampledRecording, stamps, waves
+from estimation.synthetic import SampledRecording, stamps, waves, with_options
+from helpers.plain import plain_options
 from sim.sim_arms import pendulum
 
 from ident_service.model.arm_model import ArmModel, arm_model
@@ -18,7 +19,7 @@ TERMS = {"Ia": 0.1, "fv": 0.8, "fc": 0.5, "fo": 0.2}
 
 def pendulum_model() -> tuple[ArmModel, Array]:
     """A pendulum with friction and its true parameters; no prior and no gains."""
-    model = arm_model(pendulum(**TERMS))
+    model = with_options(arm_model(pendulum(**TERMS)), plain_options())
     return model, model.layout.vector(model.config.driver.truth)
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from estimation.synthetic import SampledRecording, recorded, serial_chain, stamps, waves, with_options
+from helpers.plain import plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_delta
 
-from ident_service.config.schema import Identification, Reversal, Smoothing
+from ident_service.config.schema import Reversal
 from ident_service.errors import RecordingError
 from ident_service.estimation import equations as module
 from ident_service.estimation import smoothing
@@ -16,7 +17,7 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters, base_parameters
 from ident_service.model.regressor import joint_regressor
 
-OPTIONS = Identification(smoothing=Smoothing(cutoff=40.0))
+OPTIONS = plain_options(smoothing=plain_smoothing(cutoff=40.0))
 
 
 @pytest.fixture(scope="module")

@@ -10,11 +10,12 @@ import pytest
 from estimation.bodies import conditions as second_conditions
 from estimation.bodies import solved
 from estimation.synthetic import random_information, recorded, serial_chain, waves, with_options
+from helpers.plain import plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_chain, random_delta
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident_service.config.schema import ArmConfig, Constraints, FeasibleSetName, Identification, Smoothing
+from ident_service.config.schema import ArmConfig, Constraints, FeasibleSetName
 from ident_service.errors import ParameterError, SolverError
 from ident_service.estimation.equations import equations
 from ident_service.estimation.feasible.feasibility import (
@@ -332,7 +333,7 @@ def test_shapes_and_names_are_checked_at_the_door() -> None:
 def test_known_parameters_come_back_from_noiseless_recordings(seed: int, joints: int) -> None:
     rng = np.random.default_rng(seed)
     chain = random_chain(rng, joints, branches=False)
-    arm = with_options(model_around(chain), Identification(smoothing=Smoothing(cutoff=40.0)))
+    arm = with_options(model_around(chain), plain_options(smoothing=plain_smoothing(cutoff=40.0)))
     delta = random_delta(rng, arm.layout)
     base = base_parameters(arm.chain, arm.layout)
     gathered = equations(recorded(arm, delta, waves(seed, joints)), arm, base)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import scipy.signal
 from estimation.synthetic import SampledRecording, stamps, waves
+from helpers.plain import plain_options, plain_smoothing
 
-from ident_service.config.schema import Identification, Reversal, Smoothing
+from ident_service.config.schema import Identification, Reversal
 from ident_service.errors import RecordingError
 from ident_service.estimation import smoothing
 from ident_service.estimation.equations import kept_motion
@@ -52,9 +53,9 @@ def in_one_piece(recording: SampledRecording, options: Identification) -> Motion
 @pytest.mark.parametrize(
     ("held", "options"),
     [
-        (False, Identification()),
-        (True, Identification()),
-        (True, Identification(smoothing=Smoothing(order=4, cutoff=12.0, filter_torque=True), edge=0.2)),
+        (False, plain_options()),
+        (True, plain_options()),
+        (True, plain_options(smoothing=plain_smoothing(order=4, cutoff=12.0, filter_torque=True), edge=0.2)),
     ],
 )
 def test_windows_equal_the_whole_recording(
@@ -74,24 +75,24 @@ def test_windows_equal_the_whole_recording(
 @pytest.mark.parametrize("window", [400, 611])
 def test_keep_mask_in_windows_equals_the_whole_recording(monkeypatch: pytest.MonkeyPatch, window: int) -> None:
     recording = noisy(4013)
-    whole = kept_motion(recording, Identification())
+    whole = kept_motion(recording, plain_options())
     assert 0.1 < whole.keep.mean() < 0.9
     monkeypatch.setattr(smoothing, "_WINDOW", window)
-    np.testing.assert_array_equal(kept_motion(recording, Identification()).keep, whole.keep)
+    np.testing.assert_array_equal(kept_motion(recording, plain_options()).keep, whole.keep)
 
 
 @pytest.mark.parametrize("edge", [0.1, 0.5, 3.0])
 @pytest.mark.parametrize("samples", [3700, 3850, 4000, 4150, 4300])
 def test_edges_do_not_depend_on_where_windows_end(monkeypatch: pytest.MonkeyPatch, edge: float, samples: int) -> None:
     monkeypatch.setattr(smoothing, "_WINDOW", 700)
-    got = kept_motion(noisy(samples), Identification(edge=edge))
+    got = kept_motion(noisy(samples), plain_options(edge=edge))
     left_out = int(np.ceil(edge * RATE))
     np.testing.assert_allclose(got.time, np.arange(left_out, samples - left_out) / RATE, rtol=0, atol=1e-9)
 
 
 def test_memory_does_not_grow_with_the_recording(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(smoothing, "_WINDOW", 700)
-    longest = [max(len(part.time) for part in smoothed(noisy(n), Identification())) for n in (5000, 20000)]
+    longest = [max(len(part.time) for part in smoothed(noisy(n), plain_options())) for n in (5000, 20000)]
     assert longest[0] == longest[1] < 2100
 
 
@@ -101,7 +102,7 @@ def test_a_cubic_motion_keeps_its_derivatives() -> None:
     powers = [np.polynomial.Polynomial(row) for row in coefficients]
     position = np.column_stack([p(time) for p in powers])
     recording = SampledRecording(stamps(2400, RATE), position, np.zeros_like(position))
-    got = kept_motion(recording, Identification(edge=3.0))
+    got = kept_motion(recording, plain_options(edge=3.0))
     for joint, p in enumerate(powers):
         np.testing.assert_allclose(got.position[:, joint], p(got.time), rtol=0, atol=1e-9)
         np.testing.assert_allclose(got.velocity[:, joint], p.deriv()(got.time), rtol=0, atol=1e-8)
@@ -113,7 +114,7 @@ def test_sines_keep_their_derivatives() -> None:
     time = np.arange(4000) / RATE
     position = motion.derivative(time, 0)
     recording = SampledRecording(stamps(4000, RATE), position, np.zeros_like(position))
-    got = kept_motion(recording, Identification(smoothing=Smoothing(cutoff=40.0)))
+    got = kept_motion(recording, plain_options(smoothing=plain_smoothing(cutoff=40.0)))
     for order, values in enumerate((got.position, got.velocity, got.acceleration)):
         wanted = motion.derivative(got.time, order)
         np.testing.assert_allclose(values, wanted, rtol=0, atol=1e-7 * np.abs(wanted).max())
@@ -123,14 +124,14 @@ def test_the_filter_has_no_phase_and_the_configured_cut_off() -> None:
     time = np.arange(4000) / RATE
     position = np.sin(2.0 * np.pi * 8.0 * time)[:, None]
     recording = SampledRecording(stamps(4000, RATE), position, np.zeros_like(position))
-    got = kept_motion(recording, Identification(smoothing=Smoothing(cutoff=8.0), edge=3.0))
+    got = kept_motion(recording, plain_options(smoothing=plain_smoothing(cutoff=8.0), edge=3.0))
     # Twice through a Butterworth filter, its cut-off frequency loses half of its amplitude.
     np.testing.assert_allclose(got.position[:, 0], 0.5 * np.sin(2.0 * np.pi * 8.0 * got.time), rtol=0, atol=1e-6)
 
 
 def test_held_torque_is_the_mean_of_two_periods_and_sampled_torque_is_left_alone() -> None:
     sampled, held = noisy(1200), noisy(1200, held=True)
-    options = Identification()
+    options = plain_options()
     edge = int(np.ceil(options.edge * RATE))
     part = slice(edge, 1200 - edge)
     np.testing.assert_array_equal(kept_motion(sampled, options).torque, sampled.torque[part])
@@ -139,7 +140,7 @@ def test_held_torque_is_the_mean_of_two_periods_and_sampled_torque_is_left_alone
 
 
 def test_samples_near_a_reversal_are_left_out() -> None:
-    options = Identification(reversal=Reversal(speed=0.3, window=0.1))
+    options = plain_options(reversal=Reversal(speed=0.3, window=0.1))
     got = kept_motion(noisy(3000), options)
     reach = round(0.1 * RATE)
     slow = np.abs(got.velocity) <= 0.3
@@ -150,7 +151,7 @@ def test_samples_near_a_reversal_are_left_out() -> None:
 
 
 def test_a_reversal_too_quick_to_be_slow_is_still_left_out() -> None:
-    options = Identification(reversal=Reversal(speed=0.0, window=0.05))
+    options = plain_options(reversal=Reversal(speed=0.0, window=0.05))
     got = kept_motion(noisy(3000), options)
     turns = np.argwhere(np.diff(np.sign(got.velocity), axis=0) != 0.0)
     assert len(turns) > 10
@@ -165,12 +166,12 @@ def test_too_short_recordings_are_refused(rate: float, seconds: float) -> None:
     position = np.sin(np.arange(samples) / rate)[:, None]
     recording = SampledRecording(stamps(samples, rate), position, position)
     with pytest.raises(RecordingError, match=r"synthetic.csv: the longest stretch without a gap.*at least 2"):
-        kept_motion(recording, Identification())
+        kept_motion(recording, plain_options())
 
 
 def test_the_length_that_the_message_asks_for_is_enough() -> None:
     recording = noisy(3000)
-    for options in (Identification(), Identification(edge=3.0), Identification(smoothing=Smoothing(cutoff=30.0))):
+    for options in (plain_options(), plain_options(edge=3.0), plain_options(smoothing=plain_smoothing(cutoff=30.0))):
 
         def cut(samples: int) -> SampledRecording:
             part = slice(0, samples)
@@ -186,7 +187,7 @@ def test_the_length_that_the_message_asks_for_is_enough() -> None:
 def test_empty_recordings_are_refused(samples: int) -> None:
     recording = SampledRecording(stamps(samples, RATE), np.zeros((samples, 2)), np.zeros((samples, 2)))
     with pytest.raises(RecordingError, match="holds no samples"):
-        kept_motion(recording, Identification())
+        kept_motion(recording, plain_options())
 
 
 def test_irregular_stamps_make_no_difference_to_a_smooth_motion() -> None:
@@ -197,7 +198,7 @@ def test_irregular_stamps_make_no_difference_to_a_smooth_motion() -> None:
     late[0], late[-1] = regular[0], regular[-1]
     late = np.round(late * 1e9) * 1e-9
     position = motion.derivative(late, 0)
-    got = kept_motion(SampledRecording(np.round(late * 1e9).astype(np.int64), position, position), Identification())
+    got = kept_motion(SampledRecording(np.round(late * 1e9).astype(np.int64), position, position), plain_options())
     wanted = motion.derivative(got.time, 2)
     np.testing.assert_allclose(got.acceleration, wanted, rtol=0, atol=1e-3 * np.abs(wanted).max())
 
@@ -206,7 +207,7 @@ def test_a_gap_is_cut_at_and_its_edges_are_left_out() -> None:
     good = noisy(6000)
     stamp = good.stamp_ns.copy()
     stamp[3000:] += 1_000_000_000
-    got = kept_motion(SampledRecording(stamp, good.position, good.torque), Identification())
+    got = kept_motion(SampledRecording(stamp, good.position, good.torque), plain_options())
     hole = (got.time > 3000 / RATE - 0.5) & (got.time < 3000 / RATE + 1.0 + 0.5 - 1e-9)
     assert not hole.any()
     assert got.time[-1] > 6000 / RATE
@@ -216,10 +217,10 @@ def test_jitter_of_a_tenth_of_a_period_passes() -> None:
     good = noisy(3000)
     jitter = np.random.default_rng(1).integers(-250_000, 250_000, size=3000)
     recording = SampledRecording(good.stamp_ns + jitter, good.position, good.torque)
-    assert len(kept_motion(recording, Identification()).time) == 2800
+    assert len(kept_motion(recording, plain_options()).time) == 2800
 
 
 def test_recordings_slower_than_the_cut_off_are_refused() -> None:
     recording = SampledRecording(stamps(300, 10.0), np.zeros((300, 2)), np.zeros((300, 2)))
     with pytest.raises(RecordingError, match=r"sampled at 10 Hz, too slow for a cut-off of 8 Hz"):
-        kept_motion(recording, Identification())
+        kept_motion(recording, plain_options())

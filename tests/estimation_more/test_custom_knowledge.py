@@ -109,7 +109,8 @@ def test_the_documented_example(setting: Setting, tmp_path: Path, capsys: pytest
     assert [values[name] for name in ("lz2", "Lxz2", "Lyz2")] == pytest.approx([0.0, 0.0, 0.0], abs=1e-6)
     known = document["custom"]
     assert known["sha256"] == hashlib.sha256((tmp_path / "known_bodies.py").read_bytes()).hexdigest()
-    assert known["relative_error_percent"] >= known["relative_error_percent_without"] > 0.0
+    without = known["relative_error_percent_without"]
+    assert known["relative_error_percent"] >= without * (1.0 - 1e-6) > 0.0  # as exactly as two solvers agree
     assert "They were also held to what known_bodies:payload_and_wrist says" in (out / "report.html").read_text()
     assert document["feasibility"]["feasible"]
     assert document["feasibility"]["certificate"]["kind"] == "witness"

@@ -8,9 +8,10 @@ from functools import cache
 import numpy as np
 import pytest
 from estimation.synthetic import SampledRecording, Waves, exact_torque, serial_chain, stamps, waves, with_options
+from helpers.plain import plain_friction, plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_delta
 
-from ident_service.config.schema import FrictionShape, Identification, Reversal, Smoothing
+from ident_service.config.schema import FrictionShape, Reversal
 from ident_service.errors import RecordingError
 from ident_service.estimation.delay import Delay, estimate_delay, with_delay
 from ident_service.estimation.direction import direction
@@ -28,7 +29,7 @@ RATE = 250.0
 
 @cache
 def two_links() -> tuple[ArmModel, BaseParameters, np.ndarray]:
-    model = with_options(model_around(serial_chain(21, 2)), Identification(smoothing=Smoothing(cutoff=20.0)))
+    model = with_options(model_around(serial_chain(21, 2)), plain_options(smoothing=plain_smoothing(cutoff=20.0)))
     return model, base_parameters(model.chain, model.layout), random_delta(np.random.default_rng(5), model.layout)
 
 
@@ -125,7 +126,7 @@ def test_a_delay_beyond_reason_is_refused() -> None:
 
 TERMS = ("drive_inertia", "viscous", "coulomb", "offset", "stribeck")
 PRESLIDING, STRIBECK = np.array([0.006, 0.03]), np.array([0.06, 0.25])
-FIT = FrictionShape(presliding="fit", stribeck_velocity="fit")
+FIT = plain_friction(presliding="fit", stribeck_velocity="fit")
 NOISE = 0.05
 
 
@@ -133,7 +134,9 @@ def rubbing(shape: FrictionShape, terms: tuple[str, ...] = TERMS) -> tuple[ArmMo
     """An arm whose friction is known, and what is to be fitted of it."""
     plain = model_around(serial_chain(21, 2))
     layout = Layout(plain.chain.revolute, terms, tuple(STRIBECK) if "stribeck" in terms else ())  # type: ignore[arg-type]
-    options = Identification(smoothing=Smoothing(cutoff=20.0), reversal=Reversal(speed=0.0, window=0.0), friction=shape)
+    options = plain_options(
+        smoothing=plain_smoothing(cutoff=20.0), reversal=Reversal(speed=0.0, window=0.0), friction=shape
+    )
     model = with_options(replace(plain, layout=layout), options)
     delta = random_delta(np.random.default_rng(6), layout)
     delta[layout.term_columns("coulomb")] = (1.0, 0.7)
@@ -174,13 +177,13 @@ def test_presliding_and_stribeck_velocity_are_found() -> None:
         return torque_error(total, weighted_least_squares(total).beta).joint_rms
 
     np.testing.assert_allclose(left(fitted), NOISE, rtol=0.1)
-    worse = left(with_friction(model, FrictionShape(presliding=0.0, stribeck_velocity=0.1)))
+    worse = left(with_friction(model, plain_friction(presliding=0.0, stribeck_velocity=0.1)))
     assert np.all(worse > 1.2 * left(fitted))
 
 
 @pytest.mark.slow
 def test_a_given_number_is_kept() -> None:
-    given = FrictionShape(presliding="fit", stribeck_velocity=tuple(STRIBECK))
+    given = plain_friction(presliding="fit", stribeck_velocity=tuple(STRIBECK))
     model, base, delta = rubbing(given)
     fitted = fit_friction([rubbed(model, delta, PRESLIDING)], model, base)
     shape = fitted.config.identification.friction
@@ -190,7 +193,7 @@ def test_a_given_number_is_kept() -> None:
 
 @pytest.mark.slow
 def test_a_drive_without_presliding_is_given_little_or_none() -> None:
-    model, base, delta = rubbing(FrictionShape(presliding="fit"), TERMS[:4])
+    model, base, delta = rubbing(plain_friction(presliding="fit"), TERMS[:4])
     fitted = fit_friction([rubbed(model, delta, np.array([0.0, 0.03]))], model, base)
     first, second = fitted.config.identification.friction.presliding  # type: ignore[misc]
     assert first < 1e-3
@@ -199,7 +202,7 @@ def test_a_drive_without_presliding_is_given_little_or_none() -> None:
 
 @pytest.mark.parametrize("terms", [TERMS, TERMS[:4]])
 def test_nothing_to_fit_leaves_the_numbers(terms: tuple[str, ...]) -> None:
-    shape = FrictionShape(presliding=0.01, stribeck_velocity=tuple(STRIBECK))
+    shape = plain_friction(presliding=0.01, stribeck_velocity=tuple(STRIBECK))
     model, base, delta = rubbing(shape, terms)
     recording = rubbed(model, delta, PRESLIDING)
     fitted = fit_friction([recording], model, base)
@@ -211,7 +214,7 @@ def test_nothing_to_fit_leaves_the_numbers(terms: tuple[str, ...]) -> None:
 
 @pytest.mark.slow
 def test_the_rate_and_other_options_come_back_untouched() -> None:
-    model, base, delta = rubbing(FrictionShape(presliding="fit"), TERMS[:4])
+    model, base, delta = rubbing(plain_friction(presliding="fit"), TERMS[:4])
     before = model.config.identification
     after = fit_friction([rubbed(model, delta, PRESLIDING)], model, base).config.identification
     assert after.model_copy(update={"friction": before.friction}) == before
@@ -219,7 +222,7 @@ def test_the_rate_and_other_options_come_back_untouched() -> None:
 
 
 def test_a_number_at_the_end_of_its_search_is_said() -> None:
-    shape = FrictionShape(presliding=(0.05, 0.01), stribeck_velocity=(0.8, 0.02))
+    shape = plain_friction(presliding=(0.05, 0.01), stribeck_velocity=(0.8, 0.02))
     assert at_the_edge(shape, ("shoulder", "elbow"), ("coulomb", "stribeck")) == (
         "shoulder: its pre-sliding distance of 0.05 is the largest that is searched",
         "shoulder: its Stribeck velocity of 0.8 is the largest that is searched",
@@ -234,5 +237,5 @@ def test_the_edge_is_a_remark_of_the_estimate() -> None:
     estimate = identify(model, [rubbed(model, delta, np.array([0.2, 0.01]))])
     assert estimate.remarks[0].startswith(f"{model.chain.names[0]}: its ")
     assert estimate.remarks[0].endswith(" is the largest that is searched")
-    given = rubbing(FrictionShape(presliding=0.05, stribeck_velocity=0.8))[0]
+    given = rubbing(plain_friction(presliding=0.05, stribeck_velocity=0.8))[0]
     assert identify(given, [rubbed(model, delta, PRESLIDING)]).remarks == ()

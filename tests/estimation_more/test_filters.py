@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import scipy.signal
 from estimation.synthetic import SampledRecording, recorded, serial_chain, stamps, waves, with_options
+from helpers.plain import plain_friction, plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_delta
 
-from ident_service.config.schema import FrictionShape, Identification, Reversal, Smoothing
+from ident_service.config.schema import Identification, Reversal
 from ident_service.errors import RecordingError
 from ident_service.estimation import smoothing
 from ident_service.estimation.direction import direction
@@ -33,7 +34,7 @@ def noisy(samples: int, *, noise: float = 1e-4, seed: int = 3) -> SampledRecordi
 
 def test_polynomials_recover_the_derivatives() -> None:
     recording = noisy(4000, noise=0.0)
-    options = Identification(smoothing=Smoothing(method="savitzky_golay", order=4, cutoff=25.0))
+    options = plain_options(smoothing=plain_smoothing(method="savitzky_golay", order=4, cutoff=25.0))
     got = kept_motion(recording, options)
     for order, values in enumerate((got.position, got.velocity, got.acceleration)):
         wanted = waves(3, 3).derivative(got.time, order)
@@ -44,7 +45,7 @@ def test_polynomials_are_exact_for_polynomials() -> None:
     time = np.arange(2400) / RATE
     p = np.polynomial.Polynomial([0.3, -0.2, 0.05, 0.004])
     recording = SampledRecording(stamps(2400, RATE), p(time)[:, None], np.zeros((2400, 1)))
-    got = kept_motion(recording, Identification(smoothing=Smoothing(method="savitzky_golay", order=3)))
+    got = kept_motion(recording, plain_options(smoothing=plain_smoothing(method="savitzky_golay", order=3)))
     for order, values in enumerate((got.position, got.velocity, got.acceleration)):
         wanted = p.deriv(order)(got.time) if order else p(got.time)
         np.testing.assert_allclose(values[:, 0], wanted, rtol=0, atol=1e-8 * 100.0**order)
@@ -55,7 +56,7 @@ def test_polynomials_have_about_the_cut_off_asked_for() -> None:
     white = rng.normal(size=(40_000, 1))
     recording = SampledRecording(stamps(len(white), RATE), white, white)
     for method in ("butterworth", "savitzky_golay"):
-        got = kept_motion(recording, Identification(smoothing=Smoothing(method=method, order=3, cutoff=10.0)))
+        got = kept_motion(recording, plain_options(smoothing=plain_smoothing(method=method, order=3, cutoff=10.0)))
         # White noise of which a share of the band is left.
         assert float(np.var(got.position)) == pytest.approx(10.0 / (RATE / 2.0), rel=0.25)
 
@@ -67,14 +68,14 @@ def test_windows_and_decimation_change_nothing(
     monkeypatch: pytest.MonkeyPatch, method: str, window: int, decimate: int
 ) -> None:
     recording = noisy(4013)
-    shape = FrictionShape(presliding=(0.0, 0.01, 0.05))
+    shape = plain_friction(presliding=(0.0, 0.01, 0.05))
     whole = kept_motion(
         recording,
-        Identification(smoothing=Smoothing(method=method, filter_torque=True), friction=shape),  # type: ignore[arg-type]
+        plain_options(smoothing=plain_smoothing(method=method, filter_torque=True), friction=shape),  # type: ignore[arg-type]
     )
     monkeypatch.setattr(smoothing, "_WINDOW", window)
-    few = Smoothing(method=method, filter_torque=True, decimate=decimate)  # type: ignore[arg-type]
-    got = kept_motion(recording, Identification(smoothing=few, friction=shape))
+    few = plain_smoothing(method=method, filter_torque=True, decimate=decimate)  # type: ignore[arg-type]
+    got = kept_motion(recording, plain_options(smoothing=few, friction=shape))
     for name in FIELDS:
         wanted = getattr(whole, name)[::decimate]
         largest = max(1.0, float(np.abs(wanted).max()))
@@ -82,7 +83,7 @@ def test_windows_and_decimation_change_nothing(
 
 
 def test_direction_follows_the_smoothed_velocity() -> None:
-    options = Identification(friction=FrictionShape(presliding=0.02), edge=0.0)
+    options = plain_options(friction=plain_friction(presliding=0.02), edge=0.0)
     C = np.array([[1.0, 0.0, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, -2.0]])
     got = kept_motion(noisy(3000), options, C)
     assert got.direction is not None
@@ -92,7 +93,7 @@ def test_direction_follows_the_smoothed_velocity() -> None:
 
 def test_a_joint_is_left_out_where_any_of_its_drives_stands_still() -> None:
     C = np.array([[1.0, 0.0, 0.0], [0.7, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    options = Identification(reversal=Reversal(speed=0.1, window=0.0))
+    options = plain_options(reversal=Reversal(speed=0.1, window=0.0))
     got = kept_motion(noisy(4000, noise=0.0), options, C)
     plain = kept_motion(noisy(4000, noise=0.0), options)
     rate = got.velocity @ C.T
@@ -109,7 +110,7 @@ def test_a_delay_shifts_the_torque(seconds: float) -> None:
     time = np.arange(3000) / RATE
     torque = np.sin(2.0 * np.pi * 0.7 * (time - seconds))[:, None]
     recording = SampledRecording(stamps(3000, RATE), noisy(3000).position[:, :1], torque)
-    got = kept_motion(recording, Identification(delay=seconds))
+    got = kept_motion(recording, plain_options(delay=seconds))
     np.testing.assert_allclose(got.torque[:, 0], np.sin(2.0 * np.pi * 0.7 * got.time), rtol=0, atol=1e-6)
 
 
@@ -122,7 +123,7 @@ def three_links(options: Identification) -> ArmModel:
 
 def both_sides(**rest: object) -> Identification:
     return Identification.model_validate(
-        {"smoothing": {"cutoff": 30.0, "regressor_cutoff": 4.0, **rest}, "reversal": {"speed": 0.02}}
+        {"smoothing": {"cutoff": 30.0, "regressor_cutoff": 4.0, **rest}, "reversal": {"speed": 0.02}, "edge": 0.5}
     )
 
 
@@ -185,4 +186,4 @@ def test_both_sides_filtered_recover_the_parameters() -> None:
 
 def test_a_cut_off_above_the_samples_is_refused() -> None:
     with pytest.raises(RecordingError, match="too slow for a cut-off of 150 Hz"):
-        kept_motion(noisy(3000), Identification(smoothing=Smoothing(method="savitzky_golay", cutoff=150.0)))
+        kept_motion(noisy(3000), plain_options(smoothing=plain_smoothing(method="savitzky_golay", cutoff=150.0)))

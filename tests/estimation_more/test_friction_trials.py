@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from estimation.synthetic import SampledRecording, stamps, with_options
 from estimation_more.test_delay_and_friction import FIT, RATE, rubbed, rubbing
+from helpers.plain import plain_friction, plain_options, plain_smoothing
 
-from ident_service.config.schema import FrictionShape, Identification, Reversal, Smoothing
+from ident_service.config.schema import Reversal
 from ident_service.errors import RecordingError
 from ident_service.estimation import friction_trials
 from ident_service.estimation.equations import Equations, equations
@@ -33,15 +34,16 @@ def with_gap(recording: SampledRecording) -> SampledRecording:
 
 
 def both(model: ArmModel, recordings: list[SampledRecording], x0: np.ndarray, v_s: np.ndarray) -> list[np.ndarray]:
-    """Give each joint's Gram matrix of the kept rows, by exchange and then by reading everything again."""
+    """Give each joint's Gram matrix of all rows, by exchange and then by reading everything again."""
     base = base_parameters(model.chain, model.layout)
-    shape = FrictionShape(presliding=tuple(x0.tolist()), stribeck_velocity=tuple(v_s.tolist()))
+    shape = plain_friction(presliding=tuple(x0.tolist()), stribeck_velocity=tuple(v_s.tolist()))
     again = reduce(Equations.joined, (equations(one, with_friction(model, shape), base) for one in recordings))
     trials = FrictionTrials(recordings, model, base).equations(x0, v_s)
-    np.testing.assert_array_equal(trials.total.rows, again.total.rows)
+    np.testing.assert_array_equal(trials.total.rows, again.everything.rows)
     assert len(trials.blocks) == 3
     return [
-        np.concatenate([(factor.T @ factor).ravel() for factor in found.total.factors]) for found in (trials, again)
+        np.concatenate([(factor.T @ factor).ravel() for factor in found.everything.factors])
+        for found in (trials, again)
     ]
 
 
@@ -55,7 +57,8 @@ def test_the_same_equations(x0: np.ndarray) -> None:
 def test_several_recordings_with_gaps_and_thinned_rows() -> None:
     model, _, delta = rubbing(FIT)
     thinned = with_options(
-        model, Identification(smoothing=Smoothing(cutoff=20.0, decimate=3), reversal=Reversal(speed=0.02), friction=FIT)
+        model,
+        plain_options(smoothing=plain_smoothing(cutoff=20.0, decimate=3), reversal=Reversal(speed=0.02), friction=FIT),
     )
     whole = rubbed(model, delta, X0)
     exchanged, read = both(thinned, [with_gap(whole), whole], X0, V_S)
@@ -70,8 +73,8 @@ def test_a_period() -> None:
     position = np.column_stack([0.4 * np.sin(phase) + 0.2 * np.cos(3 * phase), 0.3 * np.cos(2 * phase)])
     torque = np.column_stack([np.sign(np.cos(phase)), np.cos(phase)])
     recording = SampledRecording(stamps(len(time), RATE), position, torque)
-    options = Identification(
-        smoothing=Smoothing(cutoff=20.0), reversal=Reversal(speed=0.0, window=0.0), friction=FIT, period=seconds
+    options = plain_options(
+        smoothing=plain_smoothing(cutoff=20.0), reversal=Reversal(speed=0.0, window=0.0), friction=FIT, period=seconds
     )
     exchanged, read = both(with_options(model, options), [recording], X0, V_S)
     np.testing.assert_allclose(exchanged, read, rtol=1e-6, atol=1e-6 * np.abs(read).max())
@@ -79,8 +82,8 @@ def test_a_period() -> None:
 
 def test_a_filtered_regressor_is_filtered_there_too() -> None:
     model, _, delta = rubbing(FIT)
-    smoothing = Smoothing(cutoff=40.0, regressor_cutoff=8.0)
-    options = Identification(smoothing=smoothing, reversal=Reversal(speed=0.0, window=0.0), friction=FIT)
+    smoothing = plain_smoothing(cutoff=40.0, regressor_cutoff=8.0)
+    options = plain_options(smoothing=smoothing, reversal=Reversal(speed=0.0, window=0.0), friction=FIT)
     exchanged, read = both(with_options(model, options), [rubbed(model, delta, X0)], X0, V_S)
     np.testing.assert_allclose(exchanged, read, rtol=0.0, atol=2e-3 * np.abs(read).max())
 

@@ -83,7 +83,7 @@ def test_a_prior_draws_as_strongly_as_its_weight(setting: Setting, plain: Estima
     assert setting.model.prior is not None
     wanted = plain.base.K @ setting.model.prior
     distances = []
-    for weight in (1e-6, 1.0, 1e4, 1e9):
+    for weight in (1e-6, 1.0, 1e4, 1e10):
         estimate = drawn(setting, kind, weight)
         assert estimate.prior is not None
         assert (estimate.prior.kind, estimate.prior.weight) == (kind, weight)
@@ -263,7 +263,7 @@ def test_methods_by_the_command(
     base, found = read_parameters(tmp_path / "out" / "parameters.json").base, document["base_parameters"]
     off = np.array(found["values"]) - base.K @ setting.delta
     assert np.all(np.abs(off) < 4.5 * np.array(found["standard_deviations"]))
-    assert np.all(np.abs(off) < 0.1)
+    assert np.all(np.abs(off) < 0.15)
 
 
 def test_columns_of_a_foreign_header(setting: Setting, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -294,15 +294,18 @@ def test_columns_of_a_foreign_header(setting: Setting, capsys: pytest.CaptureFix
 def test_delay_by_the_command(setting: Setting, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     path = written(made(setting.model, setting.delta, 2, late=0.0061), tmp_path / "late.csv")
     words = ("identify", path, "--arm", setting.arm, "--out")
-    errors = {}
+    off = {}
     for delay in ("0", "estimate", "0.0061"):
-        errors[delay] = ident_json(capsys, *words, tmp_path / delay, "--delay", delay)["relative_error_percent"]
+        assert ident_json(capsys, *words, tmp_path / delay, "--delay", delay)["exit_code"] == 0
+        found = parameters_of(tmp_path / delay)["base_parameters"]
+        base = read_parameters(tmp_path / delay / "parameters.json").base
+        off[delay] = float(np.max(np.abs(np.array(found["values"]) - base.K @ setting.delta)))
     found = parameters_of(tmp_path / "estimate")["torque_delay"]
     assert found["seconds"] == pytest.approx(0.0061, abs=1e-3)
     assert 0.0 < found["deviation"] < 1e-3
     assert parameters_of(tmp_path / "0.0061")["torque_delay"] == {"seconds": 0.0061, "deviation": None}
-    assert errors["estimate"] < errors["0"]
-    assert errors["0.0061"] == pytest.approx(errors["estimate"], rel=0.05)
+    assert off["estimate"] < 0.7 * off["0"]
+    assert off["0.0061"] < 0.7 * off["0"]
 
 
 def test_a_prior_by_the_command(setting: Setting, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from estimation.synthetic import SampledRecording, exact_torque, serial_chain, stamps, with_options
+from helpers.plain import plain_friction, plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_delta
 
 from ident_service.config.recording import RecordingFormat
-from ident_service.config.schema import FrictionShape, Identification, Reversal, Smoothing
+from ident_service.config.schema import Reversal
 from ident_service.errors import RecordingError
 from ident_service.estimation.direction import direction
 from ident_service.estimation.identify import identify
@@ -19,7 +20,7 @@ from ident_service.model.arm_model import ArmModel
 
 RATE, PERIOD = 200.0, 5.0
 LENGTH = round(RATE * PERIOD)
-OPTIONS = Identification(smoothing=Smoothing(cutoff=10.0), reversal=Reversal(window=0.05), period=PERIOD)
+OPTIONS = plain_options(smoothing=plain_smoothing(cutoff=10.0), reversal=Reversal(window=0.05), period=PERIOD)
 
 
 def periodic(time: np.ndarray, order: int, joints: int = 2) -> np.ndarray:
@@ -105,7 +106,7 @@ def test_rows_near_a_reversal_are_left_out_round_the_corner() -> None:
 
 
 def test_direction_begins_as_the_period_ends() -> None:
-    options = OPTIONS.model_copy(update={"friction": FrictionShape(presliding=(0.2, 0.05))})
+    options = OPTIONS.model_copy(update={"friction": plain_friction(presliding=(0.2, 0.05))})
     got = averaged(run(2 * LENGTH), options, PERIOD).motion
     rate = np.tile(periodic(np.arange(LENGTH) / RATE, 1), (6, 1))
     wanted = direction(rate, 1.0 / RATE, np.array([0.2, 0.05]))[-LENGTH:]

@@ -8,9 +8,10 @@ from functools import cache
 import numpy as np
 import pytest
 from estimation.synthetic import SampledRecording, one_joint_information, recorded, serial_chain, waves, with_options
+from helpers.plain import plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_delta
 
-from ident_service.config.schema import Identification, Reversal, Smoothing
+from ident_service.config.schema import Reversal
 from ident_service.estimation.equations import equations
 from ident_service.estimation.identify import identify
 from ident_service.estimation.least_squares import ordinary_least_squares, weighted_least_squares
@@ -23,7 +24,7 @@ from ident_service.model.regressor import joint_regressor
 
 @cache
 def three_links() -> tuple[ArmModel, BaseParameters, np.ndarray]:
-    options = Identification(smoothing=Smoothing(cutoff=30.0), reversal=Reversal(window=0.05))
+    options = plain_options(smoothing=plain_smoothing(cutoff=30.0), reversal=Reversal(window=0.05))
     model = with_options(model_around(serial_chain(31, 3)), options)
     return model, base_parameters(model.chain, model.layout), random_delta(np.random.default_rng(7), model.layout)
 
@@ -141,7 +142,7 @@ def test_gross_outliers_hardly_move_huber() -> None:
 def test_without_outliers_huber_is_weighted_least_squares_nearly() -> None:
     model, base, _ = three_links()
     recording = with_noise(0.0)
-    total = equations(recording, model, base).total
+    total = equations(recording, model, base).everything
     fit = weighted_least_squares(total)
     robust, gathered, _ = huber([recording], model, base, fit)
     assert np.all(np.abs(robust.beta - fit.beta) < 1.5 * fit.standard_deviations)

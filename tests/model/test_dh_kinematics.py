@@ -11,7 +11,7 @@ from helpers.random_arms import bodies_of, friction_torque, random_chain, random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ident_service.config.schema import DHTable
+from ident_service.config.kinematics import DHTable
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Chain, chain_from_dh, rotation_x, rotation_z

@@ -45,13 +45,19 @@ def regressors(blocks: int, samples: int, speed: float) -> tuple[np.ndarray, ...
 
 
 def blocks_of(
-    delta: np.ndarray, rng: np.random.Generator, blocks: int = 40, samples: int = 40, *, speed: float = 1.0
+    delta: np.ndarray,
+    rng: np.random.Generator,
+    blocks: int = 40,
+    samples: int = 40,
+    *,
+    speed: float = 1.0,
+    noise: np.ndarray = NOISE,
 ) -> Equations:
     """Equations at random states with white noise; `speed` 0 for states at rest."""
     joint_supports = supports(ARM.chain, ARM.layout, BASE.base)
     made: list[Information] = []
     for H in regressors(blocks, samples, speed):
-        torque = np.einsum("jps,p->sj", H, BASE.K @ delta) + NOISE * rng.normal(size=(samples, JOINTS))
+        torque = np.einsum("jps,p->sj", H, BASE.K @ delta) + noise * rng.normal(size=(samples, JOINTS))
         made.append(information_of(H, torque, np.ones(torque.shape, dtype=bool), joint_supports))
     return Equations(tuple(made), blocks * samples)
 

@@ -7,12 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.stats
-from payload.known_arms import ARM, BASE, DELTA, LAST, blocks_of, body, known, with_body
+from payload.known_arms import ARM, BASE, DELTA, LAST, NOISE, blocks_of, body, known, with_body
 
 from ident_service.errors import ParameterError
+from ident_service.estimation.doubt import verdicts
 from ident_service.estimation.feasible.blocks import symmetric
 from ident_service.estimation.feasible.feasible_set import feasible_set
-from ident_service.estimation.payload import KnownArm, Payload, center_of_mass, identify_payload, loaded_covariance
+from ident_service.estimation.payload import (
+    FAR,
+    KnownArm,
+    Payload,
+    center_of_mass,
+    identify_payload,
+    loaded_covariance,
+)
+from ident_service.results.payload_document import payload_text
 
 TOOL = body(1.3, (0.05, -0.02, 0.12))
 NAMES = ARM.layout.names[LAST]
@@ -111,6 +120,54 @@ def test_refitted_offsets_keep_a_new_zero_out_of_the_body() -> None:
     bare = DELTA.copy()
     bare[offsets] += [2.0, -1.0, 0.7, -0.4]
     assert identify_payload(arm, blocks_of(bare, rng), refit_offsets=True).verdict == "none"
+
+
+def test_no_payload_is_not_said_where_much_is_left_unexplained() -> None:
+    rng = np.random.default_rng(21)
+    arm = replace(known(rng), residual=NOISE)
+    quiet = identify_payload(arm, blocks_of(DELTA, rng))
+    assert (quiet.verdict, quiet.far()) == ("none", ())
+    assert quiet.excess == pytest.approx(1.0, abs=0.1)
+    # The same motion with noise on one joint 18 times as large, as from a brake that drags now and then.
+    loud = identify_payload(arm, blocks_of(DELTA, rng, noise=NOISE * [1.0, 18.0, 1.0, 1.0]))
+    assert identify_payload(replace(arm, residual=None), blocks_of(DELTA, rng, noise=18.0 * NOISE)).verdict == "none"
+    assert (loud.verdict, loud.far(), loud.body) == ("infeasible", (1,), None)
+    assert loud.excess is not None
+    assert loud.excess[1] == pytest.approx(18.0, rel=0.1)
+    text = payload_text(loud, arm)
+    assert "moves as it was identified" not in text
+    assert f"what is left is 18 times as large at joint {ARM.chain.names[1]} as when the arm was identified" in text
+
+
+def test_a_residual_that_does_not_matter_beside_the_torque_is_no_change() -> None:
+    rng = np.random.default_rng(22)
+    arm = replace(known(rng), residual=0.01 * NOISE)
+    payload = identify_payload(arm, blocks_of(DELTA, rng, noise=0.1 * NOISE))
+    assert payload.excess is not None
+    assert (payload.excess > FAR).all()
+    assert (payload.fitted.joint_relative_percent < 1.0).all()
+    assert payload.verdict == "none"
+
+
+def test_a_value_within_its_deviation_is_not_identified() -> None:
+    # A small tool on a slow motion: its moments of inertia are smaller than what is known of them.
+    rng = np.random.default_rng(23)
+    tool, share = body(0.1, (0.01, 0.0, 0.02), 0.02), 0.05
+    payload = identify_payload(
+        known(rng, scale=share), blocks_of(with_body(tool), rng, speed=0.35, noise=share * NOISE)
+    )
+    rows = zip(payload.base.expressions, payload.fit.beta, payload.standard_deviations, strict=True)
+    within = [k for k, (name, value, deviation) in enumerate(rows) if abs(value) < deviation and name[0] == "L"]
+    assert len(within) > 1
+    assert {payload.verdicts[k] for k in within} <= {"weak", "unidentified"}
+    # By the references of whole links they would be.
+    table = verdicts(payload.fit.beta, payload.standard_deviations, payload.base.units)
+    assert "identified" in {table[k] for k in within}
+    words = dict(zip(payload.base.expressions, payload.verdicts, strict=True))
+    assert {words[name] for name in ("lx4", "ly4", "lz4", "m4")} == {"identified"}
+    # Where motion shows it well, what is as good as zero is identified.
+    fast = identify_payload(known(rng, scale=1e-3), blocks_of(with_body(tool), rng, noise=1e-3 * NOISE))
+    assert set(fast.verdicts) == {"identified"}
 
 
 def test_at_rest_nobody_sees_an_inertia() -> None:

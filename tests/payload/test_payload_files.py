@@ -15,6 +15,9 @@ from compare.conftest import Ident
 from helpers.changed_arms import COARSE, changed, identified_folder, recorded_arm
 
 from ident_service.certificate_verifier import verify
+from ident_service.record.cycle import Cycle
+from ident_service.record.mcap_file import McapRecording
+from ident_service.record.writer import RecordingWriter
 from ident_service.results.run_folder import read_results
 from ident_service.service.verify import verify_file
 
@@ -95,6 +98,34 @@ def test_the_arm_with_its_tool_is_a_folder_like_any_other(arms: Path, ident: Ide
     assert text.startswith("REMOVED")
     names = list(pin.buildModelFromUrdf(str(out / "identified.urdf")).names)[1:]
     assert names == list(loaded.config.joints)
+
+
+def test_a_recording_that_ended_in_a_fault_is_refused(arms: Path, ident: Ident, tmp_path: Path) -> None:
+    faulty = tmp_path / "fault.mcap"
+    with_event(arms / "tooled.mcap", faulty, 20.0, 40, "following_error: j1 lags by 0.3 rad")
+    out = tmp_path / "out"
+    code, _, err = ident("payload", arms / "bare", faulty, "--out", out)
+    assert code == 1
+    assert "fault.mcap: ended in a fault 20 s after its first sample: following_error: j1 lags by 0.3 rad" in err
+    assert "give a part before: fault.mcap@0:SECONDS" in err
+    assert not out.exists()
+    code, text, _ = ident("payload", arms / "bare", f"{faulty}@0:19", "--out", out)
+    assert (code, text[:6]) == (0, "ADDED:")
+    # A warning is no fault.
+    with_event(arms / "tooled.mcap", tmp_path / "warned.mcap", 20.0, 30, "late_cycle: 2 ms")
+    assert ident("payload", arms / "bare", tmp_path / "warned.mcap", "--out", tmp_path / "warned")[0] == 0
+
+
+def with_event(recording: Path, copy: Path, seconds: float, level: int, message: str) -> None:
+    """Write a recording again with a line of its story."""
+    source = McapRecording(recording)
+    (block,) = source.blocks(1 << 30)
+    with RecordingWriter(copy, source.joint_names, "<robot/>", 0) as writer:
+        for k in range(len(block.stamp_ns)):
+            q, tau = block.position[k], block.torque[k]
+            whole, none = np.ones(len(q), bool), np.zeros(len(q), int)
+            writer.sample(Cycle(int(block.stamp_ns[k]), q, None, tau, q, q, k, 0, 0, whole, none, 0))
+        writer.event(int(block.stamp_ns[0]) + int(seconds * 1e9), level, message)
 
 
 def test_nothing_on_the_arm_is_said_to_be_nothing(arms: Path, ident: Ident, tmp_path: Path) -> None:

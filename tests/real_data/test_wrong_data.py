@@ -15,6 +15,7 @@ import yaml
 
 from benchmarks.real_data import CASES, DATA
 from ident_service.cli import main
+from ident_service.config.kinematics import Kinematics
 from ident_service.config.load import load_arm
 from ident_service.config.quantities import TextFile
 from ident_service.config.schema import ArmConfig, Identification
@@ -23,7 +24,8 @@ from ident_service.estimation.identify import identify
 from ident_service.model.arm_model import arm_model
 from ident_service.record.open import open_recording
 from ident_service.record.recording import Block, Recording
-from ident_service.service.identification import recording_quality, unusable_because
+from ident_service.service.identification import unusable_because
+from ident_service.service.recordings import recording_quality
 
 pytestmark = [pytest.mark.usefixtures("shared")]
 
@@ -103,7 +105,7 @@ def spike(position: np.ndarray, torque: np.ndarray) -> None:
     [
         (degrees, "lwr_0_joint is recorded from -56.73 to 56.73 rad, .* degrees"),
         (swapped, "lwr_1_joint is recorded from -38.05"),
-        (two_joints, "its torque error is 6. % where joints move on recording_2"),
+        (two_joints, "its torque error is 8. % where joints move on recording_2"),
         (negated, "the torque, or the position, may have the wrong sign at lwr_0_joint"),
         (one_negated, "the torque, or the position, may have the wrong sign at lwr_5_joint"),
         (thousandfold, "the torque of lwr_1_joint reaches 3.936e.04, 224 times its limit of 176"),
@@ -127,6 +129,23 @@ def test_a_spike_and_wrong_units_of_an_arm_without_limits() -> None:
 def test_gravity_upside_down() -> None:
     (reason,) = judged(nothing, kuka(gravity=(0.0, 0.0, 9.81)))
     assert "without the conditions of a real body: gravity, signs, order or units" in reason
+
+
+# The KUKA in Craig's convention: a, alpha and d of each row are those before the joint.
+CRAIG = ((0.0, 0.3105), ("pi/2", 0.0), ("-pi/2", 0.4), ("-pi/2", 0.0), ("pi/2", 0.39), ("pi/2", 0.0), ("-pi/2", 0.0))
+
+
+@pytest.mark.parametrize("convention", ["modified", "standard"])
+def test_standard_for_modified_dh(convention: str) -> None:
+    rows = {f"lwr_{k}_joint": {"alpha": alpha, "d": d} for k, (alpha, d) in enumerate(CRAIG)}
+    kinematics = Kinematics.model_validate({"dh": {"convention": convention, "joints": rows}})
+    reasons = judged(nothing, kuka(kinematics=kinematics))
+    if convention == "modified":
+        assert reasons == ()
+    else:
+        reason = reasons[0]
+        assert re.match(r"its torque error is [3-9]\d % where joints move on recording_2", reason)
+        assert "DH convention" in reason
 
 
 def test_sound_recordings_are_not_objected_to() -> None:

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from estimation.synthetic import SampledRecording, exact_torque, serial_chain, stamps, waves, with_options
+from helpers.plain import plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_delta
 
-from ident_service.config.schema import ArmConfig, Identification, Smoothing
+from ident_service.config.schema import ArmConfig, Identification
 from ident_service.estimation.feasible.feasible_set import SetName
 from ident_service.estimation.identify import Estimate, identify
 from ident_service.model.arm_model import ArmModel
@@ -20,7 +21,7 @@ from ident_service.results.report_files import read_evidence_of, write_report
 from ident_service.results.run_folder import read_results, write_manifest, write_results
 
 RATE = 250.0
-OPTIONS = Identification(smoothing=Smoothing(cutoff=40.0))
+OPTIONS = plain_options(smoothing=plain_smoothing(cutoff=40.0))
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from estimation.synthetic import SampledRecording, stamps, waves, with_options
+from helpers.plain import plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_chain, random_delta
 from report.conftest import Made, made, recording
 from report.pages import sections
 
-from ident_service.config.schema import Identification, Smoothing
+from ident_service.config.schema import Identification
 from ident_service.estimation.identify import identify
 from ident_service.model.regressor import joint_regressor
 from ident_service.results.evidence.making import gather_evidence
@@ -24,11 +25,11 @@ from ident_service.results.run_folder import write_results
 @pytest.mark.parametrize(
     "options",
     [
-        Identification(smoothing=Smoothing(cutoff=40.0, regressor_cutoff=20.0)),
-        Identification(smoothing=Smoothing(cutoff=40.0, decimate=10, filter_torque=True)),
-        Identification(smoothing=Smoothing(method="savitzky_golay", cutoff=40.0)),
-        Identification(smoothing=Smoothing(cutoff=40.0), method="huber"),
-        Identification(smoothing=Smoothing(cutoff=40.0), method="wls"),
+        plain_options(smoothing=plain_smoothing(cutoff=40.0, regressor_cutoff=20.0)),
+        plain_options(smoothing=plain_smoothing(cutoff=40.0, decimate=10, filter_torque=True)),
+        plain_options(smoothing=plain_smoothing(method="savitzky_golay", cutoff=40.0)),
+        plain_options(smoothing=plain_smoothing(cutoff=40.0), method="huber"),
+        plain_options(smoothing=plain_smoothing(cutoff=40.0), method="wls"),
     ],
     ids=["filtered_regressor", "decimated", "savitzky_golay", "huber", "wls"],
 )
@@ -89,7 +90,7 @@ def test_friction_of_coupled_drives_is_shown_per_drive(tmp_path: Path) -> None:
 def test_any_arm_has_a_report(tmp_path: Path, seed: int) -> None:
     # From one joint to four, in branches, some that slide.
     chain = random_chain(np.random.default_rng(seed), seed + 1)
-    arm = with_options(model_around(chain), Identification(smoothing=Smoothing(cutoff=40.0)))
+    arm = with_options(model_around(chain), plain_options(smoothing=plain_smoothing(cutoff=40.0)))
     fitted = recording(tmp_path, arm, random_delta(np.random.default_rng(seed), arm.layout), 1, 0.01)
     estimate = identify(arm, [fitted])
     folder = tmp_path / "results"

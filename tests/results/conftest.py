@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from estimation.synthetic import SampledRecording, serial_chain, stamps, waves, with_options
+from helpers.plain import plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_delta
 
-from ident_service.config.schema import Identification, Smoothing
 from ident_service.estimation.feasible.feasible_set import SetName
 from ident_service.estimation.identify import Estimate, identify
 from ident_service.model.arm_model import ArmModel
@@ -25,7 +25,9 @@ def sampled(arm: ArmModel, delta: np.ndarray, seed: int, sha256: str) -> Sampled
 
 def estimate_of(delta_seed: int, *, real: bool, set_name: SetName | None = None) -> Estimate:
     """Identify a two-link arm from exact recordings; an unreal one has its last link turned inside out."""
-    arm: ArmModel = with_options(model_around(serial_chain(21, 2)), Identification(smoothing=Smoothing(cutoff=40.0)))
+    arm: ArmModel = with_options(
+        model_around(serial_chain(21, 2)), plain_options(smoothing=plain_smoothing(cutoff=40.0))
+    )
     delta = random_delta(np.random.default_rng(delta_seed), arm.layout)
     if not real:
         last = arm.layout.inertial(1)

@@ -15,6 +15,7 @@ from helpers.tickets import write_checked_ticket
 from runs.conftest import written
 
 from ident_service.cli import main
+from ident_service.cli.moving import _report_text
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.errors import UsageError
 from ident_service.estimation.doubt import REFERENCE, shares
@@ -26,6 +27,7 @@ from ident_service.model.base import base_parameters
 from ident_service.record.mcap_file import McapRecording
 from ident_service.record.open import open_recording
 from ident_service.service.reaching import Reaching, least_seconds, require_target
+from ident_service.service.target_process import missed as not_known
 
 PERIOD = 10.0  # s, of the shipped planar arm's motion
 SHARE = 0.06
@@ -60,6 +62,7 @@ def test_a_run_ends_early_with_what_it_is_for(
     assert (report["state"], report["finished"]) == ("done", "early")
     reached = report["until"]["reached"]
     assert 0.0 < reached["share"] <= SHARE
+    assert report["until"]["missed"] == []
     assert PERIOD <= reached["seconds"] <= report["motion_seconds"] < 240.0 * PERIOD
     ended = json.loads((tmp_path / "run" / "ended.json").read_text())
     assert (ended["state"], ended["finished"]) == ("done", "early")
@@ -83,7 +86,18 @@ def test_a_target_that_is_not_reached_lets_the_run_go_on_to_its_end(
 ) -> None:
     report = ran(virtual_arm, tmp_path, capsys, "--until", "0.0001", "--parameter", "fv1")["report"]
     assert (report["state"], report.get("finished")) == ("done", None)
+    ((missed),) = report["until"].pop("missed")
     assert report["until"] == {"share": 0.0001, "parameters": ["fv1"], "reached": None}
+    assert missed["parameter"] == "fv1"
+    assert 0.0001 < missed["share"] < 1.0
+    # Of all parameters of the same recording, those that are known as well as asked are left out, the worst come first.
+    every = [one["share"] for one in not_known(tmp_path / "run", Target(1e-6))]
+    some = not_known(tmp_path / "run", Target(float(np.median(every))))
+    assert [one["share"] for one in some] == [share for share in every if share > np.median(every)]
+    assert every == sorted(every, reverse=True)
+    text = _report_text(report | {"until": {**report["until"], "missed": [missed, {"parameter": "m2", "share": None}]}})
+    assert "target of 0.01%: missed by 2 parameters" in text
+    assert f"\n  fv1: known to {missed['share']:.2%}\n  m2: not seen\n" in text
     assert report["cycles"] > 2_500  # ten seconds of motion at 250 Hz
 
 

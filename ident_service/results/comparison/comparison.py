@@ -181,12 +181,17 @@ def _others(side: Side, other: Side) -> tuple[str, ...]:
     return tuple(expression for expression, key in zip(expressions, side.keys, strict=True) if key not in other.keys)
 
 
+# Pre-sliding distances [rad or m] that differ by less change Coulomb friction over a motion by a thousandth; a Stribeck
+# velocity changes what the other friction terms mean.
+_SAME_SHAPE = {"presliding": 5e-4, "stribeck_velocity": 0.0}
+
+
 def _other_shape(reference: Side, side: Side) -> tuple[int, ...]:
     found: set[int] = set()
     for key, symbol in (("presliding", "fc"), ("stribeck_velocity", "fs")):
         here, there = (one.content.get("friction", {}).get(key, []) for one in (reference, side))
         for joint, (a, b) in enumerate(zip(here, there, strict=False), 1):
-            if a != b and f"{symbol}{joint}" in reference.leading:
+            if abs(a - b) > _SAME_SHAPE[key] and f"{symbol}{joint}" in reference.leading:
                 found.add(joint)
     return tuple(sorted(found))
 

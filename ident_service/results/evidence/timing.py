@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident_service.record.cycles import Cycles, read_cycles
+from ident_service.record.part import RangeRecording
 from ident_service.record.recording import Recording
 from ident_service.results.evidence.evidence import Array, Timing
 
@@ -32,7 +33,8 @@ def timing(recording: Recording) -> Timing:
     longer = np.flatnonzero(steps > _GAP * usual)
     order = longer[np.argsort(-steps[longer], kind="stable")][:_GAPS]
     gaps = tuple(((int(stamps[k]) - int(stamps[0])) * 1e-9, int(steps[k]) * 1e-9) for k in order)
-    parts = list(read_cycles(path))
+    # The loop's account is of a whole run.
+    parts = [] if isinstance(recording, RangeRecording) else list(read_cycles(path))
     if parts:
         return _of_cycles(path.name, parts, 1e9 / usual, gaps, len(longer))
     off = np.abs(steps[steps <= _GAP * usual] - usual) * 1e-9

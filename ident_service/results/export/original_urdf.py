@@ -2,12 +2,13 @@
 
 A movable link and what is bolted to it by fixed joints are one body, and only the whole of it is identified. Where the
 movable link with the identified body less the bolted ones is a real body, these keep their inertias; elsewhere the
-movable link takes all of it, and the bolted ones go without, as links of a URDF may.
+movable link takes all of it, and the bolted ones go without, as links of a URDF may. Joints that the arm's description
+locks, or leaves out, stay in the file as they are; what hangs on them counts as bolted on, where they are held.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,13 +49,15 @@ def original_urdf(model: ArmModel, delta: Array, has: Carried) -> tuple[str, tup
     Raises:
         ModelError: a link without positive mass, or a file that cannot be edited.
     """
+    from ident_service.model.mechanism import read_mechanism
     from ident_service.model.mechanism_process import delta_from_inertia
     from ident_service.model.rigid_body import joint_frame_inertias
 
     file = model.config.kinematics.urdf
     if file is None:
         raise ModelError(f"{model.config.name}: is not described by a URDF")
-    robot = _Robot(xml_places(file.text, file.name), file.name)
+    held = read_mechanism(file, "urdf", model.config.kinematics).held
+    robot = _Robot(xml_places(file.text, file.name), file.name, held)
     edits: list[Edit] = []
     notes: list[str] = []
     drives = joint_drives(model.chain, model.layout, delta)
@@ -72,6 +75,8 @@ def original_urdf(model: ArmModel, delta: Array, has: Carried) -> tuple[str, tup
             whole = rest
         elif bolted:
             notes.append(f"link {link} has the whole identified body; what is bolted to it has no inertia now: {names}")
+            if movable := [name for name, _ in bolted if name in robot.on_held_joints]:
+                notes.append(f"of these, {', '.join(movable)} hang on joints that move, which some programs refuse")
             edits += [_removed(robot.links[name], file.name) for name, _ in bolted]
         edits += _inertial(file.text, robot.links[link], whole)
         written = {
@@ -85,7 +90,7 @@ def original_urdf(model: ArmModel, delta: Array, has: Carried) -> tuple[str, tup
 
 @dataclass(frozen=True)
 class _Bolt:
-    """A fixed joint: the link it carries, and where."""
+    """A fixed joint, or one that is held still: the link it carries, and where."""
 
     child: str
     rotation: Array
@@ -95,14 +100,22 @@ class _Bolt:
 class _Robot:
     """Links and joints of a URDF by name, and which links are bolted to which."""
 
-    def __init__(self, root: Element, name: str) -> None:
+    def __init__(self, root: Element, name: str, held: Mapping[str, float]) -> None:
         self._name = name
+        self.on_held_joints: set[str] = set()
         self.links = {link.attributes.get("name", ""): link for link in root.all("link")}
         self.joints = {joint.attributes.get("name", ""): joint for joint in root.all("joint")}
         self._bolts: dict[str, list[_Bolt]] = {}
         for joint in root.all("joint"):
-            if joint.attributes.get("type") == "fixed":
-                bolt = _Bolt(_named(joint, "child", name), *_origin(joint.first("origin"), name))
+            position = held.get(joint.attributes.get("name", ""))
+            if joint.attributes.get("type") == "fixed" or position is not None:
+                rotation, translation = _origin(joint.first("origin"), name)
+                child = _named(joint, "child", name)
+                if position is not None:
+                    turn, slide = _moved_by(joint, position, name)
+                    rotation, translation = rotation @ turn, translation + rotation @ slide
+                    self.on_held_joints.add(child)
+                bolt = _Bolt(child, rotation, translation)
                 self._bolts.setdefault(_named(joint, "parent", name), []).append(bolt)
 
     def bolted_to(self, link: str) -> Iterator[tuple[str, Array | None]]:
@@ -132,6 +145,17 @@ def _origin(element: Element | None, name: str) -> tuple[Array, Array]:
     attributes = {} if element is None else element.attributes
     roll, pitch, yaw = _numbers(attributes.get("rpy", "0 0 0"), name)
     return rotation_rpy(roll, pitch, yaw), _numbers(attributes.get("xyz", "0 0 0"), name)
+
+
+def _moved_by(joint: Element, position: float, name: str) -> tuple[Array, Array]:
+    """Return rotation, shape (3, 3), and translation [m], shape (3,), of a joint at a position [rad or m]."""
+    element = joint.first("axis")
+    axis = _numbers("1 0 0" if element is None else element.attributes.get("xyz", "1 0 0"), name)
+    axis = axis / np.linalg.norm(axis)
+    if joint.attributes.get("type") == "prismatic":
+        return np.eye(3), position * axis
+    cross = np.cross(np.eye(3), axis)
+    return np.eye(3) + np.sin(position) * cross + (1.0 - np.cos(position)) * cross @ cross, np.zeros(3)
 
 
 def _ten(link: Element, name: str) -> Array | None:

@@ -50,14 +50,15 @@ def urdf_export(
 
     has = carried(model, delta, _TERMS)
     notes: tuple[str, ...] = ()
-    if model.config.kinematics.urdf is not None:
+    own = model.config.kinematics if model.config.kinematics.urdf is not None else None
+    if own is not None:
         text, notes = original_urdf(model, delta, has)
     else:
         text = urdf_text(model, delta)
     gravity = "gravity" if model.chain.gravity.any() else ""
     unwritten = left_out(model, delta, has)
     text = _commented(text, (*presliding_left_out(model, delta), *said))
-    written = read_back(TextFile(name=name, text=text), "urdf", gravity_of(model))
+    written = read_back(TextFile(name=name, text=text), "urdf", gravity_of(model), own)
     require_same_torques(model, delta, written, has, name)
     return text, tuple(filter(None, (gravity, *unwritten))), notes
 

@@ -158,6 +158,8 @@ def _parameters(evidence: Evidence, parameters: ParameterFile) -> Iterable[str]:
 def _torque(evidence: Evidence, parameters: ParameterFile, drawn: Figures) -> Iterable[str]:
     yield error_table(evidence)
     yield joint_table(evidence, parameters)
+    if said := parameters.content.get("fit", {}).get("rows_and_filter"):
+        yield items(said)
     for one, made in zip(evidence.recordings, drawn.torque, strict=True):
         role = "fitted to" if one.role == "identification" else "never seen by the fit"
         yield f"<h3>{plain(one.name)}, {role}</h3>{_grid(made, '')}"

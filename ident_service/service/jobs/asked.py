@@ -13,6 +13,7 @@ Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,119}$")]
 ArmName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,119}$")]
 Speed = Annotated[float, Field(gt=0, le=1)]
+Second = Annotated[float, Field(ge=0, le=1e9)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 FeasibleSet = Literal["pseudo_inertia", "inertia", "none"]
 
@@ -24,10 +25,12 @@ class Ask(BaseModel):
 
 
 class RecordingOf(Ask):
-    """A recording, by the run that it is of and its name in the manifest."""
+    """A recording, by the run that it is of and its name in the manifest; whole, or from `start` to `end` [s]."""
 
     run: Id
     name: FileName = "run.mcap"
+    start: Second | None = None
+    end: Second | None = None
 
 
 class Design(Ask):

@@ -222,7 +222,14 @@ def _judgement(db: Database, state: Path, asked: Judge) -> Command:
 
 
 def _recordings(db: Database, state: Path, asked: Sequence[RecordingOf]) -> list[str]:
-    return [str(run_file(db, state, one.run, one.name)) for one in asked]
+    return [f"{run_file(db, state, one.run, one.name)}{range_words(one)}" for one in asked]
+
+
+def range_words(one: RecordingOf) -> str:
+    """Write a recording's range as the command line has it; nothing for a whole one."""
+    if one.start is None and one.end is None:
+        return ""
+    return "@" + ":".join("" if seconds is None else f"{seconds:.9f}" for seconds in (one.start, one.end))
 
 
 def _given(options: Mapping[str, object]) -> list[str]:

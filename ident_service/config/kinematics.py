@@ -1,0 +1,71 @@
+"""The mechanism of an arm: a DH table, or a URDF or MJCF file and which part of it is the arm (decision 0054)."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+
+from ident_service.config.quantities import Angle, Number, Section, TextBeside
+
+_LARGEST_ANGLE = 6.3  # rad
+_LONGEST_LINK = 20.0  # m; the largest arms that move torque-controlled joints are a tenth of it
+
+
+class DHRow(Section):
+    """One row of a Denavit-Hartenberg table (table 2); the joint variable adds to theta or, if prismatic, to d."""
+
+    type: Literal["revolute", "prismatic"] = "revolute"
+    theta: Angle = 0.0
+    d: Number = 0.0
+    a: Number = 0.0
+    alpha: Angle = 0.0
+
+    @model_validator(mode="after")
+    def _of_an_arm(self) -> DHRow:
+        for name, angle in (("theta", self.theta), ("alpha", self.alpha)):
+            if abs(angle) > _LARGEST_ANGLE:
+                raise ValueError(
+                    f"{name}: {angle:g} rad is more than a turn; numbers are rad, degrees are written '{angle:g} deg'"
+                )
+        for name, length in (("d", self.d), ("a", self.a)):
+            if abs(length) > _LONGEST_LINK:
+                raise ValueError(f"{name}: {length:g} m is longer than the link of any arm; in mm? lengths are metres")
+        return self
+
+
+class DHTable(Section):
+    """A serial chain, standard (distal frames, `Rz(theta) Tz(d) Tx(a) Rx(alpha)`) or modified (Craig) convention."""
+
+    convention: Literal["standard", "modified"]
+    joints: Annotated[dict[str, DHRow], Field(min_length=1)]
+
+
+class Kinematics(Section):
+    """Exactly one description of the mechanism, and which part of it is the arm.
+
+    Of a URDF or MJCF file, the arm is what moves between the links `base` and `tip`, its world the frame of `base`. The
+    joints of `lock` are held at a position [rad or m], all others outside at zero; what hangs on them is part of the
+    link before them.
+    """
+
+    dh: DHTable | None = None
+    urdf: TextBeside | None = None
+    mjcf: TextBeside | None = None
+    base: Annotated[str, Field(min_length=1)] | None = None
+    tip: Annotated[str, Field(min_length=1)] | None = None
+    lock: dict[str, Angle] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _one(self) -> Kinematics:
+        if sum(source is not None for source in (self.dh, self.urdf, self.mjcf)) != 1:
+            raise ValueError("give exactly one of dh, urdf, mjcf")
+        if self.dh is not None and (self.base or self.tip or self.lock):
+            raise ValueError("base, tip and lock are of urdf and mjcf; a DH table lists the joints that move")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _unless_whole(self, serialized: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # Descriptions without these keys keep the hashes that results and tickets have named them by.
+        document: dict[str, Any] = serialized(self)
+        return {key: value for key, value in document.items() if key not in ("base", "tip", "lock") or value}

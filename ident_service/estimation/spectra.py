@@ -1,0 +1,143 @@
+"""Choose the cut-off of the smoothing filter, and the rate after it, from the spectra of the recorded positions.
+
+A filter has to pass the motion and to stop the noise, which two differentiations raise with the fourth power of the
+frequency. So the cut-off is a few times the frequency that the motion's velocity ends at, but not beyond the one below
+which the noise is a few percent of the acceleration: noise in the regressor biases least squares.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident_service.config.recording import RecordingFormat
+from ident_service.config.schema import Identification
+from ident_service.model.arm_model import ArmModel
+from ident_service.record.grid import grid
+from ident_service.record.recording import Recording
+from ident_service.record.segments import uniform
+
+Array = NDArray[np.float64]
+USUAL = 8.0  # Hz; lower, and filtered friction would not turn round where the velocity does
+_MARGIN = 5.0  # of the motion's own bandwidth
+_LEAST_MARGIN = 2.0  # of it, however noisy the positions are
+_MOVING = 0.99  # of the velocity's energy is motion
+_ABOVE_NOISE = 3.0  # power that is no noise, of the noise's
+_NOISE = 1e-3  # of the acceleration's power; 3 % of its size
+_HIGHEST = 0.2  # of the sampling rate; above half of it there is nothing
+_KEPT = 10.0  # samples a period of the cut-off
+_EDGE = 2.0  # periods of the cut-off at the ends, where the filter has one side to look at
+_WINDOW_S = 20.0
+_SAMPLES = 16384
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """What the spectra of a recording's positions say.
+
+    Attributes:
+        rate: of the samples [Hz].
+        motion: frequency below which the fastest joint's motion lies [Hz].
+        noise: frequency below which noise is a few percent of most joints' accelerations [Hz].
+    """
+
+    rate: float
+    motion: float
+    noise: float
+
+    @property
+    def cutoff(self) -> float:
+        """Cut-off [Hz] of a filter that passes the motion and stops the noise."""
+        wanted = max(_MARGIN * self.motion, USUAL)
+        return min(wanted, max(self.noise, _LEAST_MARGIN * self.motion), _HIGHEST * self.rate)
+
+
+def with_filter(
+    recordings: Sequence[Recording], options: Identification, fmt: RecordingFormat | None = None
+) -> Identification:
+    """Put numbers where the filter is left to be chosen; the cut-off is the largest that a recording asks for.
+
+    Args:
+        recordings: read once where there is something to choose.
+        options: how to smooth.
+        fmt: what to trim, what a gap is, and the rate; the defaults when None.
+
+    Raises:
+        RecordingError: a recording cannot be read.
+    """
+    smoothing, fmt = options.smoothing, fmt or RecordingFormat()
+    if "choose" not in (smoothing.cutoff, smoothing.decimate, options.edge):
+        return options
+    if smoothing.cutoff == "choose":
+        seen = [spectrum(recording, fmt) for recording in recordings]
+        cutoff, rate = float(f"{max(one.cutoff for one in seen):.2g}"), min(one.rate for one in seen)
+    else:
+        cutoff, rate = smoothing.cutoff, min(1.0 / grid(recording, fmt).period_s for recording in recordings)
+    keep = smoothing.decimate if smoothing.decimate != "choose" else max(1, int(rate / (_KEPT * cutoff)))
+    chosen = smoothing.model_copy(update={"cutoff": cutoff, "decimate": keep})
+    edge = options.edge if options.edge != "choose" else _EDGE / min(cutoff, smoothing.regressor_cutoff or cutoff)
+    return options.model_copy(update={"smoothing": chosen, "edge": edge})
+
+
+def settled(model: ArmModel, recordings: Sequence[Recording]) -> ArmModel:
+    """Give the arm with numbers where its filter is left to be chosen.
+
+    Raises:
+        RecordingError: a recording cannot be read.
+    """
+    options = with_filter(recordings, model.config.identification, model.config.recording)
+    return replace(model, config=model.config.model_copy(update={"identification": options}))
+
+
+def spectrum(recording: Recording, fmt: RecordingFormat) -> Spectrum:
+    """Look at the spectra of a recording's positions, in windows of about 20 s.
+
+    Raises:
+        RecordingError: it cannot be read.
+    """
+    stamps = grid(recording, fmt)
+    period = stamps.period_s
+    length = min(int(_WINDOW_S / period), _SAMPLES, stamps.samples)
+    power, windows = np.zeros((0, recording.joints)), 0
+    waiting = np.zeros((0, recording.joints))
+    for piece in uniform(recording, fmt, stamps, samples=_SAMPLES):
+        waiting = np.concatenate([waiting, piece.block.position])
+        while len(waiting) >= length > 3:
+            rates = np.diff(waiting[:length], axis=0) * np.hanning(length - 1)[:, None]
+            found = np.abs(np.fft.rfft(rates, axis=0)) ** 2
+            power = found if windows == 0 else power + found
+            windows += 1
+            waiting = waiting[length // 2 :]
+        if piece.end:
+            waiting = waiting[:0]
+    if windows == 0:
+        return Spectrum(1.0 / period, 0.0, 0.5 / period)  # what follows says that it is too short
+    frequency = np.fft.rfftfreq(length - 1, period)[1:]
+    ends = [_ends(joint, frequency, period) for joint in (power[1:] / windows).T if joint.any()]
+    if not ends:
+        return Spectrum(1.0 / period, 0.0, 0.5 / period)
+    motion, noise = np.array(ends).T
+    return Spectrum(1.0 / period, float(motion.max()), float(np.median(noise)))
+
+
+def _ends(power: Array, frequency: Array, period: float) -> tuple[float, float]:
+    """Give the frequencies [Hz] that a joint's motion ends at and its noise matters from; `power` is of its rates."""
+    # A difference multiplies power by this.
+    difference = (2.0 * np.sin(np.pi * frequency * period)) ** 2
+    positions = power / difference
+    high = (frequency > 0.25 / period) & (frequency < 0.475 / period)
+    # The mean of an exponential distribution from its median.
+    floor = np.median(positions[high]) / np.log(2.0) if high.any() else 0.0
+    width = max(1, round(1.0 / frequency[0]))  # 1 Hz
+    smooth = np.convolve(positions, np.full(width, 1.0 / width), "same")
+    below = np.flatnonzero(smooth <= _ABOVE_NOISE * floor)
+    last = max(int(below[0]), 1) if len(below) else len(frequency)
+    share = np.cumsum(power[:last]) / max(float(np.sum(power[:last])), np.finfo(float).tiny)
+    noise = np.cumsum(floor * difference**2)
+    motion = float(np.sum(np.maximum(power - floor * difference, 0.0)[:last] * difference[:last]))
+    loud = np.flatnonzero(noise > _NOISE * motion)
+    matters = frequency[int(loud[0])] if len(loud) else frequency[-1]
+    return float(frequency[np.argmax(share >= _MOVING)]), float(matters)

@@ -1,0 +1,170 @@
+"""The part of a mechanism that is the arm: from a base to a tip, with the other joints and the locked ones held still.
+
+A joint that is held still is a fixed joint at its value, and its link's inertia merges into the link before it
+(pinocchio's `buildReducedModel`). Joints outside base and tip are held at zero, or at the limit nearest to zero, unless
+`lock` names a value; a joint that mimics one that is held still follows it. What moves with a joint of the arm but is
+not held cannot be represented, and is refused.
+"""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import pinocchio as pin
+
+from ident_service.errors import ModelError
+
+if TYPE_CHECKING:  # the process that reads an MJCF loads no configuration
+    from ident_service.config.quantities import TextFile
+
+_OUTSIDE = 1e-6  # rad or m; what a value may be beyond a limit by rounding
+
+
+@dataclass(frozen=True)
+class Part:
+    """Which part of a mechanism is the arm: `base`, `tip` and `lock` of `config.kinematics.Kinematics`."""
+
+    base: str | None = None
+    tip: str | None = None
+    lock: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Mimic:
+    """A URDF joint's `<mimic>`: its position is `multiplier` times that of `joint`, plus `offset` [rad or m]."""
+
+    joint: str
+    multiplier: float
+    offset: float
+
+
+def mimics(file: TextFile) -> dict[str, Mimic]:
+    """Read the `<mimic>` elements of a URDF that pinocchio has accepted, by the name of their joint.
+
+    Raises:
+        ModelError: XML that pinocchio's lenient reader accepts and a strict one does not.
+    """
+    found: dict[str, Mimic] = {}
+    if "mimic" not in file.text:
+        return found
+    try:
+        robot = ET.fromstring(file.text)  # noqa: S314 - entities were refused before
+    except ET.ParseError as error:
+        raise ModelError(f"not well-formed XML: {error}") from None
+    # Numbers were checked by pinocchio's reader.
+    for joint in robot.findall("joint"):
+        if (mimic := joint.find("mimic")) is not None:
+            scale, offset = float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0"))
+            found[joint.get("name", "")] = Mimic(mimic.get("joint", ""), scale, offset)
+    return found
+
+
+def arm_part(
+    model: pin.Model, part: Part, followers: Mapping[str, Mimic], file: str
+) -> tuple[pin.Model, dict[str, float]]:
+    """Reduce a mechanism to the arm.
+
+    Args:
+        model: of the whole mechanism, mimicking joints as joints of their own.
+        part: `base` and `tip`, names of links, and `lock`, positions of joints [rad or m].
+        followers: joints that mimic others.
+        file: its name, for errors.
+
+    Returns:
+        The model of the arm, its world at the frame of `base` where that is named, and the positions at which all
+        other joints are held [rad or m].
+
+    Raises:
+        ModelError: a link or joint that does not exist, a value outside a joint's limits, a tip that does not hang on
+            the base, or a joint that follows one of the arm.
+    """
+    inside = _between(model, part, file)
+    held = {name: _checked(model, name, value, file) for name, value in part.lock.items()}
+    outside = {str(name) for name in model.names[1:]} - inside - set(held)
+    held |= {name: _rest(model, name) for name in outside if name not in followers}
+    waiting = {name: one for name, one in followers.items() if name not in held}
+    while ready := [name for name, one in waiting.items() if one.joint in held]:
+        for name in ready:
+            follower = waiting.pop(name)
+            held[name] = follower.multiplier * held[follower.joint] + follower.offset
+    for name, follower in waiting.items():
+        raise ModelError(
+            f"{file}: joint {name!r} mimics {follower.joint!r}, which moves with the arm; lock it at a value, as"
+            f" kinematics.lock: {{{name}: 0}}, or name base and tip so that {follower.joint!r} is not between them"
+        )
+    positions = pin.neutral(model)
+    for name, value in held.items():
+        joint = model.joints[model.getJointId(name)]
+        if joint.nv == 1:
+            positions[joint.idx_q : joint.idx_q + joint.nq] = (
+                [value] if joint.nq == 1 else [math.cos(value), math.sin(value)]
+            )
+    if held:
+        model = pin.buildReducedModel(model, sorted(model.getJointId(name) for name in held), positions)
+    if part.base is not None:
+        _rebase(model, part.base)
+    return model, held
+
+
+def _between(model: pin.Model, part: Part, file: str) -> set[str]:
+    """Find the joints that are neither on the way to the base nor off the way to the tip."""
+    ids = set(range(1, model.njoints))
+    if part.base is not None:
+        base = _joint_of(model, part.base, "base", file)
+        ids = {k for k in ids if k != base and base in model.supports[k]}
+    if part.tip is not None:
+        tip = _joint_of(model, part.tip, "tip", file)
+        ids &= set(model.supports[tip])
+    if not ids and (part.base is not None or part.tip is not None):
+        raise ModelError(f"{file}: no movable joint from {part.base or 'the root'!r} to {part.tip or 'any tip'!r}")
+    return {str(model.names[k]) for k in ids}
+
+
+def _joint_of(model: pin.Model, link: str, role: str, file: str) -> int:
+    """Find the joint that moves a link; 0 is the world."""
+    if not model.existFrame(link, pin.FrameType.BODY):
+        known = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
+        raise ModelError(f"{file}: kinematics.{role}: no link {link!r}; it has {', '.join(known[:40])}")
+    return int(model.frames[model.getFrameId(link, pin.FrameType.BODY)].parentJoint)
+
+
+def _checked(model: pin.Model, name: str, value: float, file: str) -> float:
+    if not model.existJointName(name):
+        raise ModelError(
+            f"{file}: kinematics.lock: no movable joint {name!r}; it has {', '.join(list(model.names[1:])[:40])}"
+        )
+    joint = model.joints[model.getJointId(name)]
+    if joint.nv != 1:
+        raise ModelError(f"{file}: kinematics.lock: {name!r} is a {joint.shortname()}, which no one number holds")
+    if joint.nq == 1:
+        lower, upper = (float(limits[joint.idx_q]) for limits in (model.lowerPositionLimit, model.upperPositionLimit))
+        if not lower - _OUTSIDE <= value <= upper + _OUTSIDE:
+            raise ModelError(
+                f"{file}: kinematics.lock: {name} at {value:g} is outside its limits, {lower:g} to {upper:g}; positions"
+                " are rad or m, degrees are written '90 deg'"
+            )
+    return value
+
+
+def _rest(model: pin.Model, name: str) -> float:
+    """Return zero, or the limit nearest to it."""
+    joint = model.joints[model.getJointId(name)]
+    if joint.nq != 1:
+        return 0.0
+    lower, upper = (float(limits[joint.idx_q]) for limits in (model.lowerPositionLimit, model.upperPositionLimit))
+    return min(max(0.0, lower), upper) if lower <= upper else 0.0
+
+
+def _rebase(model: pin.Model, base: str) -> None:
+    """Let the model's world be the frame of a link that does not move."""
+    to_base = model.frames[model.getFrameId(base, pin.FrameType.BODY)].placement.inverse()
+    for k in range(1, model.njoints):
+        if model.parents[k] == 0:
+            model.jointPlacements[k] = to_base * model.jointPlacements[k]
+    for frame in model.frames:
+        if frame.parentJoint == 0:
+            frame.placement = to_base * frame.placement

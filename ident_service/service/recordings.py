@@ -1,0 +1,137 @@
+"""Recordings as a person names them: `FILE@START:END`, columns of their own, standstill at the ends left out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ident_service.config.load import load_recording_format
+from ident_service.config.recording import RecordingFormat, disagreements, units_of_other_joints
+from ident_service.errors import RecordingError, UsageError
+from ident_service.model.arm_model import ArmModel
+from ident_service.record.files import split_range
+from ident_service.record.kept import KeptRecording
+from ident_service.record.mcap_file import McapRecording
+from ident_service.record.mcap_records import MAGIC
+from ident_service.record.open import open_recording
+from ident_service.record.part import RangeRecording, first_stamp, time_range, without_standstill
+from ident_service.record.quality import Quality, quality
+from ident_service.record.recording import Recording
+
+# What of a format says how all recordings become samples, and not how one file is laid out.
+_STOPPING = 40  # level of the events that tell of a fault which stopped the arm (`motion/faults.py`)
+_OF_ALL = ("trim", "gap", "stamps", "rate")
+
+
+def file_and_range(path: Path) -> tuple[Path, tuple[float, float] | None]:
+    """Split `FILE@START:END`, seconds of the recording either of which may be left out, where no such file exists.
+
+    Raises:
+        UsageError: the range ends before it begins.
+    """
+    named, seconds = (str(path), None) if path.exists() else split_range(str(path))
+    return Path(named), seconds
+
+
+def open_for(path: Path, model: ArmModel, form: RecordingFormat | None = None) -> Recording:
+    """Open a recording, or a range of one, as it is to be read for an arm.
+
+    Args:
+        path: the file, or `FILE@START:END`.
+        model: the arm.
+        form: how this file is laid out; as the arm's description says when None.
+
+    Raises:
+        UsageError: no such file, or no such range.
+        RecordingError: it does not fit the arm, or nothing moves where standstill is to be left out.
+    """
+    file, seconds = file_and_range(path)
+    form, gears = form or model.config.recording, model.config.transmission
+    # Quality, friction, equations and evidence each read it.
+    recording: Recording = KeptRecording(open_recording(file, model.chain.names, fmt=form, transmission=gears))
+    if seconds is not None:
+        recording = RangeRecording(recording, *seconds, label=path.name.removeprefix(file.name))
+    if form.standstill == "cut":
+        # Rows near the ends are not used, for want of neighbours; standstill may well be those.
+        recording = without_standstill(recording, model.config.identification.edge)
+    return recording
+
+
+def own_formats(
+    columns: Mapping[Path, Path], recordings: Sequence[Path], model: ArmModel
+) -> dict[Path, RecordingFormat]:
+    """Read the columns files that are each for one recording.
+
+    Args:
+        columns: the columns file of each recording.
+        recordings: all that are read, as they were named.
+        model: the arm.
+
+    Returns:
+        The format of each recording that has its own, by the name it was given with.
+
+    Raises:
+        UsageError: no such recording, or a columns file with keys that are of all recordings, or not of this arm.
+        ConfigError: mistakes in a columns file.
+    """
+    found: dict[Path, RecordingFormat] = {}
+    for wanted, file in columns.items():
+        named = [path for path in recordings if wanted in (path, file_and_range(path)[0])]
+        if not named:
+            raise UsageError(f"--columns {wanted}={file}: {wanted} is none of the recordings")
+        form = load_recording_format(file)
+        if shared := [key for key in _OF_ALL if key in form.model_fields_set]:
+            raise UsageError(f"{file}: {', '.join(shared)} is of all recordings; say it in the arm's description")
+        general = model.config.recording
+        form = form.model_copy(update={key: getattr(general, key) for key in _OF_ALL})
+        if "standstill" not in form.model_fields_set:
+            form = form.model_copy(update={"standstill": general.standstill})
+        wrong = [message for _, message in disagreements(form, model.config.transmission, model.chain.names)]
+        wrong += units_of_other_joints(form, model.chain.names, model.chain.revolute)
+        if wrong:
+            raise UsageError(f"{file}: {'; '.join(wrong)}")
+        found |= dict.fromkeys(named, form)
+    return found
+
+
+def standstill_left_out(recording: Recording) -> tuple[float, float]:
+    """Return how much standstill was left out at the start and at the end [s]."""
+    return recording.standstill if isinstance(recording, RangeRecording) else (0.0, 0.0)
+
+
+def require_no_fault(path: Path, recording: Recording) -> None:
+    """Refuse a recording of our own in which a fault stopped the arm, unless its range ends before.
+
+    Args:
+        path: as it was named.
+        recording: what was opened for it.
+
+    Raises:
+        RecordingError: names the fault and when it was.
+    """
+    file, _ = file_and_range(path)
+    with file.open("rb") as stream:
+        if stream.read(len(MAGIC)) != MAGIC:
+            return
+    log = McapRecording(file)
+    if not log.own:
+        return
+    start, end = time_range(recording)
+    first = first_stamp(recording)
+    for event in log.read_extras().events:
+        seconds = (event.stamp_ns - first) * 1e-9
+        if event.level >= _STOPPING and start <= seconds < end:
+            raise RecordingError(
+                recording.path,
+                f"ended in a fault {seconds:.6g} s after its first sample: {event.message}; what it recorded is not the"
+                f" motion of the arm with its load alone. Record again, or give a part before: {file.name}@0:SECONDS",
+            )
+
+
+def recording_quality(recording: Recording, model: ArmModel) -> Quality:
+    """What a recording is worth, held against the arm's torque limits."""
+    joints = [model.config.joints.get(name) for name in model.chain.names]
+    limits = np.array([np.nan if joint is None or joint.torque is None else joint.torque for joint in joints])
+    return quality(recording, model.config.recording, limits)
