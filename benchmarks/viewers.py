@@ -28,9 +28,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.harness import Row, table, write
+from ident_service.client import IdentClient
 from ident_service.errors import MotionRefused
 from ident_service.record.cycles import read_cycles
-from ident_service.service.client import Client
 
 PAIRS = int(os.environ.get("IDENT_BENCH_PAIRS", "5"))
 RATE = int(os.environ.get("IDENT_BENCH_RATE", "200"))
@@ -56,7 +56,7 @@ def measure(folder: Path) -> tuple[list[Row], str]:
     """All figures, and what they say in words."""
     state = folder / "state"
     with _daemon(state) as (url, token):
-        client = Client(url, token)
+        client = IdentClient(url, token)
         description = f"extends: planar2\nname: {ARM}\ncontrol: {{rate: {RATE}}}\ndriver: {_DRIVER}\n"
         client.post("/api/v1/arms", {"description": description})
         _followed(client, "check", [])
@@ -73,7 +73,7 @@ def measure(folder: Path) -> tuple[list[Row], str]:
     return _figures(runs, seen), _words(runs)
 
 
-def _run(client: Client, state: Path, url: str, token: str, viewers: int) -> tuple[Ran, list[int]]:
+def _run(client: IdentClient, state: Path, url: str, token: str, viewers: int) -> tuple[Ran, list[int]]:
     """One run that reached its end, and what each viewer saw."""
     for faulted in range(_TRIES):
         with _watching(url, token, viewers) as watching:
@@ -93,7 +93,9 @@ def _run(client: Client, state: Path, url: str, token: str, viewers: int) -> tup
     raise RuntimeError(f"no run of {_TRIES} reached its end; this machine does not keep {RATE} Hz")
 
 
-def _followed(client: Client, kind: str, watching: Sequence[subprocess.Popen[str]]) -> tuple[dict[str, Any], list[int]]:
+def _followed(
+    client: IdentClient, kind: str, watching: Sequence[subprocess.Popen[str]]
+) -> tuple[dict[str, Any], list[int]]:
     """A motion, confirmed and with its lease renewed until it has ended; what each viewer saw."""
     client.get("/healthz")  # a line that lay idle is made anew for what only reads
     word = client.post(f"/api/v1/arms/{ARM}/challenge")["challenge"]

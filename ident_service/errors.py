@@ -4,13 +4,15 @@
 
     IdentError
     ├── UsageError (ValueError)        a command or call that cannot be meant: missing file, contradictory options
-    │   └── UnknownId (LookupError)    an id that the registry does not have
+    │   ├── UnknownId (LookupError)    an id that the registry does not have
+    │   └── AlreadyThere               a name that is taken, where replacing it was not asked for
     ├── ConfigError (ValueError)       an arm description with mistakes, all of them, each with file:line:column
     ├── ModelError (ValueError)        a mechanism or array shape that the model cannot represent
     ├── RecordingError (ValueError)    a recording that cannot be used: wrong joints, NaN, too short, torn row
     ├── ParameterError (ValueError)    a parameter file or expression that does not parse or does not fit
     ├── SolverError (RuntimeError)     the conic solver stopped anywhere but at an optimum
     ├── MotionRefused (ValueError)     a motion that would leave the arm's limits, refused before anything moves
+    │   └── PersonNeeded               a re-identification that judged nothing: somebody must look at the arm first
     └── ArmError (RuntimeError)        something below the motion loop
         ├── DriverError (OSError)      the arm cannot be opened, enabled or reached
         │   ├── AnotherDrive           a drive answers that the description does not name
@@ -44,6 +46,10 @@ class UsageError(IdentError, ValueError):
 
 class UnknownId(UsageError, LookupError):
     """An arm, motion, run, file or job was named that the registry does not have."""
+
+
+class AlreadyThere(UsageError):
+    """A name is taken, and replacing what has it was not asked for."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +100,10 @@ class SolverError(IdentError, RuntimeError):
 
 class MotionRefused(IdentError, ValueError):
     """A motion would leave the arm's limits; nothing has moved."""
+
+
+class PersonNeeded(MotionRefused):
+    """A re-identification was refused by preflight or by the arm, so nothing is known about a change of the arm."""
 
 
 class ArmError(IdentError, RuntimeError):

@@ -21,6 +21,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "package": set(),
     "errors": set(),
     "certificate_verifier": set(),
+    "client": {"errors"},
     "config": {"errors"},
     "drivers": {"errors", "config"},
     "model": {"errors", "certificate_verifier", "config"},
@@ -46,7 +47,9 @@ DOORS: dict[str, set[str]] = {
     "canopen": {"drivers", "sim_backend"},
     "can": {"drivers", "sim_backend"},
     "fastapi": {"service"},
+    "httpx": {"client"},
     "jinja2": {"service"},
+    "prometheus_client": {"service"},
     "starlette": {"service"},
     "uvicorn": {"service"},
 }

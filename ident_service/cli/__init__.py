@@ -36,6 +36,7 @@ from ident_service.cli.answer import (
     DONE,
     FAILED,
     FAULTED,
+    PERSON_NEEDED,
     USAGE,
     VERDICT_NO,
     Answer,
@@ -46,9 +47,9 @@ from ident_service.cli.answer import (
     print_to_person,
 )
 from ident_service.cli.words import Parser, Verbs, WrongWords, asks_for_json
-from ident_service.errors import ArmFault, ConfigError, IdentError, MotionRefused, UsageError
+from ident_service.errors import ArmFault, ConfigError, IdentError, MotionRefused, PersonNeeded, UsageError
 
-__all__ = ["DONE", "FAILED", "FAULTED", "USAGE", "VERDICT_NO", "main"]
+__all__ = ["DONE", "FAILED", "FAULTED", "PERSON_NEEDED", "USAGE", "VERDICT_NO", "main"]
 
 GROUPS = (
     *(commission, motions, arm, recovery, parameters, results, comparing, exports, keeping),
@@ -57,6 +58,7 @@ GROUPS = (
 _EXIT_CODES: tuple[tuple[type[IdentError], int], ...] = (
     (ConfigError, USAGE),
     (UsageError, USAGE),
+    (PersonNeeded, PERSON_NEEDED),
     (MotionRefused, VERDICT_NO),
     (ArmFault, FAULTED),
     (IdentError, FAILED),

@@ -1,6 +1,7 @@
 """What a verb answers, where it may write, and how it is interrupted; shared by all groups of verbs.
 
-Exit codes: 0 done and good; 1 failed; 2 usage or configuration; 3 done, but the verdict is no; 4 stopped by a fault.
+Exit codes: 0 done and good; 1 failed; 2 usage or configuration; 3 done, but the verdict is no; 4 stopped by a fault;
+5 nothing was judged, because a person is needed first.
 Boundary: nothing here knows a single verb.
 """
 
@@ -20,7 +21,7 @@ from typing import Any, TextIO
 
 from ident_service.errors import UsageError
 
-DONE, FAILED, USAGE, VERDICT_NO, FAULTED = 0, 1, 2, 3, 4
+DONE, FAILED, USAGE, VERDICT_NO, FAULTED, PERSON_NEEDED = 0, 1, 2, 3, 4, 5
 
 Answer = tuple[int, str, dict[str, Any]]
 """Exit code; what a person reads, with its last line break; what a program reads."""

@@ -1,4 +1,4 @@
-"""Verbs about results that stay: `accept`, `rollback`, `import`, `prune`.
+"""Verbs about results that stay: `accept`, `rollback`, `import`, `prune`, `backup`, `restore`.
 
 Boundary: words to calls, results to words; the work is `service/acceptance.py` and its neighbours.
 """
@@ -10,6 +10,7 @@ import os
 import pwd
 from collections.abc import Mapping
 from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +89,14 @@ def add(verbs: Verbs) -> None:
     sub.add_argument("--keep", type=count, required=True, metavar="N", help="newest runs of each arm keep theirs")
     sub.add_argument("--yes", action="store_true", help="DELETE them")
     add_by(sub)
+    sub = verbs.add("backup", _backup, "the state folder as one file: registry, documents, recordings, hashes")
+    sub.add_argument("file", type=Path, metavar="FILE", help="which must not exist; a daemon may serve meanwhile")
+    sub.add_argument("--without-recordings", action="store_true", help="the copy's registry calls them deleted")
+    add_by(sub)
+    sub = verbs.add("restore", _restore, "a backup into the state folder, checked first; no daemon may serve it")
+    sub.add_argument("file", type=Path, metavar="FILE")
+    sub.add_argument("--replace", action="store_true", help="move what is there into a folder replaced-... in it")
+    add_by(sub)
 
 
 def _accept(arguments: argparse.Namespace) -> Answer:
@@ -154,6 +163,26 @@ def _prune(arguments: argparse.Namespace) -> Answer:
         "left_alone": untold,
     }
     return DONE, pruned_text(document), document
+
+
+def _backup(arguments: argparse.Namespace) -> Answer:
+    from ident_service.service.backup import back_up
+
+    made = back_up(own_state_folder(arguments), arguments.file, recordings=not arguments.without_recordings)
+    note_act(arguments, "backed up", "state folder", file=made.file, recordings=made.recordings)
+    return DONE, f"{made.file}: {made.files} files, {made.bytes / 2**20:.1f} MiB\n", asdict(made)
+
+
+def _restore(arguments: argparse.Namespace) -> Answer:
+    from ident_service.service.backup import restore
+
+    state = own_state_folder(arguments)
+    done = restore(arguments.file, state, at_terminal(arguments), replace=arguments.replace)
+    when = datetime.fromtimestamp(done.created, UTC).strftime("%Y-%m-%d %H:%M UTC")
+    text = f"{state}: as of {when}, {done.files} files, {done.bytes / 2**20:.1f} MiB\n"
+    text += "" if done.replaced is None else f"what stood there before: {done.replaced}\n"
+    text += "tokens that were revoked since then count again (ident token list); each arm needs a new preflight\n"
+    return DONE, text, {**asdict(done), "state": str(state)}
 
 
 def pruned_text(document: Mapping[str, Any]) -> str:

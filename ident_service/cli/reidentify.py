@@ -9,18 +9,37 @@ from __future__ import annotations
 import argparse
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-from ident_service.cli.answer import DONE, VERDICT_NO, Answer, own_state_folder, state_folder, tell
+from ident_service.cli.answer import (
+    DONE,
+    FAULTED,
+    PERSON_NEEDED,
+    VERDICT_NO,
+    Answer,
+    own_state_folder,
+    state_folder,
+    tell,
+)
 from ident_service.cli.keeping import add_by, at_terminal
 from ident_service.cli.schedule import registry
 from ident_service.cli.words import Verbs
-from ident_service.errors import ArmError, MotionRefused
+from ident_service.errors import ArmError, MotionRefused, PersonNeeded
+
+EXIT_CODES: Final = {
+    "unchanged": DONE,
+    "changed": VERDICT_NO,
+    "faulted": FAULTED,
+    **dict.fromkeys(("impossible", "refused"), PERSON_NEEDED),
+}
+"""Of a re-identification by how it ended; any other end is a failure."""
 
 
 def add(verbs: Verbs) -> None:
     """Register the verb."""
-    sub = verbs.add("reidentify", _reidentify, "check, run, identify, compare with the accepted set (exit code 3: no)")
+    sub = verbs.add(
+        "reidentify", _reidentify, "check, run, identify, compare with the accepted set (exit code 3: changed)"
+    )
     sub.add_argument("arm", metavar="ARM", help="description file, or the name of a shipped one")
     sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
     sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person: the arm is supported")
@@ -44,7 +63,7 @@ def _reidentify(arguments: argparse.Namespace) -> Answer:
         confirm = [] if arguments.confirm is None else ["--confirm", arguments.confirm]
         code, text, _ = _step(arguments, "check", arguments.arm, *motion, *confirm)
         if code != DONE:
-            raise MotionRefused(f"{config.name}: preflight found reasons not to move\n{text}")
+            raise PersonNeeded(f"{config.name}: preflight found reasons not to move\n{text}")
         recorded = new_id(config.name)
         _, _, moved = _step(arguments, "run", arguments.arm, *motion, "--out", str(state / RUNS / recorded))
         index_run(db, state, recorded)
@@ -70,7 +89,7 @@ def _reidentify(arguments: argparse.Namespace) -> Answer:
     lines = f"{text}{verdict.words}\n"
     if verdict.state == "changed":
         lines += "a drift alarm stands until `ident alarm ack`, or `ident accept` of another set\n"
-    return DONE if verdict.state == "unchanged" else VERDICT_NO, lines, answer
+    return EXIT_CODES[verdict.state], lines, answer
 
 
 def _step(arguments: argparse.Namespace, *words: str) -> Answer:
@@ -81,5 +100,11 @@ def _step(arguments: argparse.Namespace, *words: str) -> Answer:
     parsed = parser().parse_args([*words, *always])
     parsed.asked_ns = arguments.asked_ns  # a stop that comes between two of them, too, is of this
     tell(arguments, f"-- {words[0]}")
-    answer: Answer = parsed.verb(parsed)
+    try:
+        answer: Answer = parsed.verb(parsed)
+    except MotionRefused as error:
+        # Not the verdict that the arm has changed, which is told by the same exit code elsewhere.
+        refused = PersonNeeded(str(error))
+        refused.facts = error.facts
+        raise refused from None
     return answer

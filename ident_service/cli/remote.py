@@ -20,10 +20,10 @@ from ident_service.cli.words import Verbs, count
 from ident_service.errors import IdentError, UsageError
 
 if TYPE_CHECKING:
-    from ident_service.service.client import Client
+    from ident_service.client import IdentClient
 
-Verb = Callable[["Client", argparse.Namespace], Answer]
-Ended = Callable[["Client", argparse.Namespace, Answer], Answer]
+Verb = Callable[["IdentClient", argparse.Namespace], Answer]
+Ended = Callable[["IdentClient", argparse.Namespace, Answer], Answer]
 _LOOK = 0.4  # s between looks at a job, and between renewals of its lease
 _CODES = {"done": DONE, "refused": VERDICT_NO, "faulted": FAULTED}
 LIVE = ("queued", "running")
@@ -85,12 +85,12 @@ def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
     return connected
 
 
-def as_it_is(_: Client, __: argparse.Namespace, answer: Answer) -> Answer:
+def as_it_is(_: IdentClient, __: argparse.Namespace, answer: Answer) -> Answer:
     """What most verbs do with the answer of their job."""
     return answer
 
 
-def asked(make: Callable[[Client, argparse.Namespace], dict[str, Any]], ended: Ended = as_it_is) -> Verb:
+def asked(make: Callable[[IdentClient, argparse.Namespace], dict[str, Any]], ended: Ended = as_it_is) -> Verb:
     """A verb that is a job.
 
     Args:
@@ -98,7 +98,7 @@ def asked(make: Callable[[Client, argparse.Namespace], dict[str, Any]], ended: E
         ended: what becomes of the answer.
     """
 
-    def verb(client: Client, arguments: argparse.Namespace) -> Answer:
+    def verb(client: IdentClient, arguments: argparse.Namespace) -> Answer:
         job = {key: value for key, value in make(client, arguments).items() if value is not None}
         body: dict[str, Any] = {"job": {"kind": arguments.word, **job}}
         moves = body["job"]["kind"] in _MOVE
@@ -111,7 +111,7 @@ def asked(make: Callable[[Client, argparse.Namespace], dict[str, Any]], ended: E
     return verb
 
 
-def _simulate(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+def _simulate(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     motion = motion_id(client, arguments.arm, arguments.motion)
     return {
         "arm": arguments.arm,
@@ -121,7 +121,7 @@ def _simulate(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def _identify(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+def _identify(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     return {
         "arm": arguments.arm,
         "recordings": [recording(path) for path in arguments.recordings],
@@ -132,7 +132,7 @@ def _identify(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def _design(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+def _design(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     seconds = arguments.seconds if arguments.seconds is not None or arguments.starts is not None else 60.0
     return {
         "arm": arguments.arm,
@@ -146,12 +146,12 @@ def _design(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def _check(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+def _check(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     motion = motion_id(client, arguments.arm, arguments.motion)
     return {"arm": arguments.arm, "motion": motion, "home": arguments.home}
 
 
-def _run(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+def _run(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     return {
         "arm": arguments.arm,
         "motion": motion_id(client, arguments.arm, arguments.motion),
@@ -168,7 +168,7 @@ def _until(arguments: argparse.Namespace) -> dict[str, Any] | None:
     return {"share": arguments.until, "parameters": arguments.chosen or []}
 
 
-def _home(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+def _home(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     if not arguments.zero:
         return {"arm": arguments.arm}
     posture = client.get(f"/api/v1/arms/{word_of_address(arguments.arm)}/home")
@@ -180,7 +180,7 @@ def _home(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
     return {"kind": "zero", "arm": arguments.arm}
 
 
-def _stop(client: Client, arguments: argparse.Namespace) -> Answer:
+def _stop(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     if arguments.arm is not None:
         return _ask(client, arguments)
     answer = client.post("/api/v1/stop")
@@ -188,7 +188,7 @@ def _stop(client: Client, arguments: argparse.Namespace) -> Answer:
     return DONE, f"stop asked of {names}\n" if names else "nobody moves an arm there\n", answer
 
 
-def _ask(client: Client, arguments: argparse.Namespace) -> Answer:
+def _ask(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     answer = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/{arguments.word}")
     reached = bool(answer.get("reached", answer.get("arms")) or answer.get("jobs"))
     if not reached:  # the exit code is that of the same words at the machine itself
@@ -196,29 +196,29 @@ def _ask(client: Client, arguments: argparse.Namespace) -> Answer:
     return DONE, f"{arguments.arm}: {arguments.word} asked\n", answer
 
 
-def _ack(client: Client, arguments: argparse.Namespace) -> Answer:
+def _ack(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     path = f"/api/v1/arms/{word_of_address(arguments.arm)}/faults/{word_of_address(arguments.fault)}/ack"
     answer = client.post(path)
     return DONE, f"{arguments.arm}: acknowledged {answer['code']} ({answer['cause']})\n", answer
 
 
-def _list(client: Client, arguments: argparse.Namespace) -> Answer:
+def _list(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     jobs = client.get(f"/api/v1/jobs?most={min(arguments.most, 500)}")
     lines = [f"{job['id']:<44} {job['state']:<12} {job['arm'] or '':<16} by {job['created_by']}\n" for job in jobs]
     return DONE, "".join(lines) or "no jobs yet\n", {"jobs": jobs}
 
 
-def _show(client: Client, arguments: argparse.Namespace) -> Answer:
+def _show(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     return told(client, client.get(f"/api/v1/jobs/{word_of_address(arguments.job)}"), DONE)
 
 
-def _watch(client: Client, arguments: argparse.Namespace) -> Answer:
+def _watch(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     return _followed(
         client, arguments, client.get(f"/api/v1/jobs/{word_of_address(arguments.job)}"), moves=False, ours=False
     )
 
 
-def _cancel(client: Client, arguments: argparse.Namespace) -> Answer:
+def _cancel(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     return told(client, client.post(f"/api/v1/jobs/{word_of_address(arguments.job)}/cancel"), DONE)
 
 
@@ -243,6 +243,7 @@ LOCAL_ONLY: dict[str, str] = {
     "serve": "it is the daemon",
     "emulate": "it is drives on a bus of this machine, until they are switched off",
     "import": "a run with its recordings is larger than a request may be; copy its folder to the daemon's machine",
+    **dict.fromkeys(("backup", "restore"), "it is an act at the daemon's state folder"),
     "token add": "whoever got hold of an operator's token could make others that outlive it; "
     "it is an act at the daemon's state folder",
 }
@@ -266,7 +267,7 @@ _CARRIED: dict[str, frozenset[str]] = {
 
 
 def _followed(
-    client: Client, arguments: argparse.Namespace, job: dict[str, Any], *, moves: bool, ours: bool = True
+    client: IdentClient, arguments: argparse.Namespace, job: dict[str, Any], *, moves: bool, ours: bool = True
 ) -> Answer:
     """Wait for the end of a job, its lease renewed meanwhile; Ctrl-C has it end, if it is ours."""
     stopping, cancelled, phase = StopOnSignal(), False, ""
@@ -288,7 +289,7 @@ def _followed(
     return told(client, job)
 
 
-def renew(client: Client, job: str) -> None:
+def renew(client: IdentClient, job: str) -> None:
     """Renew it. A lease that cannot be renewed any more is that of a motion that ends, which the next look tells."""
     try:
         client.post(f"/api/v1/jobs/{job}/lease")
@@ -297,7 +298,7 @@ def renew(client: Client, job: str) -> None:
             raise
 
 
-def told(client: Client, job: dict[str, Any], code: int | None = None) -> Answer:
+def told(client: IdentClient, job: dict[str, Any], code: int | None = None) -> Answer:
     """How a job stands and what its command answered; the exit code is that of its state unless one is given."""
     result = client.get(f"/api/v1/jobs/{job['id']}/result")["answer"]
     lines = [f"job {job['id']}: {job['kind']}, {job['state']}"]
@@ -322,14 +323,14 @@ def typed(arguments: argparse.Namespace) -> str:
     return str(name)
 
 
-def confirmation(client: Client, arguments: argparse.Namespace, name: str | None = None) -> dict[str, str]:
+def confirmation(client: IdentClient, arguments: argparse.Namespace, name: str | None = None) -> dict[str, str]:
     """The arm's name as a person types it, or has typed it already, and a challenge for it."""
     name = typed(arguments) if name is None else name
     word = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/challenge")["challenge"]
     return {"name": name, "challenge": word}
 
 
-def motion_id(client: Client, arm: str, motion: Path | None) -> str | None:
+def motion_id(client: IdentClient, arm: str, motion: Path | None) -> str | None:
     """The id of a motion; a file is uploaded first."""
     if motion is None:
         return None
@@ -357,8 +358,8 @@ def word_of_address(word: str) -> str:
     return word
 
 
-def _client(arguments: argparse.Namespace) -> Client:
-    from ident_service.service.client import Client
+def _client(arguments: argparse.Namespace) -> IdentClient:
+    from ident_service.client import IdentClient
     from ident_service.service.registry.tokens import TOKEN_FILE, read_token
 
     state, url = state_folder(arguments), arguments.server
@@ -368,4 +369,4 @@ def _client(arguments: argparse.Namespace) -> Client:
         except OSError:
             raise UsageError(f"no daemon serves {state}; start one with `ident serve`, or give --server URL") from None
     token = os.environ.get("IDENT_TOKEN") or read_token(state / TOKEN_FILE)
-    return Client(url, token)
+    return IdentClient(url, token)

@@ -11,15 +11,15 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from ident_service.cli.answer import DONE, FAILED, FAULTED, VERDICT_NO, Answer, StopOnSignal, tell
+from ident_service.cli.answer import DONE, FAILED, VERDICT_NO, Answer, StopOnSignal, tell
+from ident_service.cli.reidentify import EXIT_CODES
 from ident_service.cli.remote import confirmation, motion_id, word_of_address
 from ident_service.cli.schedule import alarm_lines, due_line, schedule_line
 
 if TYPE_CHECKING:
-    from ident_service.service.client import Client
+    from ident_service.client import IdentClient
 
 _LOOK = 0.4  # s between looks, and between renewals of the lease
-_CODES = {"unchanged": DONE, "changed": VERDICT_NO, "impossible": VERDICT_NO, "refused": VERDICT_NO, "faulted": FAULTED}
 _API = "/api/v1"
 
 
@@ -27,7 +27,7 @@ def _of(arguments: argparse.Namespace, path: str) -> str:
     return f"{_API}/{path}" + (f"?arm={quote(arguments.arm, safe='')}" if arguments.arm is not None else "")
 
 
-def _add(client: Client, arguments: argparse.Namespace) -> Answer:
+def _add(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     body = {
         "arm": arguments.arm,
         "cron": arguments.cron,
@@ -39,25 +39,25 @@ def _add(client: Client, arguments: argparse.Namespace) -> Answer:
     return DONE, schedule_line(row), row
 
 
-def _list(client: Client, arguments: argparse.Namespace) -> Answer:
+def _list(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     rows = client.get(_of(arguments, "schedules"))
     return DONE, "".join(map(schedule_line, rows)) or "nothing is scheduled\n", {"schedules": rows}
 
 
-def _remove(client: Client, arguments: argparse.Namespace) -> Answer:
+def _remove(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     client.ask("DELETE", f"{_API}/schedules/{arguments.number}")
     return DONE, f"schedule {arguments.number}: removed\n", {"id": arguments.number, "removed": True}
 
 
-def _enabled(enabled: bool) -> Callable[[Client, argparse.Namespace], Answer]:
-    def verb(client: Client, arguments: argparse.Namespace) -> Answer:
+def _enabled(enabled: bool) -> Callable[[IdentClient, argparse.Namespace], Answer]:
+    def verb(client: IdentClient, arguments: argparse.Namespace) -> Answer:
         row = client.post(f"{_API}/schedules/{arguments.number}/enabled", {"enabled": enabled})
         return DONE, schedule_line(row), row
 
     return verb
 
 
-def _maintenance(client: Client, arguments: argparse.Namespace) -> Answer:
+def _maintenance(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     body = {"what": arguments.what, "note": arguments.note}
     row = client.post(f"{_API}/arms/{word_of_address(arguments.arm)}/maintenance", body)
     due = client.get(_of(arguments, "due"))
@@ -65,27 +65,27 @@ def _maintenance(client: Client, arguments: argparse.Namespace) -> Answer:
     return DONE, text, {**row, "due": due}
 
 
-def _due(client: Client, arguments: argparse.Namespace) -> Answer:
+def _due(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     rows = client.get(_of(arguments, "due"))
     return DONE, "".join(map(due_line, rows)) or "nothing is due\n", {"due": rows}
 
 
-def _dismiss(client: Client, arguments: argparse.Namespace) -> Answer:
+def _dismiss(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     client.post(f"{_API}/due/{arguments.number}/dismiss", {"note": arguments.note})
     return DONE, f"due {arguments.number}: dismissed\n", {"id": arguments.number, "dismissed": True}
 
 
-def _alarms(client: Client, arguments: argparse.Namespace) -> Answer:
+def _alarms(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     rows = client.get(_of(arguments, "alarms"))
     return VERDICT_NO if rows else DONE, alarm_lines(rows), {"alarms": rows}
 
 
-def _ack(client: Client, arguments: argparse.Namespace) -> Answer:
+def _ack(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     row = client.post(f"{_API}/alarms/{arguments.number}/ack", {"note": arguments.note})
     return DONE, f"alarm {row['id']} of {row['arm']}: acknowledged\n", row
 
 
-def _reidentify(client: Client, arguments: argparse.Namespace) -> Answer:
+def _reidentify(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     """Begin it, keep its lease, and tell its end; Ctrl-C has the arm stopped."""
     body = {
         "arm": arguments.arm,
@@ -108,10 +108,10 @@ def _reidentify(client: Client, arguments: argparse.Namespace) -> Answer:
             time.sleep(_LOOK)
             row = client.get(path)
     text = f"{row['arm']}: {row['detail'] or row['state']}\n" + (f"run {row['run']}\n" if row["run"] else "")
-    return _CODES.get(row["state"], FAILED), text, row
+    return EXIT_CODES.get(row["state"], FAILED), text, row
 
 
-VERBS: dict[str, Callable[[Client, argparse.Namespace], Answer]] = {
+VERBS: dict[str, Callable[[IdentClient, argparse.Namespace], Answer]] = {
     "schedule add": _add,
     "schedule list": _list,
     "schedule remove": _remove,

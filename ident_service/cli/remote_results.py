@@ -19,43 +19,43 @@ from ident_service.cli.remote_words import in_words
 from ident_service.errors import ArmError, UsageError
 
 if TYPE_CHECKING:
-    from ident_service.service.client import Client
+    from ident_service.client import IdentClient
 
 _API = "/api/v1"
 _PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,119}")  # a name that stays in the folder it is written into
 
 
-def _run(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+def _run(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     return {"run": word_of_address(str(arguments.run))}
 
 
-def _export(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+def _export(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     return {**_run(client, arguments), "formats": [name.strip() for name in arguments.format.split(",")]}
 
 
-def _figures(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+def _figures(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     return {**_run(client, arguments), "format": arguments.format}
 
 
-def _of_file(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+def _of_file(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     """The verbs that take a parameter file here take the run that holds one there."""
     given = {name: getattr(arguments, name, None) for name in ("feasible_set", "arm", "metric")}
     return {"run": word_of_address(str(arguments.file)), **given}
 
 
-def _compare(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+def _compare(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     if len(arguments.others) != 1:
         raise UsageError("compare --server: one run is compared with one other; ask again for the rest")
     run, other = arguments.reference, arguments.others[0]
     return {"run": word_of_address(str(run)), "other": word_of_address(str(other))}
 
 
-def _payload(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+def _payload(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     recordings = [recording(path) for path in arguments.recordings]
     return {**_run(client, arguments), "recordings": recordings, "refit_offsets": arguments.refit_offsets}
 
 
-def _fetched(client: Client, arguments: argparse.Namespace, answer: Answer) -> Answer:
+def _fetched(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
     """Bring the files of an export here, where `--out` was given."""
     from ident_service.results.files import appearing_folder
 
@@ -76,7 +76,7 @@ def _fetched(client: Client, arguments: argparse.Namespace, answer: Answer) -> A
     return code, f"{text}files: {arguments.out}\n{listed}", document | {"export": export, "folder": str(arguments.out)}
 
 
-def _corrected(client: Client, arguments: argparse.Namespace, answer: Answer) -> Answer:
+def _corrected(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
     """The one file of a correction, under the name that it was given here."""
     code, text, document = in_words(client, arguments, answer)
     if code != DONE:
@@ -86,7 +86,7 @@ def _corrected(client: Client, arguments: argparse.Namespace, answer: Answer) ->
     return code, f"{text}file: {arguments.out}\n", document | {"export": export, "file": str(arguments.out)}
 
 
-def _reported(client: Client, arguments: argparse.Namespace, answer: Answer) -> Answer:
+def _reported(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
     code, text, document = answer
     page = f"{_API}/runs/{word_of_address(str(arguments.run))}/report.html"
     if code != DONE or arguments.out is None:
@@ -104,31 +104,31 @@ def _write(path: Path, content: bytes) -> None:
         raise ArmError(f"{path}: not written: what the daemon sent for it is not text") from None
 
 
-def _accept(client: Client, arguments: argparse.Namespace) -> Answer:
+def _accept(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     run = word_of_address(str(arguments.run))
     arm = word_of_address(client.get(f"{_API}/runs/{run}")["arm"])
     act = client.post(f"{_API}/arms/{arm}/acceptances", {"run": run, "note": arguments.note})
     return DONE, f"{act['arm']}: acceptance {act['number']} is the current one\n", act
 
 
-def _rollback(client: Client, arguments: argparse.Namespace) -> Answer:
+def _rollback(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     body = {"note": arguments.note, "to": arguments.to}
     act = client.post(f"{_API}/arms/{word_of_address(arguments.arm)}/rollback", body)
     text = f"{act['arm']}: acceptance {act['number']} is the set of {act['origin']} ({act['run']})\n"
     return DONE, text, act
 
 
-def _prune(client: Client, arguments: argparse.Namespace) -> Answer:
+def _prune(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     found = client.post(f"{_API}/recordings/prune", {"keep": arguments.keep, "yes": arguments.yes})
     return DONE, pruned_text(found), found
 
 
-def _tokens(client: Client, _: argparse.Namespace) -> Answer:
+def _tokens(client: IdentClient, _: argparse.Namespace) -> Answer:
     rows = client.get(f"{_API}/tokens")
     return DONE, "".join(map(token_line, rows)), {"tokens": rows}
 
 
-def _revoke(client: Client, arguments: argparse.Namespace) -> Answer:
+def _revoke(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     row = client.post(f"{_API}/tokens/{word_of_address(arguments.name)}/revoke")
     return DONE, f"{arguments.name}: revoked\n", row
 

@@ -31,42 +31,42 @@ from ident_service.cli.remote_words import in_words
 from ident_service.errors import MotionRefused, UsageError
 
 if TYPE_CHECKING:
-    from ident_service.service.client import Client
+    from ident_service.client import IdentClient
 
 _API = "/api/v1"
 _RENEW = 0.05  # s between looks at the key, each of which renews the lease; a rehearsal's lasts 0.25 s
 _LOOK = 0.4  # s between looks at the job
 
 
-def _arm(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+def _arm(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     return {"arm": arguments.arm}
 
 
-def _watch(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+def _watch(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     return {"arm": arguments.arm, "seconds": arguments.seconds}
 
 
-def _recover(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+def _recover(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     return {"arm": arguments.arm, "kind": "leave_limit" if arguments.leave_limit else None}
 
 
-def _preview(client: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+def _preview(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     return {"arm": arguments.arm, "motion": motion_id(client, arguments.arm, arguments.motion)}
 
 
-def _bus_load(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+def _bus_load(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     return {"kind": "bus_load", "arm": arguments.arm, "rate": arguments.rate}
 
 
-def _bus_scan(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+def _bus_scan(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     return {"kind": "bus_scan", "arm": arguments.arm}
 
 
-def _known(_: Client, arguments: argparse.Namespace) -> dict[str, Any]:
+def _known(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     return {"kind": "config_check", "arm": word_of_address(arguments.file)}
 
 
-def _config_check(client: Client, arguments: argparse.Namespace) -> Answer:
+def _config_check(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     """A file is sent and judged there; any other word is the name of an arm that the daemon knows."""
     path = Path(arguments.file)
     if not path.is_file():
@@ -79,7 +79,7 @@ def _config_check(client: Client, arguments: argparse.Namespace) -> Answer:
     return VERDICT_NO if found["stable"] is False else DONE, found["text"], found
 
 
-def _rehearse(client: Client, arguments: argparse.Namespace) -> Answer:
+def _rehearse(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     terminal = None if arguments.no_key else require_terminal(arguments)
     name, motion = typed(arguments), motion_id(client, arguments.arm, arguments.motion)
     job = {"kind": "rehearse", "arm": arguments.arm, "speed": arguments.speed}
@@ -100,7 +100,7 @@ def _rehearse(client: Client, arguments: argparse.Namespace) -> Answer:
 
 
 def held(
-    client: Client, arguments: argparse.Namespace, job: dict[str, Any], over: Callable[[], bool]
+    client: IdentClient, arguments: argparse.Namespace, job: dict[str, Any], over: Callable[[], bool]
 ) -> dict[str, Any]:
     """Renew the lease of a rehearsal until `over` says that it is not to go on, then have it stopped.
 

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 from ident_service.cli.answer import Answer
 
 if TYPE_CHECKING:
-    from ident_service.service.client import Client
+    from ident_service.client import IdentClient
 
 _OURS = frozenset({"exit_code", "error"})  # which the job's own lines tell
 
 
-def in_words(_: Client, __: argparse.Namespace, answer: Answer) -> Answer:
+def in_words(_: IdentClient, __: argparse.Namespace, answer: Answer) -> Answer:
     """The answer with what its command said, where a person looks for it."""
     code, text, document = answer
     said = {key: value for key, value in document["answer"].items() if key not in _OURS}

@@ -16,7 +16,7 @@ from ident_service.config.recording import RecordingFormat
 from ident_service.config.schema import ArmConfig, FourierMotion
 from ident_service.config.shipped import shipped_arms as shipped_arms
 from ident_service.config.simulation import SimulatedDriver
-from ident_service.config.source import KeyPath, Tree, read_tree
+from ident_service.config.source import KeyPath, Tree, first_problems, read_tree
 from ident_service.errors import ConfigError, Problem, UsageError
 
 _Described = TypeVar("_Described", bound=Section)
@@ -53,7 +53,7 @@ def load_arm(arm: str | Path, *, upload: bool = False) -> ArmConfig:
     config = _validated(ArmConfig, tree, path, {UPLOAD: path.resolve().parent} if upload else None)
     problems = [tree.problem(where, message, path) for where, message in _disagreements(config)]
     if problems:
-        raise ConfigError(problems)
+        raise ConfigError(first_problems(problems))
     return config
 
 
@@ -115,7 +115,7 @@ def _validated(kind: type[_Described], tree: Tree, path: Path, context: dict[str
     try:
         return kind.model_validate(tree.value, context=context)
     except ValidationError as error:
-        raise ConfigError(list(_problems(error, tree, path))) from None
+        raise ConfigError(first_problems(list(_problems(error, tree, path)))) from None
 
 
 def _problems(error: ValidationError, tree: Tree, path: Path) -> Iterator[Problem]:

@@ -8,18 +8,21 @@ machinery should say everything once, and expand to nothing.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import yaml
 
-from ident_service.config.quantities import MAX_FILE_BYTES, LocatedStr
+from ident_service.config.quantities import LocatedStr
 from ident_service.config.shipped import shipped_arms
 from ident_service.errors import ConfigError, Problem
 
 KeyPath = tuple[str | int, ...]
 MAX_DEPTH = 32
+MOST_BYTES = 256 * 2**10
+_MOST_PROBLEMS, _LONGEST = 100, 500
 # YAML 1.1 reads 1e-4 as text; numbers people write are numbers here.
 _FLOAT = re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
 _INTEGER = re.compile(r"^[-+]?\d+$")
@@ -38,6 +41,18 @@ class Tree:
             if place := self.places.get(path[:length]):
                 return Problem(*place, message)
         return Problem(fallback, 1, 1, message)
+
+
+def first_problems(problems: Sequence[Problem]) -> list[Problem]:
+    """Return the first hundred problems of a file, in at most 500 characters each, and how many others there are."""
+    first = [replace(one, message=_shortened(one.message)) for one in problems[:_MOST_PROBLEMS]]
+    if (more := len(problems) - len(first)) > 0:
+        first.append(replace(first[-1], message=f"and {more} more mistakes"))
+    return first
+
+
+def _shortened(message: str) -> str:
+    return message if len(message) <= _LONGEST else f"{message[: _LONGEST // 2]} ... {message[-_LONGEST // 2 :]}"
 
 
 def read_tree(path: Path, _chain: tuple[Path, ...] = (), *, upload: bool = False) -> Tree:
@@ -93,77 +108,106 @@ def read_alone(path: Path) -> Tree:
         ConfigError: unreadable file, bad YAML, or something refused.
     """
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise ConfigError([Problem(path, 1, 1, f"larger than {MAX_FILE_BYTES} bytes")])
+        if path.stat().st_size > MOST_BYTES:
+            raise ConfigError([Problem(path, 1, 1, f"larger than {MOST_BYTES} bytes")])
         text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise ConfigError([Problem(path, 1, 1, error.strerror or str(error))]) from None
     except UnicodeDecodeError:
         raise ConfigError([Problem(path, 1, 1, "not UTF-8 text")]) from None
-    try:
-        _refuse_unplain(path, text)
-        node = yaml.compose(text, Loader=yaml.SafeLoader)
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        line, column = (mark.line + 1, mark.column + 1) if mark else (1, 1)
-        raise ConfigError([Problem(path, line, column, error.problem or "not YAML")]) from None
-    except (yaml.YAMLError, RecursionError) as error:
-        raise ConfigError([Problem(path, 1, 1, f"not YAML: {error}")]) from None
-    tree = Tree(None)
-    problems: list[Problem] = []
-    if node is not None:
-        tree.value = _build(node, (), path, tree, problems)
-    if problems:
-        raise ConfigError(problems)
-    return tree
+    return _Builder(path, text).tree()
 
 
-def _refuse_unplain(path: Path, text: str) -> None:
-    """Anchors, aliases, tags and deep nesting, seen in the stream of events before anything expands."""
-    problems, depth = [], 0
-    for event in yaml.parse(text, Loader=yaml.SafeLoader):
-        place = (event.start_mark.line + 1, event.start_mark.column + 1) if event.start_mark else (1, 1)
-        if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
-            problems.append(Problem(path, *place, "anchors and aliases are refused; write the value out"))
-        if tag := getattr(event, "tag", None):
-            problems.append(Problem(path, *place, f"tag {tag!r} is refused"))
-        if isinstance(event, yaml.CollectionStartEvent):
-            depth += 1
-            if depth > MAX_DEPTH:
-                problems.append(Problem(path, *place, f"nested deeper than {MAX_DEPTH} levels"))
-                break
-        elif isinstance(event, yaml.CollectionEndEvent):
-            depth -= 1
-    if problems:
-        raise ConfigError(problems)
+class _Builder:
+    """Values made straight from the parser's events, in one pass; nothing expands."""
 
+    def __init__(self, path: Path, text: str) -> None:
+        self._path, self._text = path, text
+        self._tree = Tree(None)
+        self._refused: list[Problem] = []  # what would expand, or be more than text
+        self._wrong: list[Problem] = []
 
-def _build(node: yaml.Node, where: KeyPath, path: Path, tree: Tree, problems: list[Problem]) -> Any:
-    line, column = node.start_mark.line + 1, node.start_mark.column + 1
-    tree.places[where] = (path, line, column)
-    if isinstance(node, yaml.MappingNode):
+    def tree(self) -> Tree:
+        try:
+            self._document(yaml.parse(self._text, Loader=yaml.CSafeLoader))
+        except yaml.MarkedYAMLError as error:
+            mark = error.problem_mark or error.context_mark
+            line, column = (mark.line + 1, mark.column + 1) if mark else (1, 1)
+            raise ConfigError([Problem(self._path, line, column, error.problem or "not YAML")]) from None
+        except yaml.YAMLError as error:
+            raise ConfigError([Problem(self._path, 1, 1, f"not YAML: {error}")]) from None
+        # First what makes the rest of the file another one than it seems.
+        if problems := self._refused or self._wrong:
+            raise ConfigError(first_problems(problems))
+        return self._tree
+
+    def _document(self, events: Iterator[yaml.Event]) -> None:
+        documents = 0
+        for event in events:
+            if isinstance(event, yaml.DocumentStartEvent):
+                documents += 1
+                if documents > 1:
+                    self._refused.append(self._problem(event, "a second document begins here; give one"))
+                    return
+            elif isinstance(event, yaml.NodeEvent):
+                self._tree.value = self._value(event, (), events, 1)
+
+    def _value(self, event: yaml.Event, where: KeyPath, events: Iterator[yaml.Event], depth: int) -> Any:
+        self._tree.places[where] = (self._path, *_place(event))
+        self._refuse_unplain(event)
+        if isinstance(event, yaml.ScalarEvent):
+            return _scalar(event, self._path)
+        if not isinstance(event, yaml.CollectionStartEvent):  # an alias
+            return None
+        if depth > MAX_DEPTH:
+            self._refused.append(self._problem(event, f"nested deeper than {MAX_DEPTH} levels"))
+            raise ConfigError(first_problems(self._refused))
+        if isinstance(event, yaml.SequenceStartEvent):
+            return tuple(self._items(where, events, depth))
+        return self._mapping(where, events, depth)
+
+    def _items(self, where: KeyPath, events: Iterator[yaml.Event], depth: int) -> Iterator[Any]:
+        index = 0
+        while not isinstance(event := next(events), yaml.SequenceEndEvent):
+            yield self._value(event, (*where, index), events, depth + 1)
+            index += 1
+
+    def _mapping(self, where: KeyPath, events: Iterator[yaml.Event], depth: int) -> dict[str, Any]:
         result: dict[str, Any] = {}
-        for key_node, value_node in node.value:
-            mark = key_node.start_mark
-            here = (path, mark.line + 1, mark.column + 1)
-            if not isinstance(key_node, yaml.ScalarNode) or key_node.tag == "tag:yaml.org,2002:merge":
-                problems.append(Problem(*here, "a key is a plain word"))
+        while not isinstance(key_event := next(events), yaml.MappingEndEvent):
+            here = (self._path, *_place(key_event))
+            if isinstance(key_event, yaml.ScalarEvent) and not (key_event.value == "<<" and key_event.implicit[0]):
+                self._refuse_unplain(key_event)
+                key = str(key_event.value)
+                if key in result:
+                    self._wrong.append(Problem(*here, f"{key!r} stands twice"))
+                result[key] = self._value(next(events), (*where, key), events, depth + 1)
+                # A mistake about a key (unknown, wrong kind of value) is best seen at the key.
+                self._tree.places[(*where, key)] = here
                 continue
-            key = str(key_node.value)
-            if key in result:
-                problems.append(Problem(*here, f"{key!r} stands twice"))
-            result[key] = _build(value_node, (*where, key), path, tree, problems)
-            # A mistake about a key (unknown, wrong kind of value) is best seen at the key.
-            tree.places[(*where, key)] = here
+            self._wrong.append(Problem(*here, "a key is a plain word"))
+            self._value(key_event, where, events, depth + 1)
+            self._value(next(events), where, events, depth + 1)
         return result
-    if isinstance(node, yaml.SequenceNode):
-        return tuple(_build(item, (*where, index), path, tree, problems) for index, item in enumerate(node.value))
-    return _scalar(cast(yaml.ScalarNode, node), path)
+
+    def _refuse_unplain(self, event: yaml.Event) -> None:
+        if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
+            self._refused.append(self._problem(event, "anchors and aliases are refused; write the value out"))
+        if tag := getattr(event, "tag", None):
+            self._refused.append(self._problem(event, f"tag {tag!r} is refused"))
+
+    def _problem(self, event: yaml.Event, message: str) -> Problem:
+        return Problem(self._path, *_place(event), message)
 
 
-def _scalar(node: yaml.ScalarNode, path: Path) -> Any:
-    text = str(node.value)
-    if node.style in ("'", '"', "|", ">"):
+def _place(event: yaml.Event) -> tuple[int, int]:
+    mark = event.start_mark
+    return (1, 1) if mark is None else (mark.line + 1, mark.column + 1)
+
+
+def _scalar(event: yaml.ScalarEvent, path: Path) -> Any:
+    text = str(event.value)
+    if event.style in ("'", '"', "|", ">"):
         return LocatedStr(text, path.parent)
     if _INTEGER.match(text):
         return int(text) if len(text) < 20 else float(text)

@@ -268,15 +268,17 @@ def _part(rows: Rows, picked: NDArray[np.intp], columns: Sequence[Sequence[int]]
         np.column_stack([rows.H_b[joint][np.array(own)[:, None], picked].T, rows.torque[picked, joint]])
         for joint, own in enumerate(columns)
     ]
-    return rows.time[picked], rows.velocity[picked] @ model.chain.coupling.T, rows.moving.any(axis=0), tables
+    moved: NDArray[np.bool_] = np.logical_or.reduce(rows.moving)
+    return rows.time[picked], rows.velocity[picked] @ model.chain.coupling.T, moved, tables
 
 
 def _joined(parts: Sequence[_Part], every: int) -> _Part:
     time, rate, moving, tables = zip(*parts, strict=True)
+    moved: NDArray[np.bool_] = np.logical_or.reduce(moving)
     return (
         np.concatenate(time)[::every],
         np.concatenate(rate)[::every],
-        np.asarray(np.any(moving, axis=0), dtype=np.bool_),
+        moved,
         [np.concatenate(joint)[::every] for joint in zip(*tables, strict=True)],
     )
 

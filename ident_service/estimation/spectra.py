@@ -116,15 +116,14 @@ def spectrum(recording: Recording, fmt: RecordingFormat) -> Spectrum:
     if windows == 0:
         return Spectrum(1.0 / period, 0.0, 0.5 / period)  # what follows says that it is too short
     frequency = np.fft.rfftfreq(length - 1, period)[1:]
-    mean: Array = power[1:] / windows
-    ends = [_ends(joint, frequency, period) for joint in mean.T if joint.any()]
+    ends = [_ends(power[1:, joint] / windows, frequency, period) for joint in np.flatnonzero(power[1:].any(axis=0))]
     if not ends:
         return Spectrum(1.0 / period, 0.0, 0.5 / period)
     motion, noise = np.array(ends).T
     return Spectrum(1.0 / period, float(motion.max()), float(np.median(noise)))
 
 
-def _ends(power: Array, frequency: Array, period: float) -> tuple[float, float]:
+def _ends(power: NDArray[np.floating], frequency: NDArray[np.floating], period: float) -> tuple[float, float]:
     """Give the frequencies [Hz] that a joint's motion ends at and its noise matters from; `power` is of its rates."""
     # A difference multiplies power by this.
     difference = (2.0 * np.sin(np.pi * frequency * period)) ** 2

@@ -18,8 +18,9 @@ from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array
 from ident_service.model.drives import WrittenArm, joint_drives
+from ident_service.model.mechanism import read_mechanism
 from ident_service.model.presliding import presliding_ways, turned
-from ident_service.model.rigid_body import mjcf_model, pinocchio_model, read_mjcf, read_urdf, urdf_model
+from ident_service.model.rigid_body import chain_of, pinocchio_model
 
 
 class DynamicModel:
@@ -155,7 +156,6 @@ def read_back(
     Raises:
         ModelError: it cannot be read.
     """
-    model = (urdf_model if kind == "urdf" else mjcf_model)(file, kinematics)
-    chain, bodies = (read_urdf if kind == "urdf" else read_mjcf)(file, gravity, kinematics)
-    dry = model.upperDryFrictionLimit if hasattr(model, "upperDryFrictionLimit") else model.friction
-    return WrittenArm(chain, bodies, np.array(model.armature), np.array(model.damping), np.array(dry))
+    found = read_mechanism(file, kind, kinematics, own=True)
+    chain, bodies = chain_of(found, gravity)
+    return WrittenArm(chain, bodies, found.armature.copy(), found.damping.copy(), found.dry_friction.copy())

@@ -11,15 +11,26 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import pinocchio as pin
 
-from ident_service.config.kinematics import Kinematics
-from ident_service.config.quantities import TextFile
 from ident_service.errors import ModelError
 
+if TYPE_CHECKING:  # the process that reads an MJCF loads no configuration
+    from ident_service.config.quantities import TextFile
+
 _OUTSIDE = 1e-6  # rad or m; what a value may be beyond a limit by rounding
+
+
+@dataclass(frozen=True)
+class Part:
+    """Which part of a mechanism is the arm: `base`, `tip` and `lock` of `config.kinematics.Kinematics`."""
+
+    base: str | None = None
+    tip: str | None = None
+    lock: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -43,7 +54,7 @@ def mimics(file: TextFile) -> dict[str, Mimic]:
     try:
         robot = ET.fromstring(file.text)  # noqa: S314 - entities were refused before
     except ET.ParseError as error:
-        raise ModelError(f"{file.name}: not well-formed XML: {error}") from None
+        raise ModelError(f"not well-formed XML: {error}") from None
     # Numbers were checked by pinocchio's reader.
     for joint in robot.findall("joint"):
         if (mimic := joint.find("mimic")) is not None:
@@ -53,13 +64,13 @@ def mimics(file: TextFile) -> dict[str, Mimic]:
 
 
 def arm_part(
-    model: pin.Model, kinematics: Kinematics, followers: Mapping[str, Mimic], file: str
+    model: pin.Model, part: Part, followers: Mapping[str, Mimic], file: str
 ) -> tuple[pin.Model, dict[str, float]]:
     """Reduce a mechanism to the arm.
 
     Args:
         model: of the whole mechanism, mimicking joints as joints of their own.
-        kinematics: `base` and `tip`, names of links, and `lock`, positions of joints [rad or m].
+        part: `base` and `tip`, names of links, and `lock`, positions of joints [rad or m].
         followers: joints that mimic others.
         file: its name, for errors.
 
@@ -71,8 +82,8 @@ def arm_part(
         ModelError: a link or joint that does not exist, a value outside a joint's limits, a tip that does not hang on
             the base, or a joint that follows one of the arm.
     """
-    inside = _between(model, kinematics, file)
-    held = {name: _checked(model, name, value, file) for name, value in kinematics.lock.items()}
+    inside = _between(model, part, file)
+    held = {name: _checked(model, name, value, file) for name, value in part.lock.items()}
     outside = {str(name) for name in model.names[1:]} - inside - set(held)
     held |= {name: _rest(model, name) for name in outside if name not in followers}
     waiting = {name: one for name, one in followers.items() if name not in held}
@@ -94,24 +105,22 @@ def arm_part(
             )
     if held:
         model = pin.buildReducedModel(model, sorted(model.getJointId(name) for name in held), positions)
-    if kinematics.base is not None:
-        _rebase(model, kinematics.base)
+    if part.base is not None:
+        _rebase(model, part.base)
     return model, held
 
 
-def _between(model: pin.Model, kinematics: Kinematics, file: str) -> set[str]:
+def _between(model: pin.Model, part: Part, file: str) -> set[str]:
     """Find the joints that are neither on the way to the base nor off the way to the tip."""
     ids = set(range(1, model.njoints))
-    if kinematics.base is not None:
-        base = _joint_of(model, kinematics.base, "base", file)
+    if part.base is not None:
+        base = _joint_of(model, part.base, "base", file)
         ids = {k for k in ids if k != base and base in model.supports[k]}
-    if kinematics.tip is not None:
-        tip = _joint_of(model, kinematics.tip, "tip", file)
+    if part.tip is not None:
+        tip = _joint_of(model, part.tip, "tip", file)
         ids &= set(model.supports[tip])
-    if not ids and (kinematics.base is not None or kinematics.tip is not None):
-        raise ModelError(
-            f"{file}: no movable joint from {kinematics.base or 'the root'!r} to {kinematics.tip or 'any tip'!r}"
-        )
+    if not ids and (part.base is not None or part.tip is not None):
+        raise ModelError(f"{file}: no movable joint from {part.base or 'the root'!r} to {part.tip or 'any tip'!r}")
     return {str(model.names[k]) for k in ids}
 
 

@@ -1,4 +1,4 @@
-"""The door to pinocchio: mechanisms read from URDF and MJCF, and models it can run, from a chain and delta.
+"""The door to pinocchio: chains from what `mechanism.py` reads, and models it can run, from a chain and delta.
 
 Pinocchio keeps a link's inertia as mass, centre of mass and inertia about the centre of mass in the joint frame; here
 stand the conversions from and to delta (eqs. 5, 8), whose inertia is about the link frame's origin.
@@ -6,11 +6,7 @@ stand the conversions from and to delta (eqs. 5, 8), whose inertia is about the 
 
 from __future__ import annotations
 
-import re
-import tempfile
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -22,11 +18,7 @@ from ident_service.config.quantities import TextFile
 from ident_service.errors import ModelError
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.layout import TERM_SYMBOLS, Layout
-from ident_service.model.mechanism_part import arm_part, mimics
-
-_SUPPORTED = ("JointModelR", "JointModelP")
-_UNSUPPORTED = ("JointModelPlanar",)
-_FORBIDDEN_XML = re.compile(r"<!\s*(DOCTYPE|ENTITY)|<\s*include\b|\bxi:include\b", re.IGNORECASE)
+from ident_service.model.mechanism import Mechanism, read_mechanism
 
 
 def read_urdf(
@@ -43,94 +35,37 @@ def read_urdf(
         The chain, and the ten inertial parameters per link (eq. 13) in SI units, shape (joints, 10).
 
     Raises:
-        ModelError: not a URDF, entities or includes, a joint that is neither revolute, continuous nor prismatic, or
-            one that mimics a joint of the arm; no such base, tip or locked joint.
+        ModelError: as `read_mechanism`.
     """
-    return _chain(urdf_model(file, kinematics), gravity, file.name)
+    return chain_of(read_mechanism(file, "urdf", kinematics), gravity)
 
 
 def read_mjcf(
     file: TextFile, gravity: tuple[float, float, float], kinematics: Kinematics | None = None
 ) -> tuple[Chain, Array]:
     """As `read_urdf`, for an MJCF file of hinge and slide joints."""
-    return _chain(mjcf_model(file, kinematics), gravity, file.name)
+    return chain_of(read_mechanism(file, "mjcf", kinematics), gravity)
 
 
-def urdf_model(file: TextFile, kinematics: Kinematics | None = None) -> pin.Model:
-    """Read the arm in a URDF as a pinocchio model; see `read_urdf`."""
-    return urdf_part(file, kinematics)[0]
-
-
-def urdf_part(file: TextFile, kinematics: Kinematics | None = None) -> tuple[pin.Model, dict[str, float]]:
-    """Read the arm in a URDF as `urdf_model` does, and where all other movable joints are held [rad or m]."""
-    _refuse_foreign(file, "URDF")
-    whole = _built(file, "URDF", lambda: pin.buildModelFromXML(file.text))
-    return arm_part(whole, kinematics or Kinematics(urdf=file), mimics(file), file.name)
-
-
-def mjcf_model(file: TextFile, kinematics: Kinematics | None = None) -> pin.Model:
-    """As `urdf_model`, for an MJCF file."""
-    _refuse_foreign(file, "MJCF")
-    with tempfile.TemporaryDirectory() as folder:
-        # Pinocchio reads MJCF from a path only; alone in a folder, the file cannot reach any other.
-        path = Path(folder) / "arm.xml"
-        path.write_text(file.text, encoding="utf-8")
-        whole = _built(file, "MJCF", lambda: pin.buildModelFromMJCF(str(path)))
-    return whole if kinematics is None else arm_part(whole, kinematics, {}, file.name)[0]
-
-
-def _refuse_foreign(file: TextFile, kind: str) -> None:
-    if found := _FORBIDDEN_XML.search(file.text):
-        raise ModelError(f"{file.name}: {found.group(0)!r} is refused in a {kind}; give one self-contained file")
-
-
-def _built(file: TextFile, kind: str, build: Callable[[], pin.Model]) -> pin.Model:
-    try:
-        return build()
-    except Exception as error:  # noqa: BLE001  # pinocchio raises whatever its XML libraries raise
-        raise ModelError(f"{file.name}: not a {kind} that can be read: {error}") from None
-
-
-def _chain(model: pin.Model, gravity: tuple[float, float, float], name: str) -> tuple[Chain, Array]:
-    """Chain and link inertias of a model; `name` is the file's, for errors."""
-    n = model.njoints - 1
-    if n == 0:
-        raise ModelError(f"{name}: no movable joint")
-    data = model.createData()
-    revolute, axes = [], []
-    for k in range(1, n + 1):
-        kind = model.joints[k].shortname()
-        if not kind.startswith(_SUPPORTED) or kind in _UNSUPPORTED:
-            raise ModelError(
-                f"{name}: joint {model.names[k]!r} is a {kind}; only revolute and prismatic joints are supported"
-            )
-        screw = np.asarray(data.joints[k].S).reshape(6)
-        turns = bool(np.any(screw[3:]))
-        revolute.append(turns)
-        axes.append(screw[3:] if turns else screw[:3])
-    placements = [model.jointPlacements[k] for k in range(1, n + 1)]
+def chain_of(mechanism: Mechanism, gravity: tuple[float, float, float]) -> tuple[Chain, Array]:
+    """Return what `read_urdf` does, of a file that was read."""
+    n = len(mechanism.names)
     chain = Chain(
-        names=tuple(model.names[1:]),
-        parents=tuple(int(model.parents[k]) - 1 for k in range(1, n + 1)),
-        revolute=tuple(revolute),
-        axes=np.array(axes, dtype=float),
-        rotation=np.array([placement.rotation for placement in placements]),
-        translation=np.array([placement.translation for placement in placements]),
+        names=mechanism.names,
+        parents=mechanism.parents,
+        revolute=mechanism.revolute,
+        axes=mechanism.axes.copy(),
+        rotation=mechanism.rotation.copy(),
+        translation=mechanism.translation.copy(),
         link_rotation=np.tile(np.eye(3), (n, 1, 1)),
         link_translation=np.zeros((n, 3)),
         gravity=np.array(gravity, dtype=float),
     )
-    return chain, np.array([delta_from_inertia(model.inertias[k]) for k in range(1, n + 1)])
-
-
-def delta_from_inertia(inertia: pin.Inertia) -> Array:
-    """The ten parameters of eq. 13 about the origin of the frame the inertia is expressed in, shape (10,)."""
-    m, mx, my, mz, xx, xy, yy, xz, yz, zz = inertia.toDynamicParameters()
-    return np.array([xx, xy, xz, yy, yz, zz, mx, my, mz, m])
+    return chain, mechanism.bodies.copy()
 
 
 def inertia_from_delta(parameters: Array) -> pin.Inertia:
-    """The inverse of `delta_from_inertia`; `parameters` shape (10,), with positive mass.
+    """The inertia of the ten parameters of eq. 13; `parameters` shape (10,), with positive mass.
 
     Raises:
         ModelError: the mass is not positive, so that no centre of mass exists.

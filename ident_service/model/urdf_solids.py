@@ -16,7 +16,7 @@ from ident_service.config.kinematics import Kinematics
 from ident_service.config.workspace import BASE
 from ident_service.errors import ModelError
 from ident_service.model.chain import WORLD, Array, Chain
-from ident_service.model.rigid_body import urdf_model
+from ident_service.model.mechanism import read_mechanism
 from ident_service.model.solids import Body, Box, Capsule, Cylinder, Solid, turned
 
 
@@ -34,21 +34,23 @@ def urdf_solids(kinematics: Kinematics, chain: Chain, skip: frozenset[str]) -> l
     file = kinematics.urdf
     if file is None:
         return []
-    model = urdf_model(file, kinematics)
+    frames = read_mechanism(file, "urdf", kinematics).frames
     bodies = []
     # Entities were refused when the chain was read from the same text.
     for link in ET.fromstring(file.text).iter("link"):  # noqa: S314
         elements = link.findall("collision")
         if not elements:
             continue
-        frame = model.frames[model.getFrameId(link.get("name", ""), pin.FrameType.BODY)]
-        joint = int(frame.parentJoint) - 1
+        frame = frames.get(link.get("name", ""))
+        if frame is None:  # in an extension's element, say
+            continue
+        joint, rotation, translation = frame
         owner = BASE if joint == WORLD else chain.names[joint]
         if owner in skip:
             continue
         where = f"{file.name}: link {link.get('name')!r}"
         for element in elements:
-            placement = frame.placement * _origin(element.find("origin"), where)
+            placement = pin.SE3(rotation, translation) * _origin(element.find("origin"), where)
             bodies.append(Body(owner, joint, _solid(element, placement.rotation, placement.translation, owner, where)))
     return bodies
 

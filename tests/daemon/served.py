@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from ident_service.service.client import Client
+from ident_service.client import IdentClient
 
 
 def started(state: Path, *words: str, **environment: str) -> subprocess.Popen[bytes]:
@@ -39,12 +39,14 @@ def url_of(process: subprocess.Popen[bytes], state: Path, seconds: float = 60.0)
 
 
 @contextmanager
-def daemon_process(state: Path, *words: str, **environment: str) -> Iterator[tuple[subprocess.Popen[bytes], Client]]:
+def daemon_process(
+    state: Path, *words: str, **environment: str
+) -> Iterator[tuple[subprocess.Popen[bytes], IdentClient]]:
     """A daemon and a client of its owner; killed at the end if it lives still."""
     (state / "serve.url").unlink(missing_ok=True)
     process = started(state, *words, **environment)
     try:
-        client = Client(url_of(process, state), (state / "token").read_text().strip())
+        client = IdentClient(url_of(process, state), (state / "token").read_text().strip())
         try:
             yield process, client
         finally:

@@ -41,7 +41,7 @@ def run_of(daemon: Asked, kind: str = "simulate") -> str:
 @pytest.fixture
 def patient(daemon: Asked) -> str:
     """The same arm with a motion of twenty minutes of its own time, and a ticket for it."""
-    assert daemon.post("/api/v1/arms", {"description": patient_text(ARM)}).status_code == 201
+    assert daemon.post("/api/v1/arms", {"description": patient_text(ARM), "replace": True}).status_code == 201
     checked_before(daemon.service.state, patient_text(ARM))
     return ARM
 

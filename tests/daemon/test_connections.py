@@ -10,6 +10,7 @@ import ssl
 import subprocess
 import threading
 import time
+from http.client import HTTPConnection
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -164,17 +165,22 @@ def test_ten_stops_at_once_while_everything_waits(tmp_path: Path) -> None:
 @pytest.mark.timeout(300)
 def test_a_line_without_a_request_is_closed(state: Path) -> None:
     with daemon_process(state) as (_, client):
-        parts = urlsplit(client._url)
+        parts = urlsplit(client.url)
         lines = []
         for begun in (b"", b"GET / HT", b"POST /api/v1/login HTTP/1.1\r\nHost: 127.0.0.1\r\n"):
             lines.append(socket.create_connection((str(parts.hostname), int(parts.port or 0)), timeout=60))
             lines[-1].sendall(begun)
-        began, kept = time.monotonic(), None
+        began, kept = time.monotonic(), HTTPConnection(str(parts.hostname), parts.port, timeout=60)
+        kept.connect()
+        line_kept = kept.sock
         while time.monotonic() - began < HEADER_SECONDS + 2.0:
-            assert client.get("/healthz")["healthy"]
-            assert client.post("/api/v1/stop") == {"arms": [], "jobs": []}
-            assert client._connection.sock is (kept := kept or client._connection.sock)  # one line, asked all the time
+            for method, path in (("GET", "/healthz"), ("POST", "/api/v1/stop")):
+                kept.request(method, path)
+                answer = kept.getresponse()
+                assert (answer.status, bool(answer.read())) == (200, True)
+            assert kept.sock is line_kept  # one line, asked all the time
             time.sleep(0.2)
+        kept.close()
         for line in lines:
             line.settimeout(0.0)
             assert line.recv(100) == b""
@@ -194,7 +200,7 @@ def test_handshakes_that_do_not_go_on_have_a_time_too(state: Path, tmp_path: Pat
     os.environ["SSL_CERT_FILE"] = str(tmp_path / "cert")
     try:
         with daemon_process(state, "--tls-cert", str(tmp_path / "cert"), "--tls-key", str(pem)) as (_, client):
-            parts = urlsplit(client._url)
+            parts = urlsplit(client.url)
             silent = socket.create_connection((str(parts.hostname), int(parts.port or 0)), timeout=60)
             context = ssl.create_default_context(cafile=str(tmp_path / "cert"))
             with socket.create_connection((str(parts.hostname), int(parts.port or 0)), timeout=60) as raw:

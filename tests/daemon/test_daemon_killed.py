@@ -12,19 +12,19 @@ import pytest
 from daemon.conftest import checked_before, patient_text, quick_text, serving
 from daemon.served import daemon_process
 
+from ident_service.client import IdentClient
 from ident_service.errors import MotionRefused
 from ident_service.motion.control_file import in_use
 from ident_service.record.open import open_recording
 from ident_service.results.manifest import verified_files
 from ident_service.service.arm_state import control_path
-from ident_service.service.client import Client
 from ident_service.service.registry.database import Database
 
 ARM = "quick"
 KINDS = ("run", "run", "check", "simulate")
 
 
-def begin(client: Client, kind: str) -> str:
+def begin(client: IdentClient, kind: str) -> str:
     """A job, confirmed where it moves."""
     body: dict[str, object] = {"job": {"kind": kind, "arm": ARM}}
     if kind != "simulate":
@@ -33,7 +33,7 @@ def begin(client: Client, kind: str) -> str:
     return str(client.post("/api/v1/jobs", body)["id"])
 
 
-def carried(client: Client, job: str, seconds: float) -> bool:
+def carried(client: IdentClient, job: str, seconds: float) -> bool:
     """Renew a job's lease for some time; whether it lives still."""
     until = time.monotonic() + seconds
     while time.monotonic() < until:
@@ -44,7 +44,7 @@ def carried(client: Client, job: str, seconds: float) -> bool:
     return True
 
 
-def checked(client: Client) -> None:
+def checked(client: IdentClient) -> None:
     """The arm has a ticket."""
     job = begin(client, "check")
     ended = not carried(client, job, 240.0)
@@ -53,13 +53,13 @@ def checked(client: Client) -> None:
     assert seen["state"] == "done", seen
 
 
-def excited(client: Client, job: str) -> None:
+def excited(client: IdentClient, job: str) -> None:
     """Renew a run's lease until its motion has begun."""
     while "exciting" not in str(client.get(f"/api/v1/jobs/{job}")["progress"]):
         assert carried(client, job, 0.2)
 
 
-def _renewed(client: Client, job: str) -> None:
+def _renewed(client: IdentClient, job: str) -> None:
     try:
         client.post(f"/api/v1/jobs/{job}/lease")
     except MotionRefused as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,12 @@ import schemathesis
 from daemon.conftest import URL, Asked, quick_text
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from jsonschema import Draft202012Validator
 
+from ident_service.service.api.description import EXAMPLES
 from ident_service.service.api.doors import MOST_BODY
+
+FAILURE = {"$ref": "#/components/schemas/Failure"}
 
 
 def test_every_answer_has_a_type_and_every_failure_the_one_shape(daemon: Asked) -> None:
@@ -36,13 +41,54 @@ def test_every_answer_has_a_type_and_every_failure_the_one_shape(daemon: Asked) 
     assert "HTTPValidationError" not in json.dumps(document["paths"])
 
 
+def test_every_operation_is_explained_by_examples_that_are_good(daemon: Asked) -> None:
+    document = daemon.get("/api/v1/openapi.json").json()
+    shapes = document["components"]
+    used, summaries = set(), []
+    for path, item in document["paths"].items():
+        for method, operation in item.items():
+            summaries.append(operation["summary"])
+            assert 10 <= len(operation["summary"]) <= 160, (method, path, operation["summary"])
+            body = operation.get("requestBody", {}).get("content", {}).get("application/json")
+            if body is not None:
+                validator = Draft202012Validator({**body["schema"], "components": shapes})
+                used.add(body["schema"]["$ref"].rpartition("/")[2])
+                assert body["examples"]
+                for title, example in body["examples"].items():
+                    validator.validate(example["value"])
+                    assert not re.search("[.]$", title)
+            for status, answer in operation["responses"].items():
+                if answer.get("content", {}).get("application/json", {}).get("schema", {}) == FAILURE:
+                    example = answer["content"]["application/json"]["example"]
+                    Draft202012Validator({**FAILURE, "components": shapes}).validate(example)
+                    assert example["error"]["message"], status
+    assert used == set(EXAMPLES)
+    assert len(set(summaries)) >= len(summaries) - 2, sorted(summaries)
+
+
+def test_what_an_example_asks_for_is_understood(daemon: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patched:
+        patched.setattr(daemon.service.engine, "_look", lambda: None)  # nothing begins
+        for path, name, good in (
+            ("/api/v1/arms", "NewArm", {201, 422}),  # of a URDF, three dots are none
+            ("/api/v1/jobs", "JobRequest", {201, 404, 409}),
+            ("/api/v1/schedules", "NewSchedule", {201}),
+            ("/api/v1/recordings/prune", "Pruning", {200}),
+        ):
+            for title, body in EXAMPLES[name].items():
+                answer = daemon.post(path, body)
+                assert answer.status_code in good, (title, answer.text)
+        for job in daemon.get("/api/v1/jobs").json():
+            daemon.post(f"/api/v1/jobs/{job['id']}/cancel")
+
+
 def test_no_page_of_the_service_loads_anything_from_elsewhere(daemon: Asked) -> None:
     assert daemon.get("/docs").status_code == 404
     assert daemon.get("/redoc").status_code == 404
 
 
 # Requests whose answer takes as long as a job, or that begin one: jobs are refused for what they name instead.
-_LEFT_OUT = {"watch_job"}
+_LEFT_OUT = {"watch_job", "watch_live"}
 
 
 def _operations(daemon: Asked) -> dict[str, Any]:

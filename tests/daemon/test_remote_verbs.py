@@ -24,8 +24,8 @@ from ident_service.cli import main, parser
 from ident_service.cli.remote import LOCAL_ONLY, table
 from ident_service.cli.remote_words import lines_of
 from ident_service.cli.words import Parser
+from ident_service.client import IdentClient
 from ident_service.errors import ArmError
-from ident_service.service.client import Client
 
 RUN = "20260101T000000Z-quick"
 SINGULAR = "20260103T000000Z-quick"
@@ -50,7 +50,7 @@ def test_every_verb_is_done_by_a_daemon_or_says_why_not() -> None:
     assert len(verbs()) > 45
     assert set(done) | set(LOCAL_ONLY) == set(verbs())
     assert not set(done) & set(LOCAL_ONLY)
-    assert set(LOCAL_ONLY) == {"serve", "emulate", "import", "token add"}
+    assert set(LOCAL_ONLY) == {"serve", "backup", "emulate", "import", "restore", "token add"}
     assert all(len(why) > 10 for why in LOCAL_ONLY.values())
     assert set(carried) == set(done)
     for word, told in carried.items():
@@ -120,7 +120,7 @@ def test_answers_are_told_in_words() -> None:
     ]
 
 
-class _Evil(Client):
+class _Evil(IdentClient):
     """A daemon that names files which lead elsewhere."""
 
     def __init__(self) -> None:
@@ -143,7 +143,7 @@ def test_a_daemon_does_not_choose_where_files_go_here(tmp_path: Path) -> None:
 
 
 @contextmanager
-def served(state: Path, commissioned: Path) -> Iterator[tuple[Client, list[str]]]:
+def served(state: Path, commissioned: Path) -> Iterator[tuple[IdentClient, list[str]]]:
     """A daemon with two arms and three runs; the words that lead to it."""
     for run in (RUN, RUN.replace("0101", "0102")):
         shutil.copytree(commissioned, state / "runs" / run)
@@ -155,7 +155,7 @@ def served(state: Path, commissioned: Path) -> Iterator[tuple[Client, list[str]]
         while len(client.get("/api/v1/runs")) < 3:
             assert time.monotonic() < until
             time.sleep(0.05)
-        yield client, ["--server", client._url, "--state", str(state)]
+        yield client, ["--server", client.url, "--state", str(state)]
 
 
 @pytest.mark.slow

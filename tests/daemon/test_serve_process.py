@@ -18,11 +18,11 @@ from daemon.conftest import quick_text
 from daemon.served import daemon_process
 
 from ident_service.cli import main
+from ident_service.client import IdentClient
 from ident_service.errors import ArmError, MotionRefused, UnknownId, UsageError
 from ident_service.motion.control_file import ControlFile
 from ident_service.service.api.notify import tell_manager, watchdog_seconds
 from ident_service.service.arm_state import control_path
-from ident_service.service.client import Client
 from ident_service.service.jobs.child import ANSWER, LOG, PROCESS, UnitChild, alive, name_of
 from ident_service.service.jobs.door import taken
 
@@ -55,7 +55,7 @@ def test_the_command_drives_a_daemon(state: Path, tmp_path: Path, capsys: pytest
         assert client.get("/healthz")["healthy"] is True
         for name in ("token", "registry.sqlite", "serve.lock"):
             assert stat.S_IMODE((state / name).stat().st_mode) == 0o600, name
-        server = ("--server", client._url, "--state", state)
+        server = ("--server", client.url, "--state", state)
         client.post("/api/v1/arms", {"description": quick_text()})
         (state / "quick.yaml").write_text(quick_text())
         code, document = ident(capsys, "run", "quick", *server)
@@ -93,7 +93,7 @@ def test_the_command_drives_a_daemon(state: Path, tmp_path: Path, capsys: pytest
         assert ident(capsys, "accept", state / "runs" / run, "--note", "at the terminal", "--state", state)[0] == 0
         assert client.get("/api/v1/arms/quick")["accepted"]["who"].startswith("terminal:")
         code, document = ident(capsys, "token", "add", "ann", "--role", "viewer", "--state", state)
-        looks = Client(client._url, document["token"])
+        looks = IdentClient(client.url, document["token"])
         assert looks.get("/api/v1/whoami") == {"name": "ann", "role": "viewer"}
         assert "ident_jobs" in _metrics(client)
         with pytest.raises(UsageError, match="look only"):
@@ -113,9 +113,8 @@ def test_the_command_drives_a_daemon(state: Path, tmp_path: Path, capsys: pytest
     assert "ident_" not in (state.parent / "serve.log").read_text().replace("ident_service", "")
 
 
-def _metrics(client: Client) -> str:
-    client._connection.request("GET", "/metrics", headers=client._headers)
-    return client._connection.getresponse().read().decode()
+def _metrics(client: IdentClient) -> str:
+    return client.content("/metrics").decode()
 
 
 def test_a_manager_hears_ready_alive_and_stopping(state: Path, tmp_path: Path) -> None:
@@ -168,7 +167,7 @@ def test_what_would_be_open_is_not_served(
 )
 def test_a_token_is_sent_nowhere_in_the_clear(url: str) -> None:
     with pytest.raises(UsageError):
-        Client(url, "ident_secret")
+        IdentClient(url, "ident_secret")
 
 
 def door(folder: Path, request: dict[str, Any], more: bytes = b"") -> tuple[int, str]:

@@ -11,6 +11,7 @@ from maintenance.drifting import reidentified
 
 from ident_service.cli import main
 from ident_service.results.manifest import verified_files
+from ident_service.service.arm_state import fault_file
 from ident_service.service.maintenance.alarms import alarms
 from ident_service.service.maintenance.schedules import When, add_schedule, dues
 from ident_service.service.registry.audit import trail
@@ -79,8 +80,10 @@ def test_without_a_typed_name_or_something_accepted_nothing_moves(
     assert main([*words, "planar2", "--confirm", "planar2"]) == 2
     assert "nothing has been accepted" in json.loads(capsys.readouterr().out)["error"]["message"]
     arm = next(state.glob("descriptions/quick-*/arm.yaml"))
-    assert main([*words, str(arm), "--confirm", "quack"]) == 3
-    assert json.loads(capsys.readouterr().out)["error"]["kind"] == "MotionRefused"
+    assert main([*words, str(arm), "--confirm", "quack"]) == 5  # 3 would mean that it has changed
+    assert json.loads(capsys.readouterr().out)["error"]["kind"] == "PersonNeeded"
+    fault_file(state, "quick").latch("lease_lost", "nobody was there")
+    assert main([*words, str(arm), "--confirm", "quick"]) == 5
     assert [path.name for path in (state / "runs").iterdir()] == [accepted]
     assert db.rows("SELECT * FROM reidentifications") == []
 

@@ -45,7 +45,7 @@ class Scene:
         mark_interrupted(self.db, self.state)
 
     def allow(self, **changes: object) -> None:
-        add_arm(self.db, self.state, description(unattended="allowed", **changes), {}, "me")
+        add_arm(self.db, self.state, description(unattended="allowed", **changes), {}, "me", replace=True)
 
     def at_six(self) -> None:
         """A schedule of six o'clock, and its time has come."""
@@ -262,7 +262,7 @@ def test_nothing_accepted_or_another_mechanism_cannot_be_compared(scene: Scene) 
     with pytest.raises(UsageError, match="nothing has been accepted"):
         scene.keeper.reidentifications.begin(Wanted("new"), "ann")
     longer = description().replace("shoulder: {a: 0.5}", "shoulder: {a: 0.6}")
-    add_arm(scene.db, scene.state, longer, {}, "me")
+    add_arm(scene.db, scene.state, longer, {}, "me", replace=True)
     with pytest.raises(UsageError, match="kinematics"):
         scene.keeper.reidentifications.begin(Wanted(ARM), "ann")
     assert scene.queued == []

@@ -26,7 +26,7 @@ def daemon(accepted: str, state: Path) -> Iterator[Asked]:
 
 
 def upload(daemon: Asked, text: str) -> None:
-    assert daemon.post("/api/v1/arms", {"description": text}).status_code == 201
+    assert daemon.post("/api/v1/arms", {"description": text, "replace": True}).status_code == 201
 
 
 def followed(daemon: Asked, name: str, *, lease: bool) -> dict[str, Any]:
@@ -44,7 +44,7 @@ def test_a_person_asks_and_a_drier_joint_is_found(daemon: Asked, viewer: str) ->
     assert daemon.post("/api/v1/schedules", {"arm": ARM, "maintenance": True}).status_code == 201
     assert daemon.post(f"/api/v1/arms/{ARM}/maintenance", {"what": "belt changed"}).status_code == 201
     (due,) = daemon.get("/api/v1/due").json()
-    assert 'ident_arm_due{arm="quick"} 1\n' in daemon.get("/metrics").text
+    assert 'ident_arm_due{arm="quick"} 1.0\n' in daemon.get("/metrics").text
     assert due["cause"] == "maintenance: belt changed"
     time.sleep(2.0)  # time enough for four looks
     assert daemon.get("/api/v1/jobs").json() == []  # it asks for a person, and does nothing
@@ -71,7 +71,7 @@ def test_a_person_asks_and_a_drier_joint_is_found(daemon: Asked, viewer: str) ->
 
     (alarm,) = daemon.get("/api/v1/alarms").json()
     assert (alarm["run"], "friction of joint elbow" in alarm["what"]) == (ended["run"], True)
-    assert 'ident_arm_drift_alarms{arm="quick"} 1\n' in daemon.get("/metrics").text
+    assert 'ident_arm_drift_alarms{arm="quick"} 1.0\n' in daemon.get("/metrics").text
     looks = {"headers": {"Authorization": f"Bearer {viewer}"}}
     assert daemon.get("/api/v1/alarms", **looks).status_code == 200
     assert daemon.post(f"/api/v1/alarms/{alarm['id']}/ack", {"note": "x"}, **looks).status_code == 403
@@ -129,7 +129,7 @@ def test_the_command_drives_a_daemon(accepted: str, state: Path, capsys: pytest.
 
     with daemon_process(state) as (process, client):
         url = url_of(process, state)
-        client.post("/api/v1/arms", {"description": description(seed=33)})
+        client.post("/api/v1/arms", {"description": description(seed=33), "replace": True})
         assert "next 20" in ident("schedule", "add", ARM, "--cron", "0 6 * * mon")[1]
         assert ident("schedule", "add", ARM, "--maintenance")[0] == 0
         assert ident("schedule", "disable", "1")[1].endswith(", disabled\n")
@@ -154,7 +154,7 @@ def test_the_command_drives_a_daemon(accepted: str, state: Path, capsys: pytest.
 def test_a_kill_in_the_midst_is_told_and_nothing_moves_by_itself(accepted: str, state: Path, step: str) -> None:
     path = "/api/v1/reidentifications"
     with daemon_process(state) as (process, client):
-        client.post("/api/v1/arms", {"description": description(seed=34)})
+        client.post("/api/v1/arms", {"description": description(seed=34), "replace": True})
         word = client.post(f"/api/v1/arms/{ARM}/challenge")["challenge"]
         row = client.post(path, {"arm": ARM, "confirm": {"name": ARM, "challenge": word}})
         while not (row["step"] == step and client.get(f"/api/v1/jobs/{row['job']}")["state"] == "running"):

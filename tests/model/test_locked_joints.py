@@ -16,8 +16,8 @@ from ident_service.config.schema import ArmConfig
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.chain import Chain
+from ident_service.model.mechanism import read_mechanism
 from ident_service.model.regressor import joint_regressor
-from ident_service.model.rigid_body import mjcf_model, urdf_part
 from ident_service.model.scene import scene
 from ident_service.results.export.urdf_file import urdf_export
 
@@ -198,7 +198,7 @@ def whole_torques(
 def test_the_arm_moves_as_in_the_whole_mechanism(text: str, kinematics: dict[str, Any], names: tuple[str, ...]) -> None:
     model = arm(text, **kinematics)
     assert model.chain.names == names
-    _, held = urdf_part(TextFile(name="arm.urdf", text=text), model.config.kinematics)
+    held = read_mechanism(TextFile(name="arm.urdf", text=text), "urdf", model.config.kinematics).held
     assert set(held) | set(names) == set(pin.buildModelFromXML(text).names[1:])
     rng = np.random.default_rng(7)
     states = tuple(rng.uniform(-1.5, 1.5, (20, len(names))) for _ in range(3))
@@ -208,17 +208,17 @@ def test_the_arm_moves_as_in_the_whole_mechanism(text: str, kinematics: dict[str
 
 def test_a_finger_that_mimics_a_locked_one_is_where_that_one_puts_it() -> None:
     file = TextFile(name="arm.urdf", text=PANDA)
-    _, held = urdf_part(file, Kinematics(urdf=file, lock={"panda_finger_joint1": 0.03}))
+    held = read_mechanism(file, "urdf", Kinematics(urdf=file, lock={"panda_finger_joint1": 0.03})).held
     assert held == {"panda_finger_joint1": 0.03, "panda_finger_joint2": 0.03}
     file = TextFile(name="arm.urdf", text=TIAGO)
-    _, held = urdf_part(file, Kinematics(urdf=file, tip="arm_3_link", lock={"gripper_left_joint": 0.7}))
+    held = read_mechanism(file, "urdf", Kinematics(urdf=file, tip="arm_3_link", lock={"gripper_left_joint": 0.7})).held
     assert held["gripper_right_joint"] == pytest.approx(-0.5)
     assert (held["wheel_left_joint"], held["head_1_joint"]) == (0.0, 0.0)
 
 
 def test_a_joint_outside_that_cannot_be_at_zero_is_at_its_nearest_limit() -> None:
     file = TextFile(name="arm.urdf", text=PANDA.replace('lower="0" upper="0.04"', 'lower="0.01" upper="0.04"'))
-    _, held = urdf_part(file, Kinematics(urdf=file, tip="panda_hand"))
+    held = read_mechanism(file, "urdf", Kinematics(urdf=file, tip="panda_hand")).held
     assert held == {"panda_finger_joint1": 0.01, "panda_finger_joint2": 0.01}
 
 
@@ -323,7 +323,7 @@ def test_joints_of_an_mjcf_can_be_locked() -> None:
         f'{body}<body name="b" pos="0 0 1"><joint name="two" axis="0 1 0"/>{body}</body></body></worldbody></mujoco>'
     )
     file = TextFile(name="arm.xml", text=text)
-    model = mjcf_model(file, Kinematics(mjcf=file, lock={"two": 0.5}))
-    assert list(model.names) == ["universe", "one"]
-    assert model.inertias[1].mass == pytest.approx(2.0)
-    assert list(mjcf_model(file, Kinematics(mjcf=file, base="a")).names) == ["universe", "two"]
+    found = read_mechanism(file, "mjcf", Kinematics(mjcf=file, lock={"two": 0.5}))
+    assert (found.names, found.held) == (("one",), {"two": 0.5})
+    assert found.bodies[0, 9] == pytest.approx(2.0)
+    assert read_mechanism(file, "mjcf", Kinematics(mjcf=file, base="a")).names == ("two",)

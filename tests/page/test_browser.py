@@ -29,7 +29,7 @@ ARM = "quick"
 
 def known(reached: Reached, text: str) -> None:
     """The service knows the arm of this description."""
-    add_arm(reached.service.db, reached.service.state, text, {}, "test")
+    add_arm(reached.service.db, reached.service.state, text, {}, "test", replace=True)
 
 
 def ready(reached: Reached) -> None:

@@ -44,7 +44,7 @@ def arm_page(page: Page, reached: Reached) -> None:
 def plant(reached: Reached, seed: int, drier: float = 1.0, periods: int = 4) -> None:
     """From now on the simulated arm is this one."""
     text = description(seed=seed, drier=drier, periods=periods)
-    add_arm(reached.service.db, reached.service.state, text, {}, "test")
+    add_arm(reached.service.db, reached.service.state, text, {}, "test", replace=True)
 
 
 def make_due(page: Page, reached: Reached) -> None:

@@ -49,12 +49,14 @@ def original_urdf(model: ArmModel, delta: Array, has: Carried) -> tuple[str, tup
     Raises:
         ModelError: a link without positive mass, or a file that cannot be edited.
     """
-    from ident_service.model.rigid_body import delta_from_inertia, joint_frame_inertias, urdf_part
+    from ident_service.model.mechanism import read_mechanism
+    from ident_service.model.mechanism_process import delta_from_inertia
+    from ident_service.model.rigid_body import joint_frame_inertias
 
     file = model.config.kinematics.urdf
     if file is None:
         raise ModelError(f"{model.config.name}: is not described by a URDF")
-    _, held = urdf_part(file, model.config.kinematics)
+    held = read_mechanism(file, "urdf", model.config.kinematics).held
     robot = _Robot(xml_places(file.text, file.name), file.name, held)
     edits: list[Edit] = []
     notes: list[str] = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Request, Response
 from fastapi.responses import PlainTextResponse
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -15,6 +15,7 @@ from ident_service.service.api.answers import AuditLine, HealthAnswer, WhoAnswer
 from ident_service.service.api.asking import COOKIE, Cookie, Serving, Viewer, address_of, throttled, unknown
 from ident_service.service.api.gate import SESSION_SECONDS, Throttled
 from ident_service.service.api.mistakes import failures, failures_of_files
+from ident_service.service.api.paging import PAGES, BeforeNumber, Most, Page
 from ident_service.service.arm_state import fault_file
 from ident_service.service.maintenance.alarms import alarms
 from ident_service.service.maintenance.schedules import dues
@@ -35,7 +36,7 @@ class Login(BaseModel):
     "/healthz", responses={503: {"model": HealthAnswer, "description": "Queue or schedule is not looked after."}}
 )
 def healthz(service: Serving, response: Response) -> HealthAnswer:
-    """Whether the service looks after its queue and its schedule; asks for no token."""
+    """Tell whether the service looks after its queue and its schedule; asks for no token."""
     healthy = service.engine.healthy and service.keeper.healthy and not service.engine.closing
     response.status_code = 200 if healthy else 503
     return HealthAnswer(healthy=healthy, version=__version__)
@@ -43,7 +44,7 @@ def healthz(service: Serving, response: Response) -> HealthAnswer:
 
 @router.get("/metrics", response_class=PlainTextResponse, responses=failures_of_files())
 def metrics(service: Serving, _: Viewer) -> PlainTextResponse:
-    """Figures in Prometheus' text format."""
+    """Read the figures of the service in Prometheus' text format."""
     rows = service.db.rows("SELECT kind, state, COUNT(*) AS number FROM jobs GROUP BY kind, state")
     faults, place = dict[str, int](), service.state / "arms"
     for folder in place.iterdir() if place.is_dir() else ():
@@ -60,13 +61,13 @@ def metrics(service: Serving, _: Viewer) -> PlainTextResponse:
 
 @router.get("/api/v1/whoami")
 def whoami(who: Viewer) -> WhoAnswer:
-    """Who asks."""
+    """Tell whose token or session asks."""
     return WhoAnswer(name=who.name, role=who.role)
 
 
 @router.post("/api/v1/login")
 def login(service: Serving, request: Request, response: Response, body: Login) -> WhoAnswer:
-    """Exchange a token for a session, in a cookie that scripts cannot read and other sites do not send."""
+    """Exchange a token for a session; its cookie cannot be read by scripts and is sent by no other site."""
     try:
         found = service.gate.log_in(body.token, address_of(request))
     except Throttled as error:
@@ -87,19 +88,14 @@ def login(service: Serving, request: Request, response: Response, body: Login) -
 
 @router.post("/api/v1/logout", status_code=204)
 def logout(service: Serving, response: Response, cookie: Cookie = None) -> None:
-    """End the session."""
+    """End the session of the page."""
     if cookie is not None:
         service.gate.log_out(cookie)
     response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
 
 
-@router.get("/api/v1/audit")
-def audit(
-    service: Serving,
-    _: Viewer,
-    before: Annotated[int, Query(ge=0, lt=2**62)] | None = None,
-    most: Annotated[int, Query(ge=1, le=500)] = 100,
-) -> list[AuditLine]:
-    """Who did what, the newest first; `before` the id of a line goes on from there."""
+@router.get("/api/v1/audit", responses=PAGES)
+def audit(page: Page, service: Serving, _: Viewer, before: BeforeNumber = None, most: Most = 100) -> list[AuditLine]:
+    """List who did what, the newest first."""
     service.engine.audit.flush(AUDIT_SECONDS)
-    return [AuditLine(**row) for row in trail(service.db, before=before, most=most)]
+    return [AuditLine(**row) for row in page(most, lambda n: trail(service.db, before=before, most=n))]

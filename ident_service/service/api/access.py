@@ -30,13 +30,13 @@ class TokenLine(BaseModel):
 
 @router.get("/tokens")
 def list_tokens(service: Serving, _: Operator) -> list[TokenLine]:
-    """All tokens that ever were, the earliest first."""
+    """List all tokens that ever were, the earliest first."""
     return [TokenLine(**row) for row in tokens(service.db)]
 
 
 @router.post("/tokens/{token}/revoke")
 def revoke(service: Serving, who: Operator, token: TokenName) -> TokenLine:
-    """Let a token, and the sessions that it began, count no more."""
+    """Revoke a token and the sessions that it began."""
     revoke_token(service.db, token, who.name)
     service.gate.refresh()
     return next(TokenLine(**row) for row in tokens(service.db) if row["name"] == token)

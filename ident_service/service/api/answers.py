@@ -196,7 +196,7 @@ class AuditLine(BaseModel):
 
 
 class WhoAnswer(BaseModel):
-    """Who asks."""
+    """Tell whose token or session asks."""
 
     name: str
     role: Literal["viewer", "operator"]

@@ -14,18 +14,31 @@ from fastapi.routing import APIRoute
 
 from ident_service import __version__
 from ident_service.service.acceptance import settle
-from ident_service.service.api import about, access, arms, descriptions, exports, jobs, maintenance, pruning, runs
+from ident_service.service.api import (
+    about,
+    access,
+    arms,
+    descriptions,
+    exports,
+    jobs,
+    live_routes,
+    maintenance,
+    pruning,
+    runs,
+)
 from ident_service.service.api.asking import Service
+from ident_service.service.api.checks import Checks
 from ident_service.service.api.connections import Connections
+from ident_service.service.api.description import describe
 from ident_service.service.api.doors import Doors
 from ident_service.service.api.gate import Gate
-from ident_service.service.api.metrics import Metrics
 from ident_service.service.api.mistakes import answer_mistakes
 from ident_service.service.api.settings import Settings
 from ident_service.service.jobs.engine import Engine
 from ident_service.service.live import LiveRuns
 from ident_service.service.maintenance.keeper import Keeper, note_gave_up
 from ident_service.service.maintenance.webhook import Webhook, read_secret
+from ident_service.service.metrics import Metrics
 from ident_service.service.pages.routes import PAGES
 from ident_service.service.registry.arms import know_shipped
 from ident_service.service.registry.database import Database
@@ -35,7 +48,16 @@ from ident_service.service.registry.tokens import first_token
 _REFRESH = 1.0  # s between looks for tokens that were made or revoked at a terminal
 _LOG = logging.getLogger("ident.serve")
 ROUTERS = (
-    *(about.router, access.router, arms.router, descriptions.router, jobs.router, runs.router, pruning.router),
+    *(
+        about.router,
+        access.router,
+        arms.router,
+        descriptions.router,
+        jobs.router,
+        live_routes.router,
+        runs.router,
+        pruning.router,
+    ),
     *(exports.router, maintenance.router, *PAGES),
 )
 """In this order."""
@@ -54,21 +76,23 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
     db = Database(settings.state)
     first_token(db, settings.state)
     know_shipped(db)
+    metrics = Metrics()
     engine = Engine(
         *(db, settings.state),
         computing=settings.computing,
         motion_door=settings.motion_door,
         lease_factor=settings.lease_factor,
+        metrics=metrics,
     )
     keeper = Keeper(engine, _webhook(settings, db))
-    service = Service(settings, db, engine, Gate(db), Metrics(), keeper)
+    service = Service(settings, db, engine, Gate(db), metrics, keeper, Checks())
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         settle(db, settings.state)
         engine.start(lambda: rebuild_runs(db, settings.state))
         keeper.start()
-        refreshing = asyncio.create_task(_refresh(service.gate))
+        refreshing = asyncio.create_task(_refresh(service))
         try:
             yield
         finally:
@@ -93,19 +117,21 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
     app.state.live = LiveRuns()
     for router in ROUTERS:
         app.include_router(router)
+    describe(app)
     answer_mistakes(app)
     book = Connections() if connections is None else connections
     app.add_middleware(Doors, settings=settings, metrics=service.metrics, connections=book)
     return app
 
 
-async def _refresh(gate: Gate) -> None:
+async def _refresh(service: Service) -> None:
     while True:
         await asyncio.sleep(_REFRESH)
         try:
-            await run_in_threadpool(gate.refresh)
+            await run_in_threadpool(service.gate.refresh)
+            await run_in_threadpool(service.db.rest)
         except sqlite3.Error as error:
-            _LOG.error("tokens cannot be read: %s", error)
+            _LOG.error("the registry cannot be looked after: %s", error)
 
 
 def _webhook(settings: Settings, db: Database) -> Webhook | None:

@@ -9,6 +9,7 @@ from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict, Field
 
 from ident_service.config.simulation import SimulatedDriver
+from ident_service.config.source import MOST_BYTES
 from ident_service.motion.control_file import mover
 from ident_service.service.acceptance import LONGEST_NOTE, accept, acceptances, rollback
 from ident_service.service.api.answers import (
@@ -23,6 +24,7 @@ from ident_service.service.api.answers import (
 from ident_service.service.api.asking import Operator, Service, Serving, Viewer
 from ident_service.service.api.gate import CHALLENGE_SECONDS
 from ident_service.service.api.mistakes import failures
+from ident_service.service.api.paging import PAGES, BeforeId, Most, Page
 from ident_service.service.arm_state import control_path, fault_file
 from ident_service.service.jobs.asked import ArmName, FileName, Id
 from ident_service.service.registry import arms as known
@@ -42,8 +44,17 @@ class _Body(BaseModel):
 class Description(_Body):
     """An arm's description, as YAML, and the files that it names by name."""
 
-    description: Text
+    description: Annotated[str, Field(max_length=MOST_BYTES)]
     files: Annotated[dict[FileName, Text], Field(max_length=16)] = {}
+
+
+class NewArm(Description):
+    """A description that is to be kept.
+
+    `replace` says that it may take the place of another one of its name; without it that is answered 409.
+    """
+
+    replace: bool = False
 
 
 class MotionUpload(_Body):
@@ -69,32 +80,35 @@ class Rollback(_Body):
 
 @router.get("/arms")
 def list_arms(service: Serving, _: Viewer) -> list[ArmLine]:
-    """All arms."""
+    """List all arms by name."""
     return [ArmLine(**row) for row in known.arm_names(service.db)]
 
 
-@router.post("/arms", status_code=201)
-def add_arm(service: Serving, who: Operator, body: Description) -> ArmAnswer:
-    """Take a description; a later one of the same name replaces it."""
-    return _arm(service, known.add_arm(service.db, service.state, body.description, body.files, who.name).name)
+@router.post("/arms", status_code=201, responses=failures(409))
+def add_arm(service: Serving, who: Operator, body: NewArm) -> ArmAnswer:
+    """Add an arm by its description; sending the same one again changes nothing."""
+    text, files = body.description, body.files
+    with service.checks.place():
+        added = known.add_arm(service.db, service.state, text, files, who.name, replace=body.replace)
+    return _arm(service, added.name)
 
 
 @router.get("/arms/{arm}")
 def get_arm(service: Serving, _: Viewer, arm: ArmName) -> ArmAnswer:
-    """One arm, and how it is."""
+    """Show an arm: its description, who moves it, its faults, what was accepted."""
     return _arm(service, arm)
 
 
 @router.post("/arms/{arm}/challenge", status_code=201)
 def challenge(service: Serving, who: Operator, arm: ArmName) -> ChallengeAnswer:
-    """A word that, with the typed name of the arm, confirms one motion: a request that comes twice moves it once."""
+    """Make a challenge, which with the typed name confirms one motion; a request that comes twice moves it once."""
     name = known.known_arm(service.db, service.state, arm).name
     return ChallengeAnswer(arm=name, challenge=service.gate.challenge(name, who.name), seconds=CHALLENGE_SECONDS)
 
 
 @router.get("/arms/{arm}/faults")
 def list_faults(service: Serving, _: Viewer, arm: ArmName) -> list[FaultAnswer]:
-    """Faults that nobody has acknowledged, the earliest first."""
+    """List the faults of an arm that nobody has acknowledged, the earliest first."""
     return _arm(service, arm).faults
 
 
@@ -111,19 +125,19 @@ def acknowledge(service: Serving, who: Operator, arm: ArmName, code: Id) -> Faul
 
 @router.post("/arms/{arm}/pause")
 def pause(service: Serving, who: Operator, arm: ArmName) -> AskedAnswer:
-    """Let the arm stand."""
+    """Pause the motion of an arm; it keeps its lease."""
     return _pause(service, who.name, arm, wanted=True)
 
 
 @router.post("/arms/{arm}/resume")
 def resume(service: Serving, who: Operator, arm: ArmName) -> AskedAnswer:
-    """Let it go on."""
+    """Resume the motion of an arm."""
     return _pause(service, who.name, arm, wanted=False)
 
 
 @router.post("/arms/{arm}/finish")
 def finish(service: Serving, who: Operator, arm: ArmName) -> AskedAnswer:
-    """Leave out the rest of the motion: the arm goes back to where it stood, and the run is done."""
+    """Finish a run early; the arm goes back to where it stood, and the run is done."""
     name = known.known_arm(service.db, service.state, arm).name
     return AskedAnswer(arm=name, asked="finish", reached=service.engine.finish(name, who.name))
 
@@ -137,7 +151,7 @@ def supported(service: Serving, who: Operator, arm: ArmName) -> AskedAnswer:
 
 @router.get("/arms/{arm}/acceptances")
 def list_acceptances(service: Serving, _: Viewer, arm: ArmName) -> list[AcceptanceAnswer]:
-    """What was accepted, the earliest first; the last one is current."""
+    """List the accepted sets of an arm, the earliest first; the last one is current."""
     name = known.known_arm(service.db, service.state, arm).name
     return [AcceptanceAnswer(**asdict(act)) for act in acceptances(service.state, name)]
 
@@ -158,22 +172,25 @@ def roll_back(service: Serving, who: Operator, arm: ArmName, body: Rollback) -> 
     return AcceptanceAnswer(**asdict(rollback(service.db, service.state, name, body.note, who.name, body.to)))
 
 
-@router.get("/motions")
-def list_motions(service: Serving, _: Viewer, arm: ArmName | None = None) -> list[MotionAnswer]:
-    """All motions, or those of an arm, the newest first."""
-    return [MotionAnswer(**row) for row in motions.motions(service.db, arm)]
+@router.get("/motions", responses=PAGES)
+def list_motions(
+    page: Page, service: Serving, _: Viewer, arm: ArmName | None = None, before: BeforeId = None, most: Most = 500
+) -> list[MotionAnswer]:
+    """List motions, or those of an arm, the newest first."""
+    found = page(most, lambda n: motions.motions(service.db, arm, before=before, most=n))
+    return [MotionAnswer(**row) for row in found]
 
 
 @router.post("/motions", status_code=201)
 def add_motion(service: Serving, who: Operator, body: MotionUpload) -> MotionAnswer:
-    """Take a motion that was designed elsewhere; preflight judges it like any other."""
+    """Upload a motion that was designed elsewhere; preflight judges it like any other."""
     name = known.known_arm(service.db, service.state, body.arm).name
     return MotionAnswer(**motions.add_motion(service.db, service.state, name, body.motion, who.name))
 
 
 @router.get("/motions/{motion}")
 def get_motion(service: Serving, _: Viewer, motion: Id) -> MotionAnswer:
-    """One motion."""
+    """Show a motion: its arm, duration and hash."""
     return MotionAnswer(**motions.known_motion(service.db, motion))
 
 

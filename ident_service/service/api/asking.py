@@ -16,11 +16,12 @@ from fastapi import Depends, HTTPException, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBearer
 
+from ident_service.service.api.checks import Checks
 from ident_service.service.api.gate import Gate, Throttled
-from ident_service.service.api.metrics import Metrics
 from ident_service.service.api.settings import Settings
 from ident_service.service.jobs.engine import Engine
 from ident_service.service.maintenance.keeper import Keeper
+from ident_service.service.metrics import Metrics
 from ident_service.service.registry.database import Database
 from ident_service.service.registry.tokens import Access
 
@@ -38,6 +39,7 @@ class Service:
     gate: Gate
     metrics: Metrics
     keeper: Keeper
+    checks: Checks
 
     @property
     def state(self) -> Path:

@@ -11,9 +11,11 @@ from typing import Literal
 from fastapi import APIRouter
 from pydantic import BaseModel
 
+from ident_service.config.load import load_arm
 from ident_service.service.api.arms import Description
 from ident_service.service.api.asking import Operator, Serving, Viewer
 from ident_service.service.api.mistakes import failures
+from ident_service.service.description_process import judge_apart
 from ident_service.service.jobs.asked import ArmName
 from ident_service.service.registry.arms import known_arm, uploaded
 
@@ -44,24 +46,15 @@ class HomeJoint(BaseModel):
 
 @router.post("/descriptions/check")
 def check(service: Serving, _: Operator, body: Description) -> DescriptionAnswer:
-    """Judge a description and keep nothing of it; its mistakes are answered with line and column."""
-    from ident_service.service.description_check import check_description, description_text
-
-    with uploaded(service.state, body.description, body.files) as path:
-        checked = check_description(path, upload=True)
-    config, gains = checked.model.config, checked.gains
-    return DescriptionAnswer(
-        arm=config.name,
-        sha256=config.sha256,
-        stable=None if gains is None else gains.stable,
-        objections=[] if gains is None else list(gains.objections()),
-        text=description_text(path.name, checked),
-    )
+    """Check a description without keeping it; its mistakes are answered with line and column."""
+    with service.checks.place(), uploaded(service.state, body.description, body.files) as path:
+        load_arm(path, upload=True)  # most have mistakes that are found here, without a process
+        return DescriptionAnswer(**judge_apart(path))
 
 
 @router.get("/arms/{arm}/home")
 def get_home(service: Serving, _: Viewer, arm: ArmName) -> list[HomeJoint]:
-    """The posture in which an arm must stand when a job of the kind `zero` is asked for; refused for other arms."""
+    """Show the posture in which an arm must stand when it is zeroed; refused for other arms."""
     from ident_service.service.zeroing import home_posture
 
     return [HomeJoint(**asdict(one)) for one in home_posture(known_arm(service.db, service.state, arm).config)]

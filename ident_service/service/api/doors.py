@@ -19,8 +19,8 @@ from urllib.parse import urlsplit
 from fastapi import HTTPException
 
 from ident_service.service.api.connections import Connections, Peer
-from ident_service.service.api.metrics import Metrics
 from ident_service.service.api.settings import Settings
+from ident_service.service.metrics import Metrics
 
 Scope = MutableMapping[str, Any]
 Message = MutableMapping[str, Any]
@@ -102,7 +102,8 @@ class Doors:
                     await _refuse(answer, 413, "TooLarge", error.detail)
         finally:
             self._connections.answered(peer)
-            self._metrics.request(scope["method"], status, time.perf_counter() - began)
+            stop = scope["method"] == "POST" and scope["path"].endswith("/stop")
+            self._metrics.request(scope["method"], status, time.perf_counter() - began, stop=stop)
             _LOG.info(
                 "request",
                 extra={

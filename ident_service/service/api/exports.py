@@ -34,7 +34,7 @@ class ExportAnswer(BaseModel):
 
 @router.get("/exports/{export}")
 def get_export(service: Serving, _: Viewer, export: Id) -> ExportAnswer:
-    """One export, by the id that its job names as its run."""
+    """Show an export and its files, by the id that its job names as its run."""
     row = exports.known_export(service.db, export)
     return ExportAnswer(
         id=row["run"],
@@ -49,6 +49,6 @@ def get_export(service: Serving, _: Viewer, export: Id) -> ExportAnswer:
 
 @router.get("/exports/{export}/files/{name}", response_class=FileResponse, responses=_BINARY)
 def get_exported_file(service: Serving, _: Viewer, export: Id, name: FileName) -> FileResponse:
-    """One of its files; as something to be kept, never as a page."""
+    """Download a file of an export; as something to be kept, never as a page."""
     path = exports.export_file(service.db, service.state, export, name)
     return FileResponse(path, media_type="application/octet-stream", filename=name)

@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import json
+import sqlite3
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from typing import Annotated, Any, Final, Literal
 
-from fastapi import APIRouter, HTTPException, Query
+from fastapi import APIRouter, Header, HTTPException, Query, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import PlainTextResponse, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
-from ident_service.errors import MotionRefused
+from ident_service.errors import MotionRefused, UsageError
 from ident_service.service.api.answers import JobAnswer, JobResult, LeaseAnswer, StopAnswer
 from ident_service.service.api.asking import LeaseKeeper, Near, Operator, Service, Serving, Viewer
 from ident_service.service.api.mistakes import failures, failures_of_files
+from ident_service.service.api.paging import PAGES, BeforeNumber, Most, Page
 from ident_service.service.jobs.asked import MOVES, ArmName, Asked, Id
 from ident_service.service.jobs.commands import JOBS
 from ident_service.service.jobs.outcome import said
 from ident_service.service.registry import jobs as rows
 from ident_service.service.registry.database import Row
+from ident_service.service.registry.tokens import Access
 
 router = APIRouter(prefix="/api/v1", tags=["jobs"], responses=failures(404, 409))
 MOST_LOG: Final = 2**20
@@ -34,6 +38,22 @@ _STREAM: dict[int | str, dict[str, Any]] = {
     200: {"content": {"text/event-stream": {}}, "description": "Events."},
     **failures_of_files(404, 409),
 }
+_REPLAYED: Final[dict[str, Any]] = {
+    "Idempotent-Replayed": {
+        "description": "`true` where the key had made this job before.",
+        "schema": {"type": "string"},
+    }
+}
+Key = Annotated[
+    str | None,
+    Header(
+        min_length=1,
+        max_length=200,
+        pattern=r"^[\x21-\x7e]+$",
+        description="of computations: within a day, the same token, key and job are answered with the job that was "
+        "made then, and another job with the same key is 409",
+    ),
+]
 State = Literal["queued", "running", "done", "refused", "failed", "faulted", "cancelled", "interrupted"]
 
 
@@ -68,44 +88,75 @@ def require_confirmed(service: Service, arm: str, confirm: Confirmation | None, 
         )
 
 
-@router.post("/jobs", status_code=201)
-def create_job(service: Serving, who: Operator, body: JobRequest) -> JobAnswer:
-    """Queue a job."""
+@router.post("/jobs", status_code=201, responses={201: {"headers": _REPLAYED}})
+def create_job(
+    service: Serving, who: Operator, body: JobRequest, response: Response, idempotency_key: Key = None
+) -> JobAnswer:
+    """Begin or queue a job; a computation that is asked for again with the same `Idempotency-Key` is the same job."""
+    if idempotency_key is None:
+        return begin_job(service, who, body)
+    if body.job.kind in MOVES:
+        raise UsageError("a motion has no Idempotency-Key: its challenge counts once, and it must not begin later")
+    asked = hashlib.sha256(body.job.model_dump_json().encode()).hexdigest()
+    if (row := rows.job_of_key(service.db, who.name, idempotency_key, asked)) is None:
+
+        def enter(job: Row) -> None:
+            rows.enter_key(service.db, who.name, idempotency_key, asked, job["id"])
+
+        try:
+            return answer_of(service, service.engine.create(body.job, who.name, entering=enter))
+        except sqlite3.IntegrityError:  # the same request came twice at a time, and the other one was the first
+            row = rows.job_of_key(service.db, who.name, idempotency_key, asked)
+            if row is None:
+                raise
+    response.headers["Idempotent-Replayed"] = "true"
+    return answer_of(service, row)
+
+
+def begin_job(service: Service, who: Access, body: JobRequest) -> JobAnswer:
+    """Queue what is asked for, in a request to the API or on a page.
+
+    Raises:
+        MotionRefused: a motion that no person has confirmed.
+        IdentError: as the engine.
+    """
     if body.job.kind in MOVES:
         require_confirmed(service, getattr(body.job, "arm", ""), body.confirm, who.name)
     return answer_of(service, service.engine.create(body.job, who.name))
 
 
-@router.get("/jobs")
+@router.get("/jobs", responses=PAGES)
 def list_jobs(
+    page: Page,
     service: Serving,
     _: Viewer,
     state: Annotated[list[State] | None, Query()] = None,
     arm: ArmName | None = None,
-    before: Annotated[int, Query(ge=0, lt=2**62)] | None = None,
-    most: Annotated[int, Query(ge=1, le=500)] = 100,
+    before: BeforeNumber = None,
+    most: Most = 100,
 ) -> list[JobAnswer]:
-    """Jobs, the newest first; `before` the number of one goes on from there."""
-    found = rows.jobs(service.db, states=tuple(state or rows.STATES), arm=arm, before=before, most=most)
+    """List jobs, the newest first."""
+    states = tuple(state or rows.STATES)
+    found = page(most, lambda n: rows.jobs(service.db, states=states, arm=arm, before=before, most=n), "number")
     return [answer_of(service, row) for row in found]
 
 
 @router.get("/jobs/{job}")
 def get_job(service: Serving, _: Viewer, job: Id) -> JobAnswer:
-    """One job."""
+    """Show a job: its state, its progress, and why it ended."""
     return answer_of(service, rows.known_job(service.db, job))
 
 
 @router.get("/jobs/{job}/log", response_class=PlainTextResponse, responses=failures_of_files(404, 409))
 def get_log(service: Serving, _: Viewer, job: Id) -> PlainTextResponse:
-    """What its process said, the last of it."""
+    """Read the end of the log of a job."""
     row = rows.known_job(service.db, job)
     return PlainTextResponse(said(service.state / JOBS / row["id"], MOST_LOG).log)
 
 
 @router.get("/jobs/{job}/result")
 def get_result(service: Serving, _: Viewer, job: Id) -> JobResult:
-    """What its command answered."""
+    """Read what the command of a job answered."""
     row = rows.known_job(service.db, job)
     answer = said(service.state / JOBS / row["id"]).answer
     return JobResult(job=row["id"], answer=without_paths(answer, str(service.state)))
@@ -113,21 +164,21 @@ def get_result(service: Serving, _: Viewer, job: Id) -> JobResult:
 
 @router.get("/jobs/{job}/events", response_class=StreamingResponse, responses=_STREAM)
 async def watch_job(service: Serving, _: Viewer, job: Id) -> StreamingResponse:
-    """Server-sent events: `job` whenever it changes, until it has ended."""
+    """Watch a job by server-sent events; `job` whenever it changes, until it has ended."""
     row = await run_in_threadpool(rows.known_job, service.db, job)
     return StreamingResponse(_events(service, row["id"]), media_type="text/event-stream")
 
 
 @router.post("/jobs/{job}/cancel")
 def cancel_job(service: Serving, who: Operator, job: Id) -> JobAnswer:
-    """Have it end; a motion comes to a controlled stop, and the job then says what happened."""
+    """Cancel a job; a motion comes to a controlled stop, and the job then says what happened."""
     service.engine.cancel(job, who.name)
     return answer_of(service, rows.known_job(service.db, job))
 
 
 @router.post("/jobs/{job}/lease")
 async def renew_lease(service: Serving, who: LeaseKeeper, job: Id) -> LeaseAnswer:
-    """Say that whoever asked for the motion is still there; only they can."""
+    """Renew the lease of a motion; only whoever asked for it can."""
     holder = service.engine.live.lease_holder(job)
     if holder is not None and holder != who.name:
         raise HTTPException(403, "the lease of a motion is renewed by whoever asked for it")
@@ -139,13 +190,13 @@ async def renew_lease(service: Serving, who: LeaseKeeper, job: Id) -> LeaseAnswe
 
 @router.post("/stop")
 async def stop_all(service: Serving, who: Near) -> StopAnswer:
-    """Bring all arms to a controlled stop. Needs no lease and no role; on the service's own machine no token either."""
+    """Stop all arms, under control; needs no lease and no role; on the service's own machine no token either."""
     return await _stop(service, None, who)
 
 
 @router.post("/arms/{arm}/stop")
 async def stop_arm(service: Serving, who: Near, arm: ArmName) -> StopAnswer:
-    """Bring an arm to a controlled stop, likewise; one that nobody moves is no mistake."""
+    """Stop an arm, under control; as for all arms; one that nobody moves is no mistake."""
     return await _stop(service, arm, who)
 
 

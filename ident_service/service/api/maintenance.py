@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import Annotated
 
-from fastapi import APIRouter, HTTPException, Path, Query
+from fastapi import APIRouter, HTTPException, Path
 from fastapi.concurrency import run_in_threadpool
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -21,6 +21,7 @@ from ident_service.service.api.maintenance_answers import (
     ScheduleAnswer,
 )
 from ident_service.service.api.mistakes import failures
+from ident_service.service.api.paging import PAGES, BeforeId, BeforeNumber, Most, Page
 from ident_service.service.jobs.asked import ArmName, Id
 from ident_service.service.maintenance import alarms as raised
 from ident_service.service.maintenance import schedules as planned
@@ -30,7 +31,6 @@ from ident_service.service.registry.database import Row
 
 router = APIRouter(prefix="/api/v1", tags=["maintenance"], responses=failures(404, 409))
 Number = Annotated[int, Path(ge=1, lt=2**62)]
-Most = Annotated[int, Query(ge=1, le=500)]
 Words = Annotated[str, Field(min_length=1, max_length=planned.LONGEST_NOTE)]
 
 
@@ -77,13 +77,13 @@ class NewReidentification(_Body):
 
 @router.get("/schedules")
 def list_schedules(service: Serving, _: Viewer, arm: ArmName | None = None) -> list[ScheduleAnswer]:
-    """All schedules, or those of an arm."""
+    """List schedules, or those of an arm."""
     return [ScheduleAnswer(**row) for row in planned.schedules(service.db, arm)]
 
 
 @router.post("/schedules", status_code=201)
 def add_schedule(service: Serving, who: Operator, body: NewSchedule) -> ScheduleAnswer:
-    """Add one."""
+    """Schedule the re-identification of an arm."""
     when = planned.When(body.cron, body.hours, body.maintenance)
     row = planned.add_schedule(service.db, _arm(service, body.arm), when, who.name, time.time(), body.motion)
     return ScheduleAnswer(**row)
@@ -91,53 +91,64 @@ def add_schedule(service: Serving, who: Operator, body: NewSchedule) -> Schedule
 
 @router.post("/schedules/{number}/enabled")
 def enable_schedule(service: Serving, who: Operator, number: Number, body: Enabled) -> ScheduleAnswer:
-    """Let one count again from now, or no more."""
+    """Enable a schedule from now on, or disable it."""
     row = planned.enable_schedule(service.db, number, who.name, time.time(), enabled=body.enabled)
     return ScheduleAnswer(**row)
 
 
 @router.delete("/schedules/{number}", status_code=204)
 def remove_schedule(service: Serving, who: Operator, number: Number) -> None:
-    """Take one away."""
+    """Remove a schedule."""
     planned.remove_schedule(service.db, number, who.name)
 
 
-@router.get("/arms/{arm}/maintenance")
-def list_maintenance(service: Serving, _: Viewer, arm: ArmName, most: Most = 100) -> list[EventAnswer]:
-    """Maintenance of an arm, the newest first."""
-    return [EventAnswer(**row) for row in planned.events(service.db, _arm(service, arm), most=most)]
+@router.get("/arms/{arm}/maintenance", responses=PAGES)
+def list_maintenance(
+    page: Page, service: Serving, _: Viewer, arm: ArmName, before: BeforeNumber = None, most: Most = 100
+) -> list[EventAnswer]:
+    """List the maintenance of an arm, the newest first."""
+    name = _arm(service, arm)
+    found = page(most, lambda n: planned.events(service.db, name, before=before, most=n))
+    return [EventAnswer(**row) for row in found]
 
 
 @router.post("/arms/{arm}/maintenance", status_code=201)
 def add_maintenance(service: Serving, who: Operator, arm: ArmName, body: Event) -> EventAnswer:
-    """Maintenance was done; what is scheduled after it falls due, and may begin by itself where that is allowed."""
+    """Enter maintenance that was done.
+
+    What is scheduled after it falls due, and may begin by itself where that is allowed.
+    """
     row = planned.add_event(service.db, _arm(service, arm), body.what, body.note, who.name, time.time())
     return EventAnswer(**row)
 
 
 @router.get("/due")
 def list_due(service: Serving, _: Viewer, arm: ArmName | None = None) -> list[DueAnswer]:
-    """What is due, the earliest first; a re-identification of the arm that comes to a verdict ends it."""
+    """List what is due, the earliest first; a re-identification of the arm that comes to a verdict ends it."""
     return [DueAnswer(**row) for row in planned.dues(service.db, arm)]
 
 
 @router.post("/due/{number}/dismiss", status_code=204)
 def dismiss_due(service: Serving, who: Operator, number: Number, body: Remark) -> None:
-    """A person's word that it is not to be done."""
+    """Dismiss what is due, by a person's word."""
     planned.dismiss(service.db, number, body.note, who.name, time.time())
 
 
-@router.get("/reidentifications")
+@router.get("/reidentifications", responses=PAGES)
 def list_reidentifications(
-    service: Serving, _: Viewer, arm: ArmName | None = None, most: Most = 100
+    page: Page, service: Serving, _: Viewer, arm: ArmName | None = None, before: BeforeId = None, most: Most = 100
 ) -> list[ReidentificationAnswer]:
-    """All of them, or those of an arm, the newest first."""
-    return [_told(service, row) for row in reidentifications(service.db, arm, most=most)]
+    """List re-identifications, the newest first."""
+    found = page(most, lambda n: reidentifications(service.db, arm, before=before, most=n))
+    return [_told(service, row) for row in found]
 
 
 @router.post("/reidentifications", status_code=201)
 def begin_reidentification(service: Serving, who: Operator, body: NewReidentification) -> ReidentificationAnswer:
-    """Check, run, identify, compare with the accepted set; the lease is renewed until the arm has come to rest."""
+    """Re-identify an arm: check, run, identify, compare with the accepted set.
+
+    The lease is renewed until the arm has come to rest.
+    """
     arm = _arm(service, body.arm)
     require_confirmed(service, arm, body.confirm, who.name)
     return _told(service, service.keeper.reidentifications.begin(Wanted(arm, body.motion), who.name))
@@ -145,13 +156,13 @@ def begin_reidentification(service: Serving, who: Operator, body: NewReidentific
 
 @router.get("/reidentifications/{name}")
 def get_reidentification(service: Serving, _: Viewer, name: Id) -> ReidentificationAnswer:
-    """One of them."""
+    """Show a re-identification."""
     return _told(service, known_reidentification(service.db, name))
 
 
 @router.post("/reidentifications/{name}/lease")
 async def renew_reidentification(service: Serving, who: LeaseKeeper, name: Id) -> LeaseAnswer:
-    """Renew the lease of the step that it is at; where nothing moves there is nothing to renew, and no mistake."""
+    """Renew the lease of a re-identification, for the step that it is at; none is needed where nothing moves."""
     step = service.keeper.reidentifications.step(name)
     if step is None:
         row = await run_in_threadpool(known_reidentification, service.db, name)
@@ -163,17 +174,24 @@ async def renew_reidentification(service: Serving, who: LeaseKeeper, name: Id) -
     return LeaseAnswer(job=step[1] or "", seconds=LEASE_SECONDS)
 
 
-@router.get("/alarms")
+@router.get("/alarms", responses=PAGES)
 def list_alarms(
-    service: Serving, _: Viewer, arm: ArmName | None = None, closed: bool = False, most: Most = 100
+    page: Page,
+    service: Serving,
+    _: Viewer,
+    arm: ArmName | None = None,
+    closed: bool = False,
+    before: BeforeNumber = None,
+    most: Most = 100,
 ) -> list[AlarmAnswer]:
-    """Drift alarms that stand, or with `closed` all of them, the newest first."""
-    return [AlarmAnswer(**row) for row in raised.alarms(service.db, arm, closed=closed, most=most)]
+    """List drift alarms that stand, or with `closed` all that ever were raised, the newest first."""
+    found = page(most, lambda n: raised.alarms(service.db, arm, closed=closed, before=before, most=n))
+    return [AlarmAnswer(**row) for row in found]
 
 
 @router.post("/alarms/{number}/ack")
 def acknowledge_alarm(service: Serving, who: Operator, number: Number, body: Remark) -> AlarmAnswer:
-    """A person's word that they know; the accepted set stays as it is."""
+    """Acknowledge a drift alarm, by a person's word; the accepted set stays as it is."""
     return AlarmAnswer(**raised.acknowledge_alarm(service.db, number, body.note, who.name, time.time()))
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import logging
+import sqlite3
 from http import HTTPStatus
 from typing import Any, Final
 
@@ -12,6 +14,7 @@ from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
 from ident_service.errors import (
+    AlreadyThere,
     ArmError,
     ConfigError,
     IdentError,
@@ -23,9 +26,11 @@ from ident_service.errors import (
     UsageError,
 )
 from ident_service.service.api.answers import Failure
+from ident_service.service.registry.database import RegistryBusy
 
 _STATUS: Final[tuple[tuple[type[IdentError], int], ...]] = (
     (UnknownId, 404),
+    (AlreadyThere, 409),
     (UsageError, 400),
     (ConfigError, 422),
     (ModelError, 422),
@@ -41,17 +46,19 @@ _WORDS: Final = {
     403: "Not with this role, or not from this page.",
     404: "No such thing is known.",
     405: "Not with this method.",
-    409: "Not now: a fault, a lease or another motion stands against it.",
+    409: "Not now: a fault, a lease, another motion, or a name that is taken stands against it.",
     413: "Too large.",
     421: "The service is not called that.",
     422: "The request has mistakes; the message names them.",
     429: "Too many failed attempts.",
+    503: "Not at this moment: ask again after `Retry-After` seconds.",
+    507: "The disk, or the registry's share of it, is full.",
 }
 
 
 def failures(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """For a route: the statuses of its failures, besides those that any route may have."""
-    every = {400, 401, 403, 413, 421, 422, 429, *statuses}
+    every = {400, 401, 403, 413, 421, 422, 429, 503, 507, *statuses}
     return {status: {"model": Failure, "description": _WORDS[status]} for status in sorted(every)}
 
 
@@ -71,8 +78,20 @@ def status_of(error: IdentError) -> int:
 def answer_mistakes(app: FastAPI) -> None:
     """Turn every error into that shape."""
 
+    async def _resources(request: Request, error: Exception) -> JSONResponse:
+        if (short := _short_of(error)) is None:
+            raise error  # a mistake of ours: the last handler tells it
+        status, kind, words, headers = short
+        _LOG.error("%s: %s", words, error, extra={"path": request.url.path})
+        return _answer(status, kind, words, headers)
+
+    app.add_exception_handler(sqlite3.Error, _resources)
+    app.add_exception_handler(OSError, _resources)
+
     @app.exception_handler(IdentError)
-    async def _ident(_: Request, error: IdentError) -> JSONResponse:
+    async def _ident(request: Request, error: IdentError) -> JSONResponse:
+        if isinstance(error.__context__, OSError | sqlite3.Error) and _short_of(error.__context__) is not None:
+            return await _resources(request, error.__context__)
         status = status_of(error)
         if status == HTTPStatus.INTERNAL_SERVER_ERROR:
             _LOG.error("an answer failed", exc_info=error)
@@ -92,6 +111,16 @@ def answer_mistakes(app: FastAPI) -> None:
     async def _ours(_: Request, error: Exception) -> JSONResponse:
         _LOG.error("an answer failed", exc_info=error)
         return _answer(500, "InternalError", "the service failed; its log says how")
+
+
+def _short_of(error: BaseException) -> tuple[int, str, str, dict[str, str]] | None:
+    """Tell what the machine, or the registry, is short of; None where an error says something else."""
+    code = getattr(error, "sqlite_errorcode", 0) & 0xFF  # of the extended codes, the primary one
+    if isinstance(error, RegistryBusy) or code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
+        return 503, "RegistryBusy", "another process keeps the registry; ask again", {"Retry-After": "2"}
+    if code == sqlite3.SQLITE_FULL or getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT):
+        return 507, "DiskFull", "the disk of the state folder is full; make room, then ask again", {}
+    return None
 
 
 def _answer(status: int, kind: str, message: str, headers: dict[str, str] | None = None) -> JSONResponse:

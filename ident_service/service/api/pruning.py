@@ -43,7 +43,7 @@ class PruningAnswer(BaseModel):
 
 @router.post("/recordings/prune")
 def prune(service: Serving, who: Operator, body: Pruning) -> PruningAnswer:
-    """Let recordings go of runs that nobody accepted and no job needs."""
+    """Delete old recordings of runs that nobody accepted and no job needs."""
     untold = rebuild_runs(service.db, service.state)
     gone = (
         retention.let_go(service.db, service.state, body.keep, who.name)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Any
 
-from fastapi import APIRouter, Query
+from fastapi import APIRouter
 from fastapi.responses import FileResponse
 
 from ident_service.errors import UnknownId
 from ident_service.service.api.answers import ParametersAnswer, RecordingAnswer, RunAnswer, RunLine
 from ident_service.service.api.asking import Serving, Viewer
 from ident_service.service.api.mistakes import failures, failures_of_files
+from ident_service.service.api.paging import PAGES, BeforeId, Most, Page
 from ident_service.service.jobs.asked import ArmName, FileName, Id
 from ident_service.service.jobs.commands import REPORTS
 from ident_service.service.registry import runs
@@ -32,17 +33,17 @@ _PAGE: dict[int | str, dict[str, Any]] = {
 }
 
 
-@router.get("/runs")
+@router.get("/runs", responses=PAGES)
 def list_runs(
-    service: Serving, _: Viewer, arm: ArmName | None = None, most: Annotated[int, Query(ge=1, le=500)] = 100
+    page: Page, service: Serving, _: Viewer, arm: ArmName | None = None, before: BeforeId = None, most: Most = 100
 ) -> list[RunLine]:
-    """Runs, the newest first."""
-    return [RunLine(**row) for row in runs.runs(service.db, arm, most=most)]
+    """List runs, the newest first."""
+    return [RunLine(**row) for row in page(most, lambda n: runs.runs(service.db, arm, before=before, most=n))]
 
 
 @router.get("/runs/{run}")
 def get_run(service: Serving, _: Viewer, run: Id) -> RunAnswer:
-    """One run."""
+    """Show a run: its ending, files, recordings and parameters."""
     row, found = runs.known_run(service.db, run), runs.parameter_set(service.db, run)
     return RunAnswer(
         **row,
@@ -54,14 +55,14 @@ def get_run(service: Serving, _: Viewer, run: Id) -> RunAnswer:
 
 @router.get("/runs/{run}/files/{name}", response_class=FileResponse, responses=_BINARY)
 def get_file(service: Serving, _: Viewer, run: Id, name: FileName) -> FileResponse:
-    """A file that its manifest names; as something to be kept, never as a page."""
+    """Download a file that the manifest of a run names; never shown as a page."""
     path = runs.run_file(service.db, service.state, run, name)
     return FileResponse(path, media_type="application/octet-stream", filename=name)
 
 
 @router.get("/runs/{run}/report.html", response_class=FileResponse, responses=_PAGE)
 def get_report(service: Serving, _: Viewer, run: Id) -> FileResponse:
-    """The report: the one that a job of the kind `report` has made since, or the run's own."""
+    """Show the report of a run; the one that a job of the kind `report` has made since, or its own."""
     path = service.state / REPORTS / f"{runs.known_run(service.db, run)['id']}.html"
     if not path.is_file() and _REPORT in runs.run_files(service.db, service.state, run):
         path = runs.run_file(service.db, service.state, run, _REPORT)

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-import fcntl
 import gc
 import logging
-import os
 import signal
 import socket
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from types import FrameType
-from typing import Any, Final
+from typing import Any
 
 import uvicorn
 from fastapi import FastAPI
@@ -26,10 +23,8 @@ from ident_service.service.api.app import create_app
 from ident_service.service.api.connections import Connections, Listener, most_connections
 from ident_service.service.api.notify import tell_manager, watchdog_seconds
 from ident_service.service.api.settings import Settings
-from ident_service.service.state_folder import keep_private
+from ident_service.service.state_folder import URL_FILE, keep_private, single_instance
 
-LOCK: Final = "serve.lock"
-URL_FILE: Final = "serve.url"
 _MOST_HEADERS = 32 * 1024  # bytes
 _SWITCH = 0.0005  # s
 _LAST_ANSWERS = 5  # s for requests that are being answered when the service ends
@@ -81,32 +76,6 @@ def serve(settings: Settings, tell: Callable[[str], None] = lambda _: None) -> N
             server.run(sockets=[listening])
         finally:
             (settings.state / URL_FILE).unlink(missing_ok=True)
-
-
-@contextmanager
-def single_instance(state: Path) -> Iterator[None]:
-    """Hold the state folder's lock; it vanishes with this process, however that ends.
-
-    Raises:
-        UsageError: another process holds it, or it cannot be made.
-    """
-    path = state / LOCK
-    try:
-        state.mkdir(mode=0o700, parents=True, exist_ok=True)
-        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be made: {error.strerror}; give another state folder") from None
-    try:
-        try:
-            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            pid = os.pread(fd, 20, 0).decode("ascii", "replace").strip() or "unknown"
-            raise UsageError(f"{state}: process {pid} serves this state folder already") from None
-        os.ftruncate(fd, 0)
-        os.pwrite(fd, str(os.getpid()).encode(), 0)
-        yield
-    finally:
-        os.close(fd)
 
 
 class _Server(uvicorn.Server):

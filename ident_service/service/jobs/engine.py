@@ -16,6 +16,7 @@ import sqlite3
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +28,16 @@ from ident_service.service.jobs.child import Child, OwnChild, UnitChild
 from ident_service.service.jobs.commands import JOBS, Command, command
 from ident_service.service.jobs.keeping import keep
 from ident_service.service.jobs.live_jobs import TICK, LiveJob, LiveJobs
-from ident_service.service.jobs.outcome import outcome, said
+from ident_service.service.jobs.outcome import lateness_of, outcome, said
 from ident_service.service.jobs.progress import Progress, progress
 from ident_service.service.jobs.reach import confirm_support, finish_arm, moving_arms, pause_arm, stop_arms
 from ident_service.service.jobs.recovery import explain_interrupted, mark_interrupted
+from ident_service.service.metrics import Metrics
 from ident_service.service.registry import jobs as rows
 from ident_service.service.registry.audit import AuditQueue, note
 from ident_service.service.registry.database import Database, Row
 from ident_service.service.registry.motions import new_id
+from ident_service.service.registry.runs import RUNS
 
 _POLITE = 15.0  # s for a computation that was asked to end
 _AGAIN = 1.0  # s between tries to enter what the registry has no room for
@@ -53,6 +56,7 @@ class Engine:
         motion_door: Path | None = None,
         lease_factor: float = 1.0,
         now: Callable[[], float] = time.monotonic,
+        metrics: Metrics | None = None,
     ) -> None:
         """Nothing runs before `start`.
 
@@ -64,9 +68,11 @@ class Engine:
             lease_factor: how much longer than usual the service waits for a renewal before it tells the motion's
                 process to stop, which counts by itself; for tests on machines that stall.
             now: the leases' clock [s].
+            metrics: that count jobs and leases; figures of its own if None.
         """
+        self.metrics = Metrics() if metrics is None else metrics
         self.db, self.state, self.audit = db, state, AuditQueue(db)
-        self.live = LiveJobs(lease_factor, now)
+        self.live = LiveJobs(lease_factor, now, self.metrics.renewed)
         self._computing, self._door, self._now = computing, motion_door, now
         self._unwritten: set[str] = set()  # jobs whose end waits for room in the registry
         self._closing = threading.Event()
@@ -137,6 +143,8 @@ class Engine:
                 entering(row)
         except BaseException:
             self.live.remove(live)
+            with suppress(OSError):
+                (self.state / JOBS / job).rmdir()
             raise
         self.live.enter(live)
         return row
@@ -219,6 +227,9 @@ class Engine:
             self.beat = self._now()
             try:
                 self._look()
+            except sqlite3.Error as error:
+                LOG.error("the queue waits for the registry: %s", error)
+                time.sleep(_AGAIN)
             except Exception:  # the queue must go on, whatever one job does to it
                 LOG.exception("the queue stumbled")
                 time.sleep(_AGAIN)
@@ -295,8 +306,9 @@ class Engine:
         while True:
             try:
                 self._finish(live, ended.state, self._kept(live, ended.detail), ended.exit_code)
-            except sqlite3.Error:  # a full disk, say; until there is room, nobody may take this service for a sound one
-                LOG.exception("the end of a job cannot be entered yet", extra={"job": live.job})
+            except sqlite3.Error as error:
+                # A full disk, say; until there is room, nobody may take this service for a sound one.
+                LOG.error("the end of a job cannot be entered yet: %s", error, extra={"job": live.job})
                 self._unwritten.add(live.job)
                 if self._closing.wait(_AGAIN):
                     return  # the next start finds out what became of it
@@ -317,10 +329,21 @@ class Engine:
 
     def _finish(self, live: LiveJob, state: str, detail: str, code: int | None) -> None:
         with self.db.transaction():
-            if rows.ended(self.db, live.job, state, detail, code):
+            entered = rows.ended(self.db, live.job, state, detail, code)
+            if entered:
                 note(self.db, live.by, "job ended", live.job, state=state, detail=detail)
+        if entered:
+            self._count(live.job)
         self.live.remove(live)
         LOG.info("job ended", extra={"job": live.job, "state": state, "detail": detail})
+
+    def _count(self, job: str) -> None:
+        row = rows.known_job(self.db, job)
+        began, ended = row["started"] or row["ended"], row["ended"]
+        ran = max(ended - began, 0.0) if row["started"] else None
+        self.metrics.job(row["kind"], row["state"], max(began - row["created"], 0.0), ran)
+        if row["motion"] and row["run"] is not None:
+            self.metrics.lateness(lateness_of(self.state / RUNS / row["run"]))
 
     def _requeue(self) -> None:
         """What still waits to compute, in its old place."""

@@ -58,13 +58,17 @@ class LiveJob:
 class LiveJobs:
     """Keeps the jobs in the order they came; used from any thread."""
 
-    def __init__(self, lease_factor: float, now: Callable[[], float]) -> None:
+    def __init__(
+        self, lease_factor: float, now: Callable[[], float], renewed: Callable[[float], None] = lambda _: None
+    ) -> None:
         """Begin without jobs.
 
         Args:
             lease_factor: how much longer than usual the service waits for a renewal.
             now: the leases' clock [s].
+            renewed: hears how old a lease was that is renewed [s]; does not wait.
         """
+        self._renewed = renewed
         self.changed = threading.Event()
         self._jobs: dict[str, LiveJob] = {}
         self._stops = Counter[str | None]()
@@ -180,10 +184,12 @@ class LiveJobs:
             live = self._jobs.get(job)
             if live is None or not live.order.moves or live.asked_to_end:
                 return None
-            live.renewed = self._now()
+            before, live.renewed = live.renewed, self._now()
             if live.child is not None:
                 live.child.say(RENEW)
-            return live.order.lease
+            age, lease = live.renewed - before, live.order.lease
+        self._renewed(age)
+        return lease
 
     def stop(self, arm: str | None, why: str) -> list[str]:
         """Ask the motions of an arm, or all, to stop; those that wait are not begun.

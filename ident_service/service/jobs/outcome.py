@@ -120,6 +120,14 @@ def interrupted(heard: Said, folder: Path | None, *, moves: bool) -> str:
     return "; ".join(words)
 
 
+def lateness_of(folder: Path) -> Any:
+    """Read how late the cycles of a run were, as `motion/histogram.py` writes it; None where it is not known."""
+    try:
+        return json.loads((folder / ENDED).read_text(encoding="utf-8"))["lateness"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+
+
 def _message(answer: dict[str, Any]) -> str:
     error = answer.get("error")
     return str(error.get("message", "")) if isinstance(error, dict) else ""

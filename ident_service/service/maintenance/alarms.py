@@ -30,11 +30,14 @@ def raise_alarm(db: Database, arm: str, reidentification: str, run: str, what: s
         note(db, "service", "drift alarm", arm, run=run, found=what)
 
 
-def alarms(db: Database, arm: str | None = None, *, closed: bool = False, most: int = 100) -> list[Row]:
-    """Alarms that stand, or all of them, the newest first."""
+def alarms(
+    db: Database, arm: str | None = None, *, closed: bool = False, before: int | None = None, most: int = 100
+) -> list[Row]:
+    """Alarms that stand, or `closed` ones too, the newest first, from the one before the number `before`."""
     return db.rows(
-        "SELECT * FROM alarms WHERE (?1 IS NULL OR arm = ?1) AND (?2 OR closed IS NULL) ORDER BY id DESC LIMIT ?3",
-        *(arm, int(closed), most),
+        "SELECT * FROM alarms WHERE (?1 IS NULL OR arm = ?1) AND (?2 OR closed IS NULL) AND id < ?3 "
+        "ORDER BY id DESC LIMIT ?4",
+        *(arm, int(closed), 2**62 if before is None else before, most),
     )
 
 

@@ -8,6 +8,7 @@ for a person. That is decided once, so that neither an acknowledged fault nor a 
 from __future__ import annotations
 
 import logging
+import sqlite3
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -80,7 +81,9 @@ class Keeper:
         while not self._ending.is_set():
             try:
                 self.look()
-            except Exception:  # the next look may go better; a disk that was full, say
+            except sqlite3.Error as error:  # a full disk, say
+                LOG.error("what is due waits for the registry: %s", error)
+            except Exception:  # the next look may go better
                 LOG.exception("what is due could not be looked at")
             self._ending.wait(_TICK)
 

@@ -73,10 +73,17 @@ def known_reidentification(db: Database, name: str) -> Row:
     return row
 
 
-def reidentifications(db: Database, arm: str | None = None, *, most: int = 100) -> list[Row]:
-    """All of them, or those of an arm, the newest first."""
+def reidentifications(db: Database, arm: str | None = None, *, before: str | None = None, most: int = 100) -> list[Row]:
+    """Re-identifications, or those of an arm, the newest first, from the one after the id `before`.
+
+    Raises:
+        UnknownId: there is none of that id.
+    """
+    at = None if before is None else known_reidentification(db, before)["begun"]
     return db.rows(
-        "SELECT * FROM reidentifications WHERE ?1 IS NULL OR arm = ?1 ORDER BY begun DESC, id LIMIT ?2", arm, most
+        "SELECT * FROM reidentifications WHERE (?1 IS NULL OR arm = ?1) "
+        "AND (?2 IS NULL OR begun < ?2 OR begun = ?2 AND id > ?3) ORDER BY begun DESC, id LIMIT ?4",
+        *(arm, at, before, most),
     )
 
 

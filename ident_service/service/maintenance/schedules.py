@@ -160,9 +160,12 @@ def add_event(db: Database, arm: str, what: str, remark: str, by: str, now: floa
     return events(db, arm, most=1)[0]
 
 
-def events(db: Database, arm: str, *, most: int = 100) -> list[Row]:
-    """Maintenance of an arm, the newest first."""
-    return db.rows("SELECT * FROM maintenance_events WHERE arm = ? ORDER BY id DESC LIMIT ?", arm, most)
+def events(db: Database, arm: str, *, before: int | None = None, most: int = 100) -> list[Row]:
+    """Maintenance that was done, the newest first, from the event before the number `before`."""
+    last = 2**62 if before is None else before
+    return db.rows(
+        "SELECT * FROM maintenance_events WHERE arm = ? AND id < ? ORDER BY id DESC LIMIT ?", arm, last, most
+    )
 
 
 def fall_due(db: Database, now: float) -> None:

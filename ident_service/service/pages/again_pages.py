@@ -12,11 +12,11 @@ from fastapi.responses import HTMLResponse
 from ident_service.errors import MotionRefused, UnknownId, UsageError
 from ident_service.service.api import arms, jobs, maintenance
 from ident_service.service.api.asking import Operator, Service, Serving, Viewer
+from ident_service.service.api.live_stream import log_of
 from ident_service.service.jobs.asked import ArmName, Id
 from ident_service.service.maintenance.reidentification import known_reidentification, require_comparable
 from ident_service.service.pages.again import MOVES, PAGE, TITLES, WORDS, compared, steps
 from ident_service.service.pages.asking import Form, PageRoute, seen
-from ident_service.service.pages.job_pages import log_of
 from ident_service.service.pages.render import page
 from ident_service.service.pages.run_pages import POLICY
 from ident_service.service.registry import jobs as rows

@@ -10,6 +10,7 @@ from ident_service.errors import IdentError, MotionRefused, UsageError
 from ident_service.motion.control_file import in_use
 from ident_service.service.api import arms, jobs
 from ident_service.service.api.asking import Operator, Service, Serving, Viewer
+from ident_service.service.api.mistakes import status_of
 from ident_service.service.arm_state import control_path, fault_file
 from ident_service.service.jobs.asked import MOVES, ArmName
 from ident_service.service.maintenance import schedules as planned
@@ -57,17 +58,17 @@ def list_arms(service: Serving, who: Viewer) -> Response:
 @router.get("/new")
 def describe(who: Operator) -> Response:
     """Ask for a description."""
-    return page("new", who, problem="", text="")
+    return page("new", who, problem="", text="", replace=False)
 
 
 @router.post("/new")
 def take_description(service: Serving, who: Operator, form: Form) -> Response:
     """Take it, or show every mistake in it."""
-    text = form.get("description", "").replace("\r\n", "\n")
+    text, replace = form.get("description", "").replace("\r\n", "\n"), "replace" in form
     try:
-        added = arms.add_arm(service, who, arms.Description(description=text))
+        added = arms.add_arm(service, who, arms.NewArm(description=text, replace=replace))
     except IdentError as error:
-        return page("new", who, 422, problem=str(error), text=text)
+        return page("new", who, status_of(error), problem=str(error), text=text, replace=replace)
     return seen(f"/arms/{added.name}")
 
 
@@ -112,7 +113,7 @@ def move(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
     asked = _asked(arm, form)
     body = {"job": asked, "confirm": {"name": form.get("name", ""), "challenge": form.get("challenge", "")}}
     try:
-        job = jobs.create_job(service, who, jobs.JobRequest.model_validate(body))
+        job = jobs.begin_job(service, who, jobs.JobRequest.model_validate(body))
     except MotionRefused:
         words = "That was not the arm's name, or this page was open for too long. Nothing has moved; try again."
         return _confirmation(service, who, arm, form, words)
@@ -124,7 +125,7 @@ def compute(service: Serving, who: Operator, arm: ArmName, form: Form) -> Respon
     """Queue a job that moves nothing."""
     if form.get("kind") not in _KINDS:
         raise UsageError("choose what is to be done on the page of the arm")
-    job = jobs.create_job(service, who, jobs.JobRequest.model_validate({"job": _asked(arm, form)}))
+    job = jobs.begin_job(service, who, jobs.JobRequest.model_validate({"job": _asked(arm, form)}))
     return seen(f"/jobs/{job.id}")
 
 

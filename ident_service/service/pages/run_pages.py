@@ -11,6 +11,7 @@ from ident_service.errors import UsageError
 from ident_service.service.api import runs
 from ident_service.service.api.about import AUDIT_SECONDS
 from ident_service.service.api.asking import Serving, Viewer
+from ident_service.service.api.paging import BeforeId
 from ident_service.service.jobs.asked import ArmName, Id
 from ident_service.service.jobs.commands import REPORTS
 from ident_service.service.pages.asking import PageRoute
@@ -20,14 +21,16 @@ from ident_service.service.registry.audit import trail
 
 router = APIRouter(include_in_schema=False, route_class=PageRoute)
 # Of a page whose own style stands in it, and that needs nothing else.
+_RUNS: Final = 200  # of one page
 POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'; sandbox"
 
 
 @router.get("/runs")
-def list_runs(service: Serving, who: Viewer, arm: ArmName | None = None) -> Response:
+def list_runs(service: Serving, who: Viewer, arm: ArmName | None = None, before: BeforeId = None) -> Response:
     """Runs, the newest first."""
     sets = {row["run"]: row for row in service.db.rows("SELECT * FROM parameter_sets")}
-    return page("runs", who, arm=arm, runs=known.runs(service.db, arm, most=200), sets=sets)
+    found = known.runs(service.db, arm, before=before, most=_RUNS + 1)
+    return page("runs", who, arm=arm, runs=found[:_RUNS], more=len(found) > _RUNS, sets=sets)
 
 
 @router.get("/runs/{run}")

@@ -20,7 +20,7 @@ from typing import Final
 from ident_service.config.load import load_arm
 from ident_service.config.schema import ArmConfig
 from ident_service.config.shipped import shipped_arms
-from ident_service.errors import ConfigError, Problem, UnknownId, UsageError
+from ident_service.errors import AlreadyThere, ConfigError, Problem, UnknownId, UsageError
 from ident_service.results.files import appearing_folder
 from ident_service.service.registry.audit import note
 from ident_service.service.registry.database import Database, Row
@@ -97,8 +97,10 @@ def known_arm(db: Database, state: Path, name: str) -> KnownArm:
     return KnownArm(name, path, config, row["source"])
 
 
-def add_arm(db: Database, state: Path, text: str, files: Mapping[str, str], by: str) -> KnownArm:
-    """Take an uploaded description; a later one of the same name replaces it, and the earlier one stays on the disk.
+def add_arm(
+    db: Database, state: Path, text: str, files: Mapping[str, str], by: str, *, replace: bool = False
+) -> KnownArm:
+    """Take an uploaded description; the one that had its name stays on the disk.
 
     Args:
         db: the registry.
@@ -106,19 +108,23 @@ def add_arm(db: Database, state: Path, text: str, files: Mapping[str, str], by: 
         text: the YAML.
         files: name to content of the files that it names.
         by: who.
+        replace: whether it may take the place of another of its name, a shipped one included.
 
     Raises:
+        AlreadyThere: its name is taken by another description.
         UsageError: too large, or files whose names are none.
         ConfigError: every mistake in it, each with line and column.
     """
     with uploaded(state, text, files) as path:
         config = load_arm(path, upload=True)
+        _require_free(db, config, replace=replace)
         folder = state / DESCRIPTIONS / f"{config.name}-{config.sha256[:16]}"
         if not folder.exists():
             with appearing_folder(folder) as built:
                 for part in path.parent.iterdir():
                     shutil.copyfile(part, built / part.name)
     with db.transaction():
+        _require_free(db, config, replace=replace)
         db.write(
             "INSERT INTO arms VALUES (?, ?, ?, 'uploaded', ?, ?, 0, ?, ?) ON CONFLICT (name) DO UPDATE SET "
             "sha256 = excluded.sha256, description = excluded.description, source = excluded.source, "
@@ -129,6 +135,16 @@ def add_arm(db: Database, state: Path, text: str, files: Mapping[str, str], by: 
         )
         note(db, by, "arm added", config.name, sha256=config.sha256)
     return KnownArm(config.name, folder / ARM_FILE, config, "uploaded")
+
+
+def _require_free(db: Database, config: ArmConfig, *, replace: bool) -> None:
+    row = db.row("SELECT source, sha256 FROM arms WHERE name = ?", config.name)
+    same = row is not None and (row["source"], row["sha256"]) == ("uploaded", config.sha256)
+    if row is not None and not (replace or same):
+        raise AlreadyThere(
+            f"{config.name!r} is the name of an arm already, {row['source']}; ask for replacing it (`replace`), "
+            "or give another name"
+        )
 
 
 @contextmanager

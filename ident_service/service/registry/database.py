@@ -7,10 +7,12 @@ One connection writes and another one reads: who reads does not wait for who wri
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import sqlite3
 import threading
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -19,10 +21,16 @@ from typing import Any, Final, Self
 
 from ident_service.errors import UsageError
 from ident_service.service.registry.migrations import MIGRATIONS
+from ident_service.service.state_folder import require_whole
 
 FILE: Final = "registry.sqlite"
 _BUSY = 10.0  # s that another process may keep it
+_IDLE = 2.0  # s
 Row = Mapping[str, Any]
+
+
+class RegistryBusy(sqlite3.OperationalError):
+    """Other threads have written for so long that a write does not wait any longer."""
 
 
 class Database:
@@ -37,10 +45,12 @@ class Database:
             busy: how long a write waits for another process that writes [s].
 
         Raises:
-            UsageError: it cannot be made, is damaged, or was written by newer software.
+            UsageError: it cannot be made, is damaged, or was written by newer software; or a restore broke off.
         """
+        require_whole(state)
         self._path, self._lock, self._read_lock = state / FILE, threading.RLock(), threading.Lock()
         self._writer: int | None = None  # the thread whose transaction is open
+        self._busy, self._wrote = busy, math.inf  # when something was last written that is in the log only
         try:
             state.mkdir(mode=0o700, parents=True, exist_ok=True)
             with suppress(FileExistsError):  # SQLite gives its other files the mode of this one
@@ -53,6 +63,7 @@ class Database:
             for pragma in ("journal_mode = WAL", "synchronous = FULL", "foreign_keys = ON"):
                 self._connection.execute(f"PRAGMA {pragma}")
             self._migrate(migrations)
+            self._checkpointed()
             self._reader.execute("PRAGMA query_only = ON")
             for ending in ("", "-wal", "-shm"):  # of folders that older software made
                 with suppress(FileNotFoundError):
@@ -87,21 +98,29 @@ class Database:
     @contextmanager
     def transaction(self) -> Iterator[None]:
         """All that is written in the block, or nothing of it; blocks within blocks are one."""
-        with self._lock:
+        # Who waits behind one that waits for another process waits no longer than that one.
+        if not self._lock.acquire(timeout=self._busy + 1.0):
+            raise RegistryBusy("the registry is being written")
+        try:
             if self._writer is not None:
                 yield
                 return
             self._connection.execute("BEGIN IMMEDIATE")
-            self._writer = threading.get_ident()
+            self._writer, before = threading.get_ident(), self._connection.total_changes
             try:
                 yield
             except BaseException:
-                self._connection.execute("ROLLBACK")
+                if self._connection.in_transaction:  # a full disk has ended it already
+                    self._connection.execute("ROLLBACK")
                 raise
             else:
                 self._connection.execute("COMMIT")
+                if self._connection.total_changes != before:
+                    self._wrote = time.monotonic()
             finally:
                 self._writer = None
+        finally:
+            self._lock.release()
 
     def write(self, sql: str, *values: Any) -> int:
         """Execute one statement; how many rows it changed."""
@@ -125,10 +144,36 @@ class Database:
             "PRAGMA foreign_key_check"
         )
 
+    def rest(self) -> None:
+        """Put what was written into the main file, once nothing has been written for two seconds; waits for nobody.
+
+        Until then the last transactions are in SQLite's log beside it, which whoever copies one file leaves behind.
+        """
+        if time.monotonic() - self._wrote < _IDLE or not self._lock.acquire(blocking=False):
+            return
+        try:
+            if self._writer is None and self._checkpointed():
+                self._wrote = math.inf
+        finally:
+            self._lock.release()
+
+    def _checkpointed(self) -> bool:
+        """Move the log into the main file, as far as no other process reads or writes now; whether all of it was."""
+        self._connection.execute("PRAGMA busy_timeout = 0")
+        try:
+            busy, *_ = self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
+        except sqlite3.OperationalError:
+            return False
+        finally:
+            self._connection.execute(f"PRAGMA busy_timeout = {int(1000 * self._busy):d}")
+        return not busy
+
     def close(self) -> None:
-        """Let the file go."""
+        """Put what was written into the main file, and let it go."""
         with self._lock, self._read_lock:
             self._reader.close()
+            with suppress(sqlite3.Error):  # damaged, or closed already
+                self._checkpointed()
             self._connection.close()
 
     def __enter__(self) -> Self:

@@ -18,10 +18,11 @@ import json
 import time
 from typing import Any, Final
 
-from ident_service.errors import UnknownId
+from ident_service.errors import AlreadyThere, UnknownId
 from ident_service.service.registry.database import Database, Row
 
 STATES: Final = ("queued", "running", "done", "refused", "failed", "faulted", "cancelled", "interrupted")
+KEY_SECONDS: Final = 24 * 3600.0
 LIVE: Final = ("queued", "running")
 
 
@@ -105,6 +106,40 @@ def ended(db: Database, job: str, state: str, detail: str, exit_code: int | None
 def explain(db: Database, job: str, detail: str) -> None:
     """Say more about a job that has ended."""
     db.write("UPDATE jobs SET detail = ? WHERE id = ?", detail, job)
+
+
+def enter_key(db: Database, who: str, key: str, request: str, job: str) -> None:
+    """Remember for a day that a request with an idempotency key made a job.
+
+    Args:
+        db: the registry.
+        who: name of the token.
+        key: of the request; each token has its own.
+        request: SHA-256 of what was asked.
+        job: id.
+
+    Raises:
+        sqlite3.IntegrityError: the key has made a job already.
+    """
+    db.write("DELETE FROM idempotency_keys WHERE at < ?", time.time() - KEY_SECONDS)
+    db.write("INSERT INTO idempotency_keys VALUES (?, ?, ?, ?, ?)", who, key, request, job, time.time())
+
+
+def job_of_key(db: Database, who: str, key: str, request: str) -> Row | None:
+    """Find the job that a request with an idempotency key has made within a day.
+
+    Raises:
+        AlreadyThere: the key was used to ask for something else.
+    """
+    row = db.row(
+        "SELECT request, job FROM idempotency_keys WHERE who = ? AND key = ? AND at >= ?",
+        *(who, key, time.time() - KEY_SECONDS),
+    )
+    if row is None:
+        return None
+    if row["request"] != request:
+        raise AlreadyThere(f"the idempotency key {key!r} was used for another request; give each its own")
+    return known_job(db, row["job"])
 
 
 def typical_seconds(db: Database, kind: str, arm: str | None) -> float | None:

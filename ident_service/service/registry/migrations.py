@@ -195,4 +195,15 @@ CREATE TABLE sessions (
 ) STRICT;
 """
 
-MIGRATIONS: Final[tuple[str, ...]] = (_FIRST, _MAINTENANCE, _SESSIONS)
+_KEYS = """
+CREATE TABLE idempotency_keys (
+    who TEXT NOT NULL,                 -- name of the token
+    key TEXT NOT NULL,
+    request TEXT NOT NULL,             -- SHA-256 of what was asked with it
+    job TEXT NOT NULL,
+    at REAL NOT NULL,
+    PRIMARY KEY (who, key)
+) STRICT;
+"""
+
+MIGRATIONS: Final[tuple[str, ...]] = (_FIRST, _MAINTENANCE, _SESSIONS, _KEYS)

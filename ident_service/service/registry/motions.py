@@ -67,9 +67,14 @@ def known_motion(db: Database, motion: str) -> Row:
     return row
 
 
-def motions(db: Database, arm: str | None = None) -> list[Row]:
-    """All motions, or those of an arm, the newest first."""
-    return db.rows("SELECT * FROM motions WHERE ?1 IS NULL OR arm = ?1 ORDER BY added DESC, id", arm)
+def motions(db: Database, arm: str | None = None, *, before: str | None = None, most: int = 500) -> list[Row]:
+    """Motions, or those of an arm, the newest first, from the one after the id `before`; raises as `known_motion`."""
+    at = None if before is None else known_motion(db, before)["added"]
+    return db.rows(
+        "SELECT * FROM motions WHERE (?1 IS NULL OR arm = ?1) AND (?2 IS NULL OR added < ?2 OR added = ?2 AND id > ?3) "
+        "ORDER BY added DESC, id LIMIT ?4",
+        *(arm, at, before, most),
+    )
 
 
 def motion_path(db: Database, state: Path, motion: str) -> Path:

@@ -94,9 +94,14 @@ def known_run(db: Database, run: str) -> Row:
     return row
 
 
-def runs(db: Database, arm: str | None = None, *, most: int = 100) -> list[Row]:
-    """Runs, or those of an arm, the newest first."""
-    return db.rows("SELECT * FROM runs WHERE ?1 IS NULL OR arm = ?1 ORDER BY created DESC, id LIMIT ?2", arm, most)
+def runs(db: Database, arm: str | None = None, *, before: str | None = None, most: int = 100) -> list[Row]:
+    """Runs, or those of an arm, the newest first, from the one after the id `before`; raises as `known_run`."""
+    at = None if before is None else known_run(db, before)["created"]
+    return db.rows(
+        "SELECT * FROM runs WHERE (?1 IS NULL OR arm = ?1) "
+        "AND (?2 IS NULL OR created < ?2 OR created = ?2 AND id > ?3) ORDER BY created DESC, id LIMIT ?4",
+        *(arm, at, before, most),
+    )
 
 
 def recordings(db: Database, run: str) -> list[Row]:

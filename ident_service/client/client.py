@@ -1,0 +1,285 @@
+"""Arms, jobs and motions of a daemon."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from types import MappingProxyType, TracebackType
+from typing import Any, Final, Self
+from urllib.parse import quote, urlencode
+
+from ident_service.client.connection import NOTHING, Connection
+from ident_service.errors import IdentError, MotionRefused, UsageError
+
+_API: Final = "/api/v1"
+_RENEWED: Final = 0.5  # s between renewals of a lease, which lasts four times as long
+_LOOK = 0.3  # s between looks at a job
+_LIVE: Final = ("queued", "running")
+
+
+@dataclass(frozen=True)
+class Job:
+    """A job as it stood when it was asked for.
+
+    Attributes:
+        id: which names it.
+        kind: `run`, `identify` and so on.
+        arm: its arm's name, if it is about one.
+        state: `queued`, `running`, and after its end `done`, `refused`, `failed`, `faulted`, `cancelled` or
+            `interrupted`.
+        run: id of the run, motion or export that it makes or is about.
+        detail: why it ended so, in words; empty where there is nothing to say.
+        phase: of one that runs.
+        document: everything that the daemon tells of it (`JobAnswer` in the OpenAPI description).
+    """
+
+    id: str
+    kind: str
+    arm: str | None
+    state: str
+    run: str | None
+    detail: str
+    phase: str | None
+    document: Mapping[str, Any] = field(repr=False)
+
+    @property
+    def live(self) -> bool:
+        """Whether it has not ended."""
+        return self.state in _LIVE
+
+
+@dataclass(frozen=True)
+class LiveSample:
+    """A moment of a run while it is recorded; the daemon sends one every 20 ms.
+
+    Attributes:
+        time: since the first sample [s].
+        joints: names, in the order of the values.
+        position: measured [rad or m]; None for a value that was not valid.
+        torque: commanded [N m or N].
+        following_error: the largest of those 20 ms [rad or m].
+    """
+
+    time: float
+    joints: tuple[str, ...]
+    position: tuple[float | None, ...]
+    torque: tuple[float | None, ...]
+    following_error: tuple[float | None, ...]
+
+
+class IdentClient(Connection):
+    """A daemon, asked over HTTP; used from any thread."""
+
+    def arms(self) -> list[dict[str, Any]]:
+        """List the arms (`ArmLine`)."""
+        return list(self.pages(f"{_API}/arms"))
+
+    def arm(self, name: str) -> RemoteArm:
+        """Name an arm; nothing is asked yet."""
+        return RemoteArm(self, name)
+
+    def add_arm(self, description: str, files: Mapping[str, str] = NOTHING, *, replace: bool = False) -> RemoteArm:
+        """Add an arm.
+
+        Args:
+            description: the YAML.
+            files: name to content of the files that it names.
+            replace: whether it may take the place of another of its name.
+
+        Raises:
+            AlreadyThere: another arm has its name.
+            UsageError: its mistakes, each with line and column.
+        """
+        body = {"description": description, "files": dict(files), "replace": replace}
+        return self.arm(str(self.post(f"{_API}/arms", body)["name"]))
+
+    def stop(self) -> dict[str, list[str]]:
+        """Bring all arms to a controlled stop; names of the arms and jobs that were reached."""
+        found: dict[str, list[str]] = self.post(f"{_API}/stop")
+        return found
+
+    def job(self, job: str) -> Job:
+        """Look at a job."""
+        return _job(self.get(f"{_API}/jobs/{_word(job)}"))
+
+    def jobs(self, *, arm: str | None = None) -> Iterator[Job]:
+        """List jobs, or those of an arm, the newest first."""
+        return map(_job, self.pages(_listed("jobs", arm)))
+
+    def runs(self, *, arm: str | None = None) -> Iterator[dict[str, Any]]:
+        """List runs, or those of an arm, the newest first (`RunLine`)."""
+        return self.pages(_listed("runs", arm))
+
+    def begin(self, kind: str, *, key: str | None = None, **asked: Any) -> Job:
+        """Queue a computation and return at once.
+
+        Args:
+            kind: `simulate`, `design`, `identify`, `export` and so on.
+            key: an idempotency key: within a day, the same request with it is the same job.
+            asked: fields of the job.
+        """
+        body = {"job": {"kind": kind, **{name: value for name, value in asked.items() if value is not None}}}
+        return _job(self.post(f"{_API}/jobs", body, {} if key is None else {"Idempotency-Key": key}))
+
+    def compute(self, kind: str, *, key: str | None = None, **asked: Any) -> Job:
+        """Queue a computation and wait for its end, which `state` tells; as `begin`."""
+        return self.wait(self.begin(kind, key=key, **asked).id)
+
+    def wait(self, job: str) -> Job:
+        """Wait until a job has ended."""
+        while (seen := self.job(job)).live:
+            time.sleep(_LOOK)
+        return seen
+
+    def answer(self, job: str) -> dict[str, Any]:
+        """Read what the command of a job answered: its one JSON object."""
+        found: dict[str, Any] = self.get(f"{_API}/jobs/{_word(job)}/result")["answer"]
+        return found
+
+
+class RemoteArm:
+    """An arm of a daemon."""
+
+    def __init__(self, client: IdentClient, name: str) -> None:
+        """Nothing is asked yet."""
+        self.client, self.name = client, name
+        self._path = f"{_API}/arms/{_word(name)}"
+
+    def document(self) -> dict[str, Any]:
+        """Read its description, faults and accepted set (`ArmAnswer`)."""
+        found: dict[str, Any] = self.client.get(self._path)
+        return found
+
+    def stop(self) -> dict[str, list[str]]:
+        """Bring it to a controlled stop."""
+        found: dict[str, list[str]] = self.client.post(f"{self._path}/stop")
+        return found
+
+    def faults(self) -> list[dict[str, Any]]:
+        """List the faults that nobody has acknowledged (`FaultAnswer`)."""
+        found: list[dict[str, Any]] = self.client.get(f"{self._path}/faults")
+        return found
+
+    def acknowledge(self, code: str) -> None:
+        """Acknowledge a fault by its name."""
+        self.client.post(f"{self._path}/faults/{_word(code)}/ack")
+
+    def check(self, motion: str | None = None, *, confirm: str) -> RemoteMotion:
+        """Begin the preflight of a motion; as `run`."""
+        return self._begin("check", confirm, motion=motion)
+
+    def run(
+        self, motion: str | None = None, *, confirm: str, speed: float | None = None, until: float | None = None
+    ) -> RemoteMotion:
+        """Begin a run; it is to be used in a `with` block, which keeps its lease.
+
+        Args:
+            motion: id; the description's own if None.
+            confirm: the arm's name, as a person has typed it: they see the arm, and nobody is within its reach.
+            speed: share of the motion's own, above 0 and at most 1.
+            until: ends the run once the standard deviation of every parameter is at most this share of it.
+
+        Raises:
+            MotionRefused: the name is not the arm's, or something stands against the motion.
+        """
+        share = None if until is None else {"share": until}
+        return self._begin("run", confirm, motion=motion, speed=speed, until=share)
+
+    def home(self, *, confirm: str) -> RemoteMotion:
+        """Begin the way home; as `run`."""
+        return self._begin("home", confirm)
+
+    def finish(self) -> None:
+        """End a run early, in order."""
+        self.client.post(f"{self._path}/finish")
+
+    def accept(self, run: str, note: str) -> dict[str, Any]:
+        """Accept the parameters of a run, by a person's word (`AcceptanceAnswer`)."""
+        found: dict[str, Any] = self.client.post(f"{self._path}/acceptances", {"run": run, "note": note})
+        return found
+
+    def _begin(self, kind: str, confirm: str, **asked: Any) -> RemoteMotion:
+        challenge = self.client.post(f"{self._path}/challenge")["challenge"]
+        job = {"kind": kind, "arm": self.name, **{name: value for name, value in asked.items() if value is not None}}
+        body = {"job": job, "confirm": {"name": confirm, "challenge": challenge}}
+        return RemoteMotion(self.client, _job(self.client.post(f"{_API}/jobs", body)))
+
+
+class RemoteMotion:
+    """A motion that was asked for; a `with` block renews its lease, and waits for its end."""
+
+    def __init__(self, client: IdentClient, begun: Job) -> None:
+        """Take a job that the daemon has queued; its lease lasts two seconds from now."""
+        self.client, self.id, self.uncertainty = client, begun.id, dict[str, Any]()
+        self._ended: Job | None = None
+        self._leaving = threading.Event()
+        self._thread = threading.Thread(target=self._keep, name=f"lease of {begun.id}", daemon=True)
+
+    @property
+    def ended(self) -> Job:
+        """The job after its end.
+
+        Raises:
+            UsageError: the block has not been left.
+        """
+        if self._ended is None:
+            raise UsageError(f"{self.id}: has not ended; leave the `with` block first")
+        return self._ended
+
+    def live(self) -> Iterator[LiveSample]:
+        """Yield samples while the run is recorded, until it ends; `uncertainty` has the deviations so far."""
+        for kind, value in self.client.events(f"{_API}/jobs/{self.id}/live"):
+            if kind == "doubt":
+                self.uncertainty = value
+            elif kind == "samples":
+                joints, columns = tuple(value["joints"]), (value[key] for key in ("position", "torque", "error"))
+                for at, *rows in zip(value["time"], *(zip(*column, strict=True) for column in columns), strict=True):
+                    yield LiveSample(at, joints, *rows)
+
+    def cancel(self) -> None:
+        """Bring the arm to a controlled stop; the job then says what happened."""
+        self.client.post(f"{_API}/jobs/{self.id}/cancel")
+
+    def __enter__(self) -> Self:
+        """Renew the lease from now on."""
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Wait for the end, the lease renewed; after an exception the arm is stopped first."""
+        try:
+            if kind is not None:
+                with suppress(UsageError):  # it has ended by itself
+                    self.cancel()
+            self._ended = self.client.wait(self.id)
+        finally:
+            self._leaving.set()
+            self._thread.join()
+
+    def _keep(self) -> None:
+        while not self._leaving.wait(_RENEWED):
+            try:
+                self.client.post(f"{_API}/jobs/{self.id}/lease")
+            except MotionRefused:
+                return  # nothing to renew any more: the job ends, or has
+            except IdentError:
+                continue  # the next one may come through; if none does, the arm stops
+
+
+def _job(document: Mapping[str, Any]) -> Job:
+    progress = document.get("progress") or {}
+    known = {name: document[name] for name in ("id", "kind", "arm", "state", "run", "detail")}
+    return Job(**known, phase=progress.get("phase"), document=MappingProxyType(dict(document)))
+
+
+def _listed(what: str, arm: str | None) -> str:
+    return f"{_API}/{what}" + ("" if arm is None else f"?{urlencode({'arm': arm})}")
+
+
+def _word(name: str) -> str:
+    return quote(name, safe="")

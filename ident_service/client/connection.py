@@ -1,0 +1,179 @@
+"""Requests to a daemon, and its refusals as our errors."""
+
+from __future__ import annotations
+
+import json
+import ssl
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType, TracebackType
+from typing import Any, Final, Self
+from urllib.parse import urlsplit
+
+import httpx
+
+from ident_service.errors import (
+    AlreadyThere,
+    ArmError,
+    ConfigError,
+    IdentError,
+    MotionRefused,
+    ParameterError,
+    RecordingError,
+    UnknownId,
+    UsageError,
+)
+
+_PATIENCE = 30.0  # s for one answer
+_MOST = 64 * 2**20  # bytes of one answer
+NOTHING: Final[Mapping[str, Any]] = MappingProxyType({})
+_KINDS: Final[dict[str, type[IdentError]]] = {
+    kind.__name__: kind for kind in (UsageError, UnknownId, AlreadyThere, MotionRefused, ParameterError, ArmError)
+}
+
+
+class Connection:
+    """A daemon, asked over HTTP for JSON; used from any thread."""
+
+    def __init__(self, url: str, token: str | None = None, *, patience: float = _PATIENCE) -> None:
+        """Nothing is asked yet.
+
+        Args:
+            url: of the daemon: scheme, host and port.
+            token: to say who asks; None for a stop on the daemon's own machine.
+            patience: how long to wait for an answer [s].
+
+        Raises:
+            UsageError: not such an address; or one that would send the token in the clear over a network.
+        """
+        try:
+            parts = urlsplit(url)
+            host, _ = parts.hostname or "", parts.port
+        except ValueError as error:
+            raise UsageError(f"{url}: not an address: {error}") from None
+        if parts.scheme not in ("http", "https") or not host or parts.path.strip("/") or parts.query or parts.username:
+            raise UsageError(f"{url}: give scheme, host and port, such as https://robot.example:8470")
+        if parts.scheme == "http" and host not in ("127.0.0.1", "::1", "localhost"):
+            raise UsageError(f"{url}: a token is sent to other machines over https only")
+        self.url = url.rstrip("/")
+        headers = {} if token is None else {"Authorization": f"Bearer {token}"}
+        secure = parts.scheme == "https"
+        # The other one, which nobody is checked by, is made faster.
+        verify = ssl.create_default_context() if secure else ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        try:
+            self._http = httpx.Client(
+                base_url=self.url, headers=headers, timeout=patience, verify=verify, trust_env=False
+            )
+        except (ValueError, httpx.HTTPError, httpx.InvalidURL) as error:
+            raise UsageError(f"{url}: cannot be asked with this token: {error}") from None
+
+    def get(self, path: str) -> Any:
+        """Read what stands at a path; raises as `ask`."""
+        return self.ask("GET", path)
+
+    def post(self, path: str, body: Any = None, headers: Mapping[str, str] = NOTHING) -> Any:
+        """Have something done; raises as `ask`."""
+        return self.ask("POST", path, {} if body is None else body, headers)
+
+    def ask(self, method: str, path: str, body: Any = None, headers: Mapping[str, str] = NOTHING) -> Any:
+        """Send one request and return its answer as JSON values.
+
+        Raises:
+            IdentError: the daemon refused, with its own error; or it cannot be reached.
+        """
+        return self._document(*self._exchange(method, path, body, headers)[:2])
+
+    def pages(self, path: str) -> Iterator[Any]:
+        """Read a list to its end, page by page; raises as `ask`."""
+        after: str | None = path
+        while after is not None:
+            status, content, after = self._exchange("GET", after, None, {})
+            yield from self._document(status, content)
+
+    def content(self, path: str) -> bytes:
+        """Download a file.
+
+        Raises:
+            IdentError: as `ask`; or it is larger than what is taken.
+        """
+        status, content, _ = self._exchange("GET", path, None, {})
+        if status >= 400:
+            self._document(status, content)
+        if len(content) >= _MOST:
+            raise ArmError(f"{self.url}{path}: has {_MOST} bytes or more; fetch it by other means")
+        return content
+
+    def close(self) -> None:
+        """End the connections."""
+        self._http.close()
+
+    def __enter__(self) -> Self:
+        """Nothing more to do."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close."""
+        self.close()
+
+    def events(self, path: str) -> Iterator[tuple[str, Any]]:
+        """Read server-sent events until the daemon ends them: kind and JSON value.
+
+        Raises:
+            IdentError: as `ask`; or the line was cut.
+        """
+        try:
+            with self._http.stream("GET", path) as answer:
+                if answer.status_code >= 400:
+                    self._document(answer.status_code, answer.read())
+                kind = ""
+                for line in answer.iter_lines():
+                    if line.startswith("event: "):
+                        kind = line.removeprefix("event: ")
+                    elif line.startswith("data: "):
+                        yield kind, json.loads(line.removeprefix("data: "))
+        except (httpx.HTTPError, ValueError) as error:
+            raise self._unreachable(error) from None
+
+    def _exchange(self, method: str, path: str, body: Any, headers: Mapping[str, str]) -> tuple[int, bytes, str | None]:
+        """Return status, body (as far as it is taken) and the path of the next page."""
+        content = None if body is None else json.dumps(body).encode()
+        sent = dict(headers) if content is None else {**headers, "Content-Type": "application/json"}
+        # A connection that lay idle may have been closed meanwhile: what only reads is asked again.
+        for last in (False, True) if method == "GET" else (True,):
+            try:
+                with self._http.stream(method, path, content=content, headers=sent) as answer:
+                    taken = bytearray()
+                    for piece in answer.iter_bytes():
+                        taken += piece
+                        if len(taken) >= _MOST:
+                            break
+                    after = answer.links.get("next", {}).get("url")
+                    return answer.status_code, bytes(taken[:_MOST]), after
+            except (httpx.HTTPError, httpx.InvalidURL) as error:
+                if last or isinstance(error, httpx.ConnectError):
+                    raise self._unreachable(error) from None
+        raise AssertionError("the second try ends the loop")
+
+    def _unreachable(self, error: Exception) -> ArmError:
+        return ArmError(f"{self.url}: cannot be reached: {error or type(error).__name__}")
+
+    def _document(self, status: int, content: bytes) -> Any:
+        try:
+            document = json.loads(content) if content else None
+        except ValueError:
+            raise ArmError(f"{self.url}: answered {status} with what is not JSON; is it the daemon?") from None
+        if status >= 400:
+            raise _error(self.url, status, document)
+        return document
+
+
+def _error(url: str, status: int, document: Any) -> IdentError:
+    said = document.get("error", {}) if isinstance(document, dict) else {}
+    kind, message = str(said.get("kind", "")), str(said.get("message", f"answered {status}"))
+    if kind == ConfigError.__name__:
+        return UsageError(message)
+    if kind == RecordingError.__name__ or kind not in _KINDS:
+        kinds: dict[int, type[IdentError]] = {401: UsageError, 403: UsageError, 404: UnknownId, 422: UsageError}
+        return kinds.get(status, ArmError)(f"{url}: {message}")
+    return _KINDS[kind](message)

@@ -1,0 +1,67 @@
+"""Run one of our programs on a file that may break it, with limits of memory and time; it answers with JSON."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from ident_service.errors import ModelError
+
+
+def ask_process(module: str, path: Path, deadline: float, *more: str) -> dict[str, Any]:
+    """Run a module on a file and return what it answers.
+
+    Args:
+        module: its `main` calls `answer_within`.
+        path: of the file.
+        more: words after it.
+        deadline: how long a busy machine may take [s]; the process limits its own computing.
+
+    Raises:
+        ModelError: it takes too long or breaks off; without the file's name.
+    """
+    paths = os.pathsep.join(one or str(Path.cwd()) for one in sys.path)
+    try:
+        done = subprocess.run(  # noqa: S603 - our own interpreter and module
+            [sys.executable, "-P", "-m", module, str(path), *more],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env={**os.environ, "PYTHONPATH": paths, "OPENBLAS_NUM_THREADS": "1"},
+            timeout=deadline,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise ModelError(f"could not be read and judged within {deadline:g} s; give a smaller one") from None
+    if done.returncode == 0:
+        answer: dict[str, Any] = json.loads(done.stdout)
+        return answer
+    if done.returncode == -signal.SIGXCPU:
+        raise ModelError("takes too long to read and judge; give a smaller one")
+    raise ModelError("breaks what reads it: a name twice, a name that is reserved, or too much memory; mend it")
+
+
+def answer_within(memory: int, seconds: int, document: Callable[[], dict[str, Any]]) -> int:
+    """In the process: limit it, then print what `document` returns; whatever libraries print is no part of it.
+
+    Args:
+        memory: bytes of addresses that it may have, libraries included.
+        seconds: that it may compute.
+        document: called without arguments; a JSON object.
+    """
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
+    answer = os.dup(1)
+    os.dup2(2, 1)
+    text = json.dumps(document()).encode()
+    with os.fdopen(answer, "wb") as out:
+        out.write(text)
+    return 0

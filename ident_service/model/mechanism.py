@@ -1,0 +1,220 @@
+"""A mechanism as a URDF or MJCF file describes it: the one door to the parsers that are written in C++.
+
+Files come from strangers, and those parsers recurse: thousands of links in one another overflow the stack, and a small
+MJCF with a name twice damages the heap (decision 0052). So expat first counts what a file holds, in one pass that keeps
+nothing. A URDF within the limits is then read here: its parser and pinocchio's walk recurse only by links in one
+another. An MJCF is read in a process of its own, with limits of memory and time, whose answer is numbers and names.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Final, Literal
+from xml.parsers import expat
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident_service.config.kinematics import Kinematics
+from ident_service.config.quantities import TextFile
+from ident_service.errors import ModelError
+from ident_service.model.limited_process import ask_process
+
+Kind = Literal["urdf", "mjcf"]
+MOST_BYTES: Final = 2 * 2**20
+MOST_ELEMENTS: Final = 20_000
+MOST_LINKS: Final = 256
+DEEPEST_LINKS: Final = 64  # a level takes 2 kB of the stack, of which a thread may have 512 kB
+_DEEPEST_ELEMENTS = 128
+_DEADLINE = 30.0  # s of waiting on a busy machine; the process itself may compute for five
+_FORBIDDEN = re.compile(r"<!\s*(DOCTYPE|ENTITY)|<\s*include\b|\bxi:include\b", re.IGNORECASE)
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Mechanism:
+    """The joints of a file in pinocchio's order, fixed ones merged into their parents; arrays are read-only.
+
+    Attributes:
+        names: of the joints.
+        parents: joint that each one hangs on; -1 for the world.
+        revolute: whether it turns; otherwise it slides.
+        axes: in the joint's frame, shape (joints, 3).
+        rotation: of each joint's frame in its parent's, shape (joints, 3, 3).
+        translation: likewise [m], shape (joints, 3).
+        bodies: the ten inertial parameters of eq. 13 in the joint's frame [SI], shape (joints, 10).
+        armature: [kg m^2 or kg], shape (joints,).
+        damping: [N m s/rad or N s/m], shape (joints,).
+        dry_friction: [N m or N], shape (joints,).
+        held: where all other movable joints are held [rad or m].
+        frames: name of each link to its joint (-1: the world), and its rotation and translation in that joint's frame.
+    """
+
+    names: tuple[str, ...]
+    parents: tuple[int, ...]
+    revolute: tuple[bool, ...]
+    axes: Array
+    rotation: Array
+    translation: Array
+    bodies: Array
+    armature: Array
+    damping: Array
+    dry_friction: Array
+    held: Mapping[str, float]
+    frames: Mapping[str, tuple[int, Array, Array]]
+
+
+def read_mechanism(file: TextFile, kind: Kind, kinematics: Kinematics | None = None, *, own: bool = False) -> Mechanism:
+    """Read the arm in a file.
+
+    Args:
+        file: its name and text.
+        kind: of the file.
+        kinematics: which part of it is the arm; all of it when None.
+        own: whether this process has just written it, so that nobody else has a word in it.
+
+    Raises:
+        ModelError: not such a file, beyond the limits, entities or includes in it, or a joint that is neither
+            revolute, continuous nor prismatic, or mimics a joint of the arm; no such base, tip or locked joint.
+    """
+    part = None
+    if kinematics is not None:
+        part = json.dumps({"base": kinematics.base, "tip": kinematics.tip, "lock": kinematics.lock})
+    return _read(file, kind, part, own)
+
+
+@lru_cache(maxsize=8)
+def _read(file: TextFile, kind: Kind, part: str | None, own: bool) -> Mechanism:
+    count_mechanism(file, kind)
+    if kind == "urdf":
+        from ident_service.model.mechanism_process import urdf_document
+
+        document = urdf_document(file, part)
+    else:
+        document = _mjcf_document(file, part, own=own)
+    if (error := document.get("error")) is not None:
+        raise ModelError(f"{file.name}: {error}")
+    return _mechanism(document)
+
+
+def count_mechanism(file: TextFile, kind: Kind) -> None:
+    """Refuse a file that its parser should not see.
+
+    Raises:
+        ModelError: not XML, too large, too many or too deeply nested elements or links, two joints that carry one
+            link, entities or includes.
+    """
+    name, data = file.name, file.text.encode("utf-8", "surrogatepass")
+    if len(data) > MOST_BYTES:
+        raise ModelError(f"{name}: larger than {MOST_BYTES} bytes; leave meshes and drawings out of it")
+    if found := _FORBIDDEN.search(file.text):
+        raise ModelError(f"{name}: {found.group(0)!r} is refused in a {kind.upper()}; give one self-contained file")
+    counter = _Counter(name, kind)
+    parser = expat.ParserCreate("utf-8")
+    parser.StartElementHandler, parser.EndElementHandler = counter.begin, counter.end
+    try:
+        parser.Parse(data, True)
+    except expat.ExpatError as error:
+        raise ModelError(f"{name}: not a {kind.upper()} that can be read: {error}") from None
+    counter.finish()
+
+
+class _Counter:
+    """Count elements, links and how deep they stand in one another."""
+
+    def __init__(self, name: str, kind: Kind) -> None:
+        self._name, self._urdf = name, kind == "urdf"
+        self._link = "link" if self._urdf else "body"
+        self._elements = self._depth = self._links = self._bodies_open = 0
+        self._joint_parent, self._joint_child = "", ""
+        self._parents: dict[str, str] = {}
+
+    def begin(self, tag: str, attributes: dict[str, str]) -> None:
+        self._elements += 1
+        self._depth += 1
+        if self._elements > MOST_ELEMENTS:
+            self._refuse(f"more than {MOST_ELEMENTS} elements")
+        if self._depth > _DEEPEST_ELEMENTS:
+            self._refuse(f"more than {_DEEPEST_ELEMENTS} elements in one another")
+        if tag == self._link:
+            self._links += 1
+            if self._links > MOST_LINKS:
+                self._refuse(f"more than {MOST_LINKS} links")
+            self._bodies_open += not self._urdf
+            if self._bodies_open > DEEPEST_LINKS:
+                self._refuse(f"more than {DEEPEST_LINKS} links in one another")
+        elif tag == "parent":
+            self._joint_parent = attributes.get("link", "")
+        elif tag == "child":
+            self._joint_child = attributes.get("link", "")
+
+    def end(self, tag: str) -> None:
+        self._depth -= 1
+        if not self._urdf:
+            self._bodies_open -= tag == "body"
+        elif tag == "joint":
+            if self._joint_child in self._parents:
+                self._refuse(f"link {self._joint_child!r} is the child of two joints")
+            if self._joint_child:
+                self._parents[self._joint_child] = self._joint_parent
+            self._joint_parent = self._joint_child = ""
+
+    def finish(self) -> None:
+        for link in self._parents:
+            above, depth = link, 1
+            while (parent := self._parents.get(above)) is not None:
+                above, depth = parent, depth + 1
+                if depth > DEEPEST_LINKS:
+                    self._refuse(f"more than {DEEPEST_LINKS} links in one another, or links in a circle")
+
+    def _refuse(self, what: str) -> None:
+        raise ModelError(f"{self._name}: {what}; an arm has fewer")
+
+
+def _mjcf_document(file: TextFile, part: str | None, *, own: bool) -> dict[str, Any]:
+    # Pinocchio reads MJCF from a path only; alone in a folder, the file cannot reach any other.
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "arm.xml"
+        path.write_text(file.text, encoding="utf-8", errors="surrogatepass")
+        if own:
+            from ident_service.model.mechanism_process import mjcf_document
+
+            return mjcf_document(str(path), part)
+        try:
+            return ask_process(
+                "ident_service.model.mechanism_process", path, _DEADLINE, *([] if part is None else [part])
+            )
+        except ModelError as error:
+            return {"error": str(error)}
+
+
+def _mechanism(document: Mapping[str, Any]) -> Mechanism:
+    def array(key: str, *shape: int) -> Array:
+        values = np.array(document[key], dtype=float).reshape(shape)
+        values.setflags(write=False)
+        return values
+
+    n = len(document["names"])
+    return Mechanism(
+        names=tuple(document["names"]),
+        parents=tuple(document["parents"]),
+        revolute=tuple(document["revolute"]),
+        axes=array("axes", n, 3),
+        rotation=array("rotation", n, 3, 3),
+        translation=array("translation", n, 3),
+        bodies=array("bodies", n, 10),
+        armature=array("armature", n),
+        damping=array("damping", n),
+        dry_friction=array("dry_friction", n),
+        held=document["held"],
+        frames={
+            name: (joint, np.array(rotation).reshape(3, 3), np.array(translation))
+            for name, joint, rotation, translation in document["frames"]
+        },
+    )

@@ -1,0 +1,35 @@
+"""How many descriptions are read and judged at a time: few, so that they keep no other request waiting."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Final
+
+from fastapi import HTTPException
+
+MOST_CHECKS: Final = 2
+
+
+class Checks:
+    """Places for descriptions that are being read."""
+
+    def __init__(self) -> None:
+        self._places = threading.BoundedSemaphore(MOST_CHECKS)
+
+    @contextmanager
+    def place(self) -> Iterator[None]:
+        """Have a place for as long as the block lasts.
+
+        Raises:
+            HTTPException: 503 where all are taken; waiting would keep a thread from other requests.
+        """
+        if not self._places.acquire(blocking=False):
+            raise HTTPException(
+                503, f"{MOST_CHECKS} descriptions are being checked; ask again", headers={"Retry-After": "2"}
+            )
+        try:
+            yield
+        finally:
+            self._places.release()

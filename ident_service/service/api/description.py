@@ -1,0 +1,97 @@
+"""The OpenAPI description as people read it: a summary, an example of each request, and one of each failure.
+
+Boundary: words about routes; their shapes are those of the models.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from fastapi import FastAPI
+
+_CONFIRM: Final = {"name": "wam7_sim", "challenge": "bGV0IGl0IG1vdmU"}
+_YAML: Final = "extends: planar2\nname: bench\ncontrol: {rate: 500}\n"
+_RUN: Final = "20261101T080000Z-wam7_sim-3fa9c1"
+
+EXAMPLES: Final[dict[str, dict[str, Any]]] = {
+    "Acceptance": {"A person's word": {"run": _RUN, "note": "after the new belt, torque error 2.1 %"}},
+    "Description": {"An arm that extends a shipped one": {"description": _YAML}},
+    "Enabled": {"Let it count no more": {"enabled": False}},
+    "Event": {"Gear oil": {"what": "gear oil changed", "note": "joint 2, 40 ml"}},
+    "JobRequest": {
+        "Commission a simulated arm": {"job": {"kind": "simulate", "arm": "planar2", "seed": 1}},
+        "Search for a motion": {"job": {"kind": "design", "arm": "wam7_sim", "seconds": 30.0}},
+        "Preflight, which may move the arm": {"job": {"kind": "check", "arm": "wam7_sim"}, "confirm": _CONFIRM},
+        "Run, at half the speed": {"job": {"kind": "run", "arm": "wam7_sim", "speed": 0.5}, "confirm": _CONFIRM},
+        "Identify from a run": {"job": {"kind": "identify", "arm": "wam7_sim", "recordings": [{"run": _RUN}]}},
+        "Export": {"job": {"kind": "export", "run": _RUN, "formats": ["urdf", "mjcf"]}},
+    },
+    "Login": {"A token": {"token": "ident_x3J0"}},
+    "MotionUpload": {
+        "The content of a motion.json": {"arm": "planar2", "motion": '{"format": "ident-motion", "...": 0}'}
+    },
+    "NewArm": {
+        "An arm that extends a shipped one": {"description": _YAML},
+        "A later description of the same arm": {"description": _YAML, "replace": True},
+        "An arm with its URDF": {
+            "description": "format: ident-arm\nversion: 1\nname: mine\nkinematics: {urdf: mine.urdf}\n",
+            "files": {"mine.urdf": '<robot name="mine">...</robot>'},
+        },
+    },
+    "NewReidentification": {"Now, by a person": {"arm": "wam7_sim", "confirm": _CONFIRM}},
+    "NewSchedule": {
+        "Mondays at six, UTC": {"arm": "wam7_sim", "cron": "0 6 * * 1"},
+        "After 500 operating hours": {"arm": "wam7_sim", "hours": 500.0},
+        "After each maintenance": {"arm": "wam7_sim", "maintenance": True},
+    },
+    "Pruning": {"What would go": {"keep": 20}, "Delete it": {"keep": 20, "yes": True}},
+    "Remark": {"Why": {"note": "seal ordered"}},
+    "Rollback": {"The set before": {"note": "the new one oscillates"}, "The second": {"note": "the best", "to": 2}},
+}
+"""By the name of a request's model: title and value of its examples."""
+
+FAILURES: Final[dict[int, tuple[str, str]]] = {
+    400: ("UsageError", "a description comes with 16 files at most"),
+    401: ("Unauthorized", "give a token that counts: Authorization: Bearer TOKEN"),
+    403: ("Forbidden", "the token 'screen' may look only; this needs the role operator"),
+    404: ("UnknownId", "no run 'x' is known; the list of runs names them"),
+    409: ("MotionRefused", "wam7_sim: a motion needs a fresh challenge of this arm"),
+    413: ("TooLarge", "a request has 65536 bytes at most"),
+    421: ("WrongHost", "this service is not called that; use the address or name that it was started with"),
+    422: ("ConfigError", "arm.yaml:3:11: control.rate: Input should be greater than 0"),
+    429: ("TooManyRequests", "ten failed logins in a minute; try again in 42 s"),
+    503: ("RegistryBusy", "another process keeps the registry; ask again"),
+    507: ("DiskFull", "the disk of the state folder is full; make room, then ask again"),
+}
+"""By status: kind and message of one failure that has it."""
+
+
+def describe(app: FastAPI) -> None:
+    """Have an application describe itself with all of this."""
+    plain = app.openapi
+
+    def described() -> dict[str, Any]:
+        if app.openapi_schema is None:
+            _complete(plain())
+        return plain()  # which is kept from the first time
+
+    app.openapi = described  # type: ignore[method-assign]
+
+
+def _complete(document: dict[str, Any]) -> None:
+    for item in document["paths"].values():
+        for operation in item.values():
+            # The first sentence of the function's docstring says what is done; its name is only an id.
+            first, _, _ = operation.get("description", "").partition("\n\n")
+            sentence, _, _ = first.replace("\n", " ").partition("; ")
+            operation["summary"] = sentence.removesuffix(".")
+            body = operation.get("requestBody", {}).get("content", {}).get("application/json")
+            if body is not None:
+                name = body["schema"]["$ref"].rpartition("/")[2]
+                given = EXAMPLES[name]
+                body["examples"] = {title: {"value": value} for title, value in given.items()}
+            for status, answer in operation["responses"].items():
+                content = answer.get("content", {}).get("application/json", {})
+                if content.get("schema") == {"$ref": "#/components/schemas/Failure"}:
+                    kind, message = FAILURES[int(status)]
+                    content["example"] = {"error": {"kind": kind, "message": message}}

@@ -1,0 +1,114 @@
+"""`IdentClient` on a daemon that runs: lists, computations, a motion under its lease, live samples, one error tree."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from daemon.conftest import checked_before, patient_text, quick_text
+from daemon.served import daemon_process
+
+from ident_service.client import IdentClient
+from ident_service.errors import AlreadyThere, ArmError, MotionRefused, UnknownId, UsageError
+from ident_service.motion.control_file import in_use
+from ident_service.service.arm_state import control_path
+from ident_service.service.registry.audit import note
+from ident_service.service.registry.database import Database
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def state(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("client") / "state"
+
+
+@pytest.fixture(scope="module")
+def client(state: Path) -> Iterator[IdentClient]:
+    """A daemon with two arms that were checked: `quick`, and `patient`, whose motion outlasts a test."""
+    for text in (quick_text(), patient_text("patient")):
+        checked_before(state, text)
+    with daemon_process(state) as (_, client):
+        client.add_arm(quick_text())
+        client.add_arm(patient_text("patient"))
+        yield client
+
+
+def test_lists_are_read_to_their_end(client: IdentClient, state: Path) -> None:
+    assert {"quick", "patient", "planar2"} <= {arm["name"] for arm in client.arms()}
+    with Database(state) as db:
+        for number in range(30):
+            note(db, "me", "did", str(number))
+    whole = list(client.pages("/api/v1/audit?most=500"))
+    assert list(client.pages("/api/v1/audit?most=7")) == whole
+    assert len(whole) > 30
+
+
+def test_errors_are_of_one_tree(client: IdentClient) -> None:
+    with pytest.raises(UnknownId, match="nothing"):
+        client.job("nothing")
+    with pytest.raises(UnknownId):
+        client.job("../runs")
+    with pytest.raises(AlreadyThere, match="quick"):
+        client.add_arm(quick_text(periods=8))
+    with pytest.raises(UsageError, match=r"arm.yaml:\d+:\d+"):
+        client.add_arm(quick_text("third").replace("terms:", "termz:"))
+    with pytest.raises(MotionRefused, match="typed"):
+        client.arm("quick").run(confirm="quack")
+    with IdentClient(client.url, "ident_no") as nobody, pytest.raises(UsageError, match="token that counts"):
+        nobody.arms()
+    with pytest.raises(UsageError, match="https only"):
+        IdentClient("http://robot.example:8470", "x")
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))
+        url = f"http://127.0.0.1:{closed.getsockname()[1]}"
+        with IdentClient(url) as nobody, pytest.raises(ArmError, match="cannot be reached"):
+            nobody.stop()
+
+
+def test_a_computation_is_waited_for_and_its_key_is_kept(client: IdentClient) -> None:
+    ended = client.compute("base", arm="planar2", key="one")
+    assert (ended.state, ended.live) == ("done", False)
+    assert client.answer(ended.id)["exit_code"] == 0
+    assert client.begin("base", arm="planar2", key="one").id == ended.id
+    assert [job.id for job in client.jobs(arm="planar2")] == [ended.id]
+
+
+@pytest.mark.timeout(300)
+def test_a_run_is_watched_and_kept_alive_to_its_end(client: IdentClient) -> None:
+    with client.arm("quick").run(confirm="quick") as job:
+        with pytest.raises(UsageError, match="has not ended"):
+            _ = job.ended
+        samples = list(job.live())
+    assert job.ended.state == "done", job.ended
+    assert len(samples) > 20
+    assert samples[0].joints == ("shoulder", "elbow")
+    assert {len(sample.position) for sample in samples} == {len(sample.torque) for sample in samples} == {2}
+    times = [sample.time for sample in samples]
+    assert times == sorted(times)
+    assert job.ended.run in [run["id"] for run in client.runs(arm="quick")]
+
+
+@pytest.mark.timeout(300)
+def test_an_exception_stops_the_arm(client: IdentClient, state: Path) -> None:
+    job = client.arm("patient").run(confirm="patient")
+    with pytest.raises(ZeroDivisionError):  # noqa: PT012, SIM117 - it is raised within the block of the motion
+        with job:
+            next(job.live())
+            raise ZeroDivisionError
+    assert job.ended.state == "cancelled"
+    assert not in_use(control_path(state, "patient"))
+
+
+@pytest.mark.timeout(300)
+def test_a_stop_elsewhere_ends_the_block(client: IdentClient) -> None:
+    with client.arm("patient").run(confirm="patient") as job:
+        live = job.live()
+        next(live)
+        threading.Timer(0.5, client.stop).start()
+        assert sum(1 for _ in live) > 5
+    assert job.ended.state == "cancelled"
+    assert "stop" in job.ended.detail

@@ -1,0 +1,80 @@
+"""Descriptions that would break, or occupy, whoever reads them: each is one clear error, and the daemon goes on."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from daemon.conftest import Asked
+
+from ident_service.service.api.checks import MOST_CHECKS
+
+ARM = "format: ident-arm\nversion: 1\nname: spy\nkinematics: {{{kind}: arm.xml}}\n"
+INERTIAL = '<inertial pos="0 0 0.1" mass="1" diaginertia="0.1 0.1 0.1"/>'
+
+
+def body(kind: str, text: str) -> dict[str, object]:
+    return {"description": ARM.format(kind=kind), "files": {"arm.xml": text}}
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "message"),
+    [
+        pytest.param(
+            "mjcf",
+            f"<mujoco><worldbody>{'<body>' * 100_000}{'</body>' * 100_000}</worldbody></mujoco>",
+            "arm.xml: more than 64 links in one another",
+            id="100,000 bodies in one another",
+        ),
+        pytest.param(
+            "urdf",
+            "<robot name='r'>"
+            + "".join(f'<link name="l{k}"/>' for k in range(5_000))
+            + "".join(
+                f'<joint name="j{k}" type="fixed"><parent link="l{k - 1}"/><child link="l{k}"/></joint>'
+                for k in range(1, 5_000)
+            )
+            + "</robot>",
+            "arm.xml: more than 256 links",
+            id="5,000 links",
+        ),
+        pytest.param(
+            "mjcf",
+            f'<mujoco><worldbody><body name="a"><joint name="universe"/>{INERTIAL}</body></worldbody>'
+            '<keyframe><key name="k" qpos="0"/></keyframe></mujoco>',
+            "arm.xml: ",
+            id="a name that breaks the heap",
+        ),
+    ],
+)
+def test_a_mechanism_that_breaks_parsers_leaves_the_daemon_alive(
+    daemon: Asked, kind: str, text: str, message: str
+) -> None:
+    answer = daemon.post("/api/v1/descriptions/check", body(kind, text))
+    assert answer.status_code == 422, answer.text
+    assert answer.json()["error"]["message"].startswith(message)
+    # Known and then put to use in the daemon itself, it is the same error.
+    if daemon.post("/api/v1/arms", body(kind, text)).status_code == 201:
+        answer = daemon.get("/api/v1/arms/spy/home")
+        assert answer.status_code in (400, 422), answer.text
+    assert daemon.get("/api/v1/arms").status_code == 200
+
+
+def test_a_description_has_its_own_limit_of_size(daemon: Asked, state: Path) -> None:
+    for door in ("arms", "descriptions/check"):
+        answer = daemon.post(f"/api/v1/{door}", {"description": "a: 1\n" * 60_000})
+        assert answer.status_code == 422, answer.text
+        assert "262144" in answer.json()["error"]["message"]
+
+
+def test_few_descriptions_are_checked_at_a_time(daemon: Asked) -> None:
+    good = {"description": "extends: planar2\nname: other\n"}
+    with ExitStack() as taken:
+        for _ in range(MOST_CHECKS):
+            taken.enter_context(daemon.service.checks.place())
+        for door in ("arms", "descriptions/check"):
+            answer = daemon.post(f"/api/v1/{door}", good)
+            assert (answer.status_code, answer.headers["retry-after"]) == (503, "2"), answer.text
+        assert daemon.post("/api/v1/stop").status_code == 200
+    assert daemon.post("/api/v1/arms", good).status_code == 201
