@@ -173,7 +173,8 @@ class Smoothing(Section):
     `butterworth` of `order`, or `savitzky_golay` polynomials of that degree over a window of about the same cut-off
     [Hz], chosen from the spectra of the positions by default. `filter_torque` sends the torque through the Butterworth
     filter too. `regressor_cutoff` [Hz] filters both sides of eq. 59 alike, the torque then no second time. `decimate`
-    keeps every so many-th sample, after all filters; chosen, ten a period of the cut-off are left.
+    keeps every so many-th sample, after all filters; chosen, ten a period of the cut-off are left. `velocity` is the
+    recording's own, or of the positions; by default the recording's where it has one that predicts better.
     """
 
     method: Literal["butterworth", "savitzky_golay"] = "butterworth"
@@ -182,6 +183,7 @@ class Smoothing(Section):
     filter_torque: bool = True
     regressor_cutoff: Positive | None = None
     decimate: Count | Literal["choose"] = "choose"
+    velocity: Literal["position", "measured", "choose"] = "choose"
 
     @model_validator(mode="before")
     @classmethod

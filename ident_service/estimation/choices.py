@@ -6,8 +6,17 @@ Nothing but the recordings that are fitted to is looked at.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
+
+import numpy as np
+
+from ident_service.estimation.least_squares import ordinary_least_squares
+from ident_service.model.chain import Array
+from ident_service.model.information import Information
+
+_PARTS = 3
 
 # A choice is left at its usual value for less: held-out errors of so few parts differ by as much from chance.
 _WORTH = 0.99
@@ -37,3 +46,26 @@ def chosen(option: str, held_out: Mapping[str, float]) -> Choice:
     usual = next(iter(held_out))
     best = min(held_out, key=lambda name: held_out[name])
     return Choice(option, best if held_out[best] < _WORTH * held_out[usual] else usual, dict(held_out))
+
+
+def held_out_error(blocks: Sequence[Information], weights: Array) -> float:
+    """Predict the torques of each third of the recordings from the other two.
+
+    Args:
+        blocks: equations of consecutive stretches of time.
+        weights: per joint, what its equations are multiplied by, shape (joints,).
+
+    Returns:
+        Relative torque error [percent], the joints weighed by `weights`; infinite where there are too few stretches.
+    """
+    if len(blocks) < _PARTS:
+        return np.inf
+    parts = np.array_split(np.arange(len(blocks)), _PARTS)
+    errors = torques = 0.0
+    for number, part in enumerate(parts):
+        rest = [blocks[index] for other, indices in enumerate(parts) if other != number for index in indices]
+        beta = ordinary_least_squares(reduce(Information.merged, rest), weights).beta
+        unseen = reduce(Information.merged, [blocks[index] for index in part])
+        errors += float(np.sum(weights**2 * unseen.squared_residuals(beta)))
+        torques += float(np.sum(weights**2 * unseen.squared_torques()))
+    return 100.0 * float(np.sqrt(errors / torques)) if torques > 0.0 else np.inf

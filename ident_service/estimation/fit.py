@@ -15,7 +15,7 @@ import numpy as np
 
 from ident_service.config.schema import Method
 from ident_service.estimation import instruments, robust
-from ident_service.estimation.choices import Choice, chosen
+from ident_service.estimation.choices import Choice, chosen, held_out_error
 from ident_service.estimation.delay import Delay, estimate_delay, with_delay
 from ident_service.estimation.doubt import uncertainty
 from ident_service.estimation.equations import Equations, equations
@@ -88,7 +88,7 @@ def prepare(
         ParameterError: bounds of torque constants that mean nothing.
         SolverError: the solver stopped without an optimum.
     """
-    model = settled(model, recordings)
+    model, choices = _with_velocity(recordings, model, base)
     delay = None
     # Before the friction, whose turning round would take a delay for a longer way.
     if model.config.identification.delay == "estimate":
@@ -101,7 +101,37 @@ def prepare(
         weights = weighted_least_squares(gathered.total).weights
         scales = constrained_least_squares_with_scales(gathered.total, base, conditions, bounds, weights).scales
         gathered = gathered.with_torques_times(scales)
-    return Prepared(model, gathered, delay, scales)
+    return Prepared(model, gathered, delay, scales, choices)
+
+
+def _with_velocity(
+    recordings: Sequence[Recording], model: ArmModel, base: BaseParameters
+) -> tuple[ArmModel, tuple[Choice, ...]]:
+    """Choose whose velocities to use, and the filter with them.
+
+    Our own recordings have the velocities of the loop, which lag behind the positions.
+    """
+    options = model.config.identification
+    if options.smoothing.velocity != "choose":
+        return settled(model, recordings), ()
+
+    def of(velocity: str, **more: object) -> ArmModel:
+        smoothing = options.smoothing.model_copy(update={"velocity": velocity, **more})
+        update = {"identification": options.model_copy(update={"smoothing": smoothing})}
+        return replace(model, config=model.config.model_copy(update=update))
+
+    usual = settled(of("position"), recordings)
+    there = all(not one.torque_held and all(block.velocity is not None for block in one.blocks()) for one in recordings)
+    if not there or options.period is not None:
+        return usual, ()
+    # Through the same filter, so that the same torque is predicted.
+    filtered = usual.config.identification.smoothing
+    own = settled(of("measured", cutoff=filtered.cutoff, decimate=filtered.decimate), recordings)
+    ways = {name: gather(recordings, one, base) for name, one in (("position", usual), ("measured", own))}
+    weights = weighted_least_squares(ways["position"].total).weights
+    errors = {name: held_out_error(found.blocks, weights) for name, found in ways.items()}
+    choice = chosen("smoothing.velocity", errors)
+    return (usual if choice.value == "position" else settled(of("measured"), recordings)), (choice,)
 
 
 def gather(recordings: Sequence[Recording], model: ArmModel, base: BaseParameters) -> Equations:

@@ -24,7 +24,7 @@ from ident_service.estimation.direction import direction
 from ident_service.estimation.spectra import with_filter
 from ident_service.model.zero_phase import local_polynomial, low_pass, widened
 from ident_service.record.grid import grid
-from ident_service.record.recording import Block, Recording
+from ident_service.record.recording import Block, Recording, cut, join
 from ident_service.record.segments import Piece, uniform
 
 Array = NDArray[np.float64]
@@ -145,6 +145,7 @@ class _Smoother:
                 "lower identification.smoothing.cutoff",
             )
         self._options, self._period, self._held = options, period, recording.torque_held
+        self._path = recording.path
         self._coupling = np.eye(recording.joints) if coupling is None else coupling
         presliding = options.friction.presliding
         if presliding == "fit":
@@ -165,7 +166,7 @@ class _Smoother:
     def __call__(self, window: Block, first_ns: int, opens: bool, again: slice) -> Motion:
         """Smooth a window; the next one of this stretch begins with the samples `again` of this one."""
         options = self._options
-        position, velocity, acceleration = self._derivatives(window.position)
+        position, velocity, acceleration = self._derivatives(window)
         torque = window.torque
         if self._held:
             torque = np.vstack([torque[:1], 0.5 * (torque[:-1] + torque[1:])])
@@ -191,16 +192,29 @@ class _Smoother:
         time = np.asarray((window.stamp_ns - first_ns) * 1e-9, dtype=np.float64)
         return Motion(time, position, velocity, acceleration, torque, keep, way)
 
-    def _derivatives(self, values: Array) -> tuple[Array, Array, Array]:
+    def _derivatives(self, window: Block) -> tuple[Array, Array, Array]:
+        values, measured = window.position, self._measured(window)
         if self._options.smoothing.method == "savitzky_golay":
             length, degree = min(self._length, len(values) - (len(values) + 1) % 2), self._options.smoothing.order
-            position, velocity, acceleration = (
-                local_polynomial(values, length, degree, derivative, self._period) for derivative in range(3)
-            )
-            return position, velocity, acceleration
+
+            def fitted(of: Array, derivative: int) -> Array:
+                return np.asarray(local_polynomial(of, length, degree, derivative, self._period))
+
+            if measured is not None:
+                return fitted(values, 0), fitted(measured, 0), fitted(measured, 1)
+            return fitted(values, 0), fitted(values, 1), fitted(values, 2)
         position = self._low_pass(values)
-        velocity = self._differenced(position)
+        velocity = self._differenced(position) if measured is None else self._low_pass(measured)
         return position, velocity, self._differenced(velocity)
+
+    def _measured(self, window: Block) -> Array | None:
+        if self._options.smoothing.velocity != "measured":
+            return None
+        if window.velocity is None:
+            raise RecordingError(
+                self._path, "has no velocities; leave out identification.smoothing.velocity or set it to position"
+            )
+        return window.velocity
 
     def _low_pass(self, values: Array) -> Array:
         smoothing = self._options.smoothing
@@ -220,26 +234,11 @@ def _overlapping(pieces: Iterable[Piece], margin: int) -> Iterator[tuple[Block, 
         held.append(piece.block)
         length += len(piece.block.stamp_ns)
         if piece.end:
-            yield _joined(held), left, length, opens, True
+            yield join(held), left, length, opens, True
             held, length, left, opens = [], 0, 0, True
         elif length >= _WINDOW + 2 * margin:
-            window = _joined(held)
+            window = join(held)
             yield window, left, length - margin, opens, False
             # Keep the margin that was withheld and the margin before it.
-            held = [_slice(window, slice(length - 2 * margin, length))]
+            held = [cut(window, length - 2 * margin, length)]
             length, left, opens = 2 * margin, margin, False
-
-
-def _joined(blocks: Iterable[Block]) -> Block:
-    parts = list(blocks)
-    if len(parts) == 1:
-        return parts[0]
-    return Block(
-        np.concatenate([part.stamp_ns for part in parts]),
-        np.concatenate([part.position for part in parts]),
-        np.concatenate([part.torque for part in parts]),
-    )
-
-
-def _slice(block: Block, part: slice) -> Block:
-    return Block(block.stamp_ns[part], block.position[part], block.torque[part])

@@ -72,7 +72,7 @@ def with_filter(
     if "choose" not in (smoothing.cutoff, smoothing.decimate, options.edge):
         return options
     if smoothing.cutoff == "choose":
-        seen = [spectrum(recording, fmt) for recording in recordings]
+        seen = [spectrum(recording, fmt, measured=smoothing.velocity == "measured") for recording in recordings]
         cutoff, rate = float(f"{max(one.cutoff for one in seen):.2g}"), min(one.rate for one in seen)
     else:
         cutoff, rate = smoothing.cutoff, min(1.0 / grid(recording, fmt).period_s for recording in recordings)
@@ -92,8 +92,13 @@ def settled(model: ArmModel, recordings: Sequence[Recording]) -> ArmModel:
     return replace(model, config=model.config.model_copy(update={"identification": options}))
 
 
-def spectrum(recording: Recording, fmt: RecordingFormat) -> Spectrum:
+def spectrum(recording: Recording, fmt: RecordingFormat, *, measured: bool = False) -> Spectrum:
     """Look at the spectra of a recording's positions, in windows of about 20 s.
+
+    Args:
+        recording: to look at.
+        fmt: what to trim, what a gap is, and the rate.
+        measured: whether to look at its velocities instead, as far as it has any.
 
     Raises:
         RecordingError: it cannot be read.
@@ -101,12 +106,14 @@ def spectrum(recording: Recording, fmt: RecordingFormat) -> Spectrum:
     stamps = grid(recording, fmt)
     period = stamps.period_s
     length = min(int(_WINDOW_S / period), _SAMPLES, stamps.samples)
-    power, windows = np.zeros((0, recording.joints)), 0
+    power, windows, own = np.zeros((0, recording.joints)), 0, False
     waiting = np.zeros((0, recording.joints))
     for piece in uniform(recording, fmt, stamps, samples=_SAMPLES):
-        waiting = np.concatenate([waiting, piece.block.position])
+        own = measured and piece.block.velocity is not None
+        waiting = np.concatenate([waiting, piece.block.velocity if own else piece.block.position])
         while len(waiting) >= length > 3:
-            rates = np.diff(waiting[:length], axis=0) * np.hanning(length - 1)[:, None]
+            rates = waiting[1:length] if own else np.diff(waiting[:length], axis=0)
+            rates = rates * np.hanning(length - 1)[:, None]
             found = np.abs(np.fft.rfft(rates, axis=0)) ** 2
             power = found if windows == 0 else power + found
             windows += 1
@@ -116,28 +123,38 @@ def spectrum(recording: Recording, fmt: RecordingFormat) -> Spectrum:
     if windows == 0:
         return Spectrum(1.0 / period, 0.0, 0.5 / period)  # what follows says that it is too short
     frequency = np.fft.rfftfreq(length - 1, period)[1:]
-    ends = [_ends(power[1:, joint] / windows, frequency, period) for joint in np.flatnonzero(power[1:].any(axis=0))]
+    # A difference multiplies power by this, and white noise of positions is that of rates after one.
+    difference = (2.0 * np.sin(np.pi * frequency * period)) ** 2
+    white = np.ones_like(difference) if own else difference
+    ends = [
+        _ends(power[1:, joint] / windows, frequency, period, difference, white)
+        for joint in np.flatnonzero(power[1:].any(axis=0))
+    ]
     if not ends:
         return Spectrum(1.0 / period, 0.0, 0.5 / period)
     motion, noise = np.array(ends).T
     return Spectrum(1.0 / period, float(motion.max()), float(np.median(noise)))
 
 
-def _ends(power: NDArray[np.floating], frequency: NDArray[np.floating], period: float) -> tuple[float, float]:
+def _ends(
+    power: NDArray[np.floating],
+    frequency: NDArray[np.floating],
+    period: float,
+    difference: NDArray[np.floating],
+    white: NDArray[np.floating],
+) -> tuple[float, float]:
     """Give the frequencies [Hz] that a joint's motion ends at and its noise matters from; `power` is of its rates."""
-    # A difference multiplies power by this.
-    difference = (2.0 * np.sin(np.pi * frequency * period)) ** 2
-    positions = power / difference
+    flat = power / white
     high = (frequency > 0.25 / period) & (frequency < 0.475 / period)
     # The mean of an exponential distribution from its median.
-    floor = np.median(positions[high]) / np.log(2.0) if high.any() else 0.0
+    floor = np.median(flat[high]) / np.log(2.0) if high.any() else 0.0
     width = max(1, round(1.0 / frequency[0]))  # 1 Hz
-    smooth = np.convolve(positions, np.full(width, 1.0 / width), "same")
+    smooth = np.convolve(flat, np.full(width, 1.0 / width), "same")
     below = np.flatnonzero(smooth <= _ABOVE_NOISE * floor)
     last = max(int(below[0]), 1) if len(below) else len(frequency)
     share = np.cumsum(power[:last]) / max(float(np.sum(power[:last])), np.finfo(float).tiny)
-    noise = np.cumsum(floor * difference**2)
-    motion = float(np.sum(np.maximum(power - floor * difference, 0.0)[:last] * difference[:last]))
+    noise = np.cumsum(floor * white * difference)
+    motion = float(np.sum(np.maximum(power - floor * white, 0.0)[:last] * difference[:last]))
     loud = np.flatnonzero(noise > _NOISE * motion)
     matters = frequency[int(loud[0])] if len(loud) else frequency[-1]
     return float(frequency[np.argmax(share >= _MOVING)]), float(matters)

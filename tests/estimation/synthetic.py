@@ -31,6 +31,7 @@ class SampledRecording:
     joint_names: tuple[str, ...] = ()
     torque_held: bool = False
     torn: bool = False
+    velocity: Array | None = None
 
     @property
     def joints(self) -> int:
@@ -39,7 +40,8 @@ class SampledRecording:
     def blocks(self, samples: int = 4096) -> Iterator[Block]:
         for start in range(0, len(self.stamp_ns), samples):
             part = slice(start, start + samples)
-            yield Block(self.stamp_ns[part], self.position[part], self.torque[part])
+            velocity = None if self.velocity is None else self.velocity[part]
+            yield Block(self.stamp_ns[part], self.position[part], self.torque[part], velocity)
 
 
 @dataclass(frozen=True)
