@@ -183,4 +183,7 @@ def found_in(outcome: Outcome) -> int:
     if FAULTS[first.split(":")[0]].reaction >= Reaction.QUICK_STOP:
         return outcome.arm.cycle - 1
     stamp = next(stamp for stamp, _, message in outcome.story.events if message == first)
+    last = outcome.story.samples[-1]
+    if stamp > last["stamp_ns"]:  # an arm that is held or lowered for long is no longer recorded
+        return int(last["cycle"]) + round((stamp - last["stamp_ns"]) * 1e-9 / PERIOD)
     return int(next(sample["cycle"] for sample in outcome.story.samples if sample["stamp_ns"] == stamp))
