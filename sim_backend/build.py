@@ -78,7 +78,7 @@ def build_machine(config: ArmConfig, faults: Sequence[Fault] = ()) -> Machine:
         # need no more than that share to hold it never sinks faster than it may move.
         known = np.isfinite(limit) & np.isfinite(speed)
         braking = np.where(known, _BRAKING_SHARE * limit, plant.inertia) / np.where(known, speed, _BRAKING_TIME)
-    held = np.array([joint is not None and joint.brake for joint in joints])
+    held = np.array([config.has_brake(name) for name in model.chain.names])
     shorted = np.full(count, driver.windings_off == "shorted")
     return Machine(
         plant,

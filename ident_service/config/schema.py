@@ -98,8 +98,9 @@ class Joint(GrownSection):
     """Limits, gains and body of one joint; what a motion needs may be left out of an arm that is only identified.
 
     `drive_inertia` [kg m^2 or kg] is what its rotors have at the joint by data sheet, the least that is there.
-    Margins of the gains are stated with it where the prior, a CAD model of the links, lacks it. `brake` says that the
-    joint's drive has a holding brake, which closes whenever its power stage is off.
+    Margins of the gains are stated with it where the prior, a CAD model of the links, lacks it. `brake` says whether a
+    holding brake closes whenever the power stage is off. Where nothing is said, a simulated drive has one and a real
+    one has none.
     """
 
     position: Interval | None = None
@@ -112,7 +113,7 @@ class Joint(GrownSection):
     kp: Positive | None = None
     kd: Positive | None = None
     drive_inertia: NonNegative | None = None
-    brake: bool = False
+    brake: bool | None = None
     later = frozenset({"brake"})
     body: Body = Body()
 
@@ -354,6 +355,11 @@ class ArmConfig(Section):
     motions: Motions = Motions()
     driver: Driver | None = None
     unattended_motion: Literal["refused", "allowed"] = "refused"
+
+    def has_brake(self, joint: str) -> bool:
+        """Tell whether a joint is held where its drive has no power."""
+        said = self.joints[joint].brake if joint in self.joints else None
+        return said if said is not None else self.driver is not None and self.driver.kind == "simulated"
 
     @property
     def sha256(self) -> str:

@@ -60,8 +60,7 @@ def after_stop(model: ArmModel, limits: MotionLimits) -> AfterStop:
     asked = model.config.control.after_stop
     if asked in ("hold", "lower"):
         return AfterStop(asked)
-    described = model.config.joints
-    loose = [name for name in falling_joints(model, limits) if not described[name].brake]
+    loose = [name for name in falling_joints(model, limits) if not model.config.has_brake(name)]
     if loose:
         raise MotionRefused(
             f"{model.config.name}: {', '.join(loose)} would fall after a stop: gravity moves them, and no brake is "

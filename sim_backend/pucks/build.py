@@ -56,7 +56,7 @@ def build_emulator(config: ArmConfig, faults: Sequence[PuckFault] = ()) -> Emula
     gears = Gears(config.transmission, len(names))
     body = Body(machine.plant, gears, machine.imperfections.torque_noise, machine.seed)
     braking = gears.motor_damping(machine.braking).tolist()
-    braked = np.array([joint.brake for joint in config.joints.values()] or [False] * len(names))
+    braked = np.array([config.has_brake(name) for name in names])
     off = Power.BRAKE if emulation.windings_off == "shorted" else Power.COAST
     unpowered = [Power.HELD if braked[row != 0.0].any() else off for row in gears.matrix]
     body.motors = tuple(

@@ -10,6 +10,7 @@ from motion_bench import JOINTS, LOOKED, Story, WatchedArm, bench_config
 
 from drivers.arm import StopKind
 from ident_service.config.limits import motion_limits
+from ident_service.config.load import load_arm
 from ident_service.errors import ArmFault, MotionRefused
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import arm_model
@@ -103,6 +104,16 @@ def test_an_arm_that_would_fall_must_say_what_holds_it() -> None:
     assert resolved(bench_config()) is AfterStop.BRAKE
     assert resolved(loose("hold")) is AfterStop.HOLD
     assert resolved(loose("lower")) is AfterStop.LOWER
+
+
+def test_a_simulated_drive_has_a_brake_where_nothing_is_said_and_a_real_one_has_none() -> None:
+    silent = {name: {key: value for key, value in joint.items() if key != "brake"} for name, joint in JOINTS.items()}
+    config = bench_config(joints=silent)
+    assert resolved(config) is AfterStop.BRAKE
+    assert [config.has_brake(name) for name in silent] == [True, True]
+    real = config.model_copy(update={"driver": load_arm("wam7_canopen").driver})
+    with pytest.raises(MotionRefused, match=r"shoulder, elbow would fall after a stop"):
+        resolved(real)
 
 
 def test_an_arm_that_does_not_fall_need_not_say_anything() -> None:
