@@ -148,6 +148,8 @@ def _check(arguments: argparse.Namespace) -> Answer:
     path, faults = ticket_path(state, config.name), fault_file(state, config.name)
     faults.require_none(faults.latched())
     require_writable(path.parent)
+    if arguments.confirm not in (None, config.name):
+        raise UsageError(f"--confirm {arguments.confirm}: the arm is {config.name}; nothing has moved")
     arm, model = make_arm(config), arm_model(config)
     lease, stopping = asked_lease(arguments, config), StopOnSignal()
     # Whoever looks for the one who moves the arm finds this process, and its stop ends the preflight. A person's Ctrl-C

@@ -126,9 +126,13 @@ def _recover(arguments: argparse.Namespace) -> Answer:
 def _slowly(arguments: argparse.Namespace, config: ArmConfig, destination: Destination) -> Answer:
     from ident_service.motion.faults import HOLD
 
+    ends = {
+        "hold": f"the arm is held until `ident supported {config.name}`, then lowered",
+        "lower": f"the arm is held for {HOLD:g} s, then lowered until it rests",
+    }.get(config.control.after_stop or "", f"the arm is held for {HOLD:g} s, then its drives brake it")
     lease = asked_lease(arguments, config)
-    tell(arguments, f"{config.name}: keep out of its reach; where the way ends the arm is held for {HOLD:g} s,")
-    tell(arguments, "then its drives brake it: support it, an arm without brakes sinks. Ctrl-C stops.")
+    tell(arguments, f"{config.name}: keep out of its reach; where the way ends")
+    tell(arguments, f"{ends}. Ctrl-C stops.")
     stopping = StopOnSignal()
     with stopping:
         asked = until(stopping.requested, lease)

@@ -303,9 +303,15 @@ def _check(method: str, recordings: Sequence[Recording], validation: Sequence[Re
         raise UsageError("give at least one recording to identify from")
     for index, recording in enumerate(recordings):
         if any(overlap(recording, other) for other in recordings[:index]):
-            raise UsageError(f"{recording.path}: the same recording twice would make the doubt too small")
+            raise UsageError(
+                f"{recording.path}: the same recording twice would make the doubt too small; leave one out, or give"
+                " ranges that do not overlap"
+            )
     if seen := [str(one.path) for one in validation if any(overlap(one, other) for other in recordings)]:
-        raise UsageError(f"{', '.join(seen)}: a recording that is fitted to cannot validate the fit")
+        raise UsageError(
+            f"{', '.join(seen)}: a recording that is fitted to cannot validate the fit; give another, or ranges that do"
+            " not overlap"
+        )
 
 
 def _check_convex(

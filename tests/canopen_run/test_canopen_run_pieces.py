@@ -27,8 +27,10 @@ IDENTITY = bytes([0x40, 0x00, 0x10, 0, 0, 0, 0, 0])
 PUSH = np.array([0.1, 0.1])  # N m, next to nothing, but torque
 
 
-def behind(folder: Path) -> tuple[LockStepArm, CanopenArm]:
+def behind(folder: Path, *, brakes: bool = True) -> tuple[LockStepArm, CanopenArm]:
     config = load_arm(write(folder, canopen(described("held", 250.0, 225.0, 30.0), {"interface": "lock_step"}, 1)))
+    joints = {name: joint.model_copy(update={"brake": brakes}) for name, joint in config.joints.items()}
+    config = config.model_copy(update={"joints": joints})
     drives = LockStepArm(config)
     return drives, CanopenArm(config, lambda _: [drives.link(0)])
 
@@ -70,8 +72,8 @@ def test_an_arm_whose_host_leaves_in_order_is_held_where_it_stands(tmp_path: Pat
         assert not body.supported
 
 
-def test_an_arm_whose_host_falls_silent_sinks(tmp_path: Path) -> None:
-    drives, arm = behind(tmp_path)
+def test_an_arm_without_brakes_whose_host_falls_silent_sinks(tmp_path: Path) -> None:
+    drives, arm = behind(tmp_path, brakes=False)
     body = drives.emulator.body
     arm.open()
     arm.enable()

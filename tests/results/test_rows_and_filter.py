@@ -12,7 +12,7 @@ import pytest
 from ident_service.cli import main
 from ident_service.config.schema import Identification
 from ident_service.results.report.markup import prose
-from ident_service.results.rows_and_filter import rows_and_filter, rows_and_filter_text
+from ident_service.results.rows_and_filter import rows_and_filter, wrapped
 
 PLAIN: dict[str, Any] = {
     "method": "ols",
@@ -62,7 +62,7 @@ def test_settings_that_differ_never_sound_alike() -> None:
 
 
 def test_lines_fit_a_terminal() -> None:
-    assert max(map(len, rows_and_filter_text(Identification.model_validate(PLAIN)))) <= 100
+    assert max(map(len, wrapped(rows_and_filter(Identification.model_validate(PLAIN))))) <= 100
 
 
 def test_the_words_stand_beside_the_figures_everywhere(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
