@@ -79,16 +79,27 @@ class Fit:
 
 
 def prepare(
-    recordings: Sequence[Recording], model: ArmModel, base: BaseParameters, conditions: FeasibleSet
+    recordings: Sequence[Recording],
+    model: ArmModel,
+    base: BaseParameters,
+    conditions: FeasibleSet,
+    validation: Sequence[Recording] = (),
 ) -> Prepared:
     """Find what has to be known before the equations are linear, and gather them.
+
+    Args:
+        recordings: to fit to.
+        model: the arm.
+        base: grouping of the parameters.
+        conditions: that torque constants are found under.
+        validation: what will be judged on; only whether it has velocities is looked at.
 
     Raises:
         RecordingError: a recording does not fit the arm or cannot be used.
         ParameterError: bounds of torque constants that mean nothing.
         SolverError: the solver stopped without an optimum.
     """
-    model, choices = _with_velocity(recordings, model, base)
+    model, choices = _with_velocity(recordings, validation, model, base)
     delay = None
     # Before the friction, whose turning round would take a delay for a longer way.
     if model.config.identification.delay == "estimate":
@@ -105,7 +116,7 @@ def prepare(
 
 
 def _with_velocity(
-    recordings: Sequence[Recording], model: ArmModel, base: BaseParameters
+    recordings: Sequence[Recording], validation: Sequence[Recording], model: ArmModel, base: BaseParameters
 ) -> tuple[ArmModel, tuple[Choice, ...]]:
     """Choose whose velocities to use, and the filter with them.
 
@@ -121,7 +132,10 @@ def _with_velocity(
         return replace(model, config=model.config.model_copy(update=update))
 
     usual = settled(of("position"), recordings)
-    there = all(not one.torque_held and all(block.velocity is not None for block in one.blocks()) for one in recordings)
+    there = all(
+        not one.torque_held and all(block.velocity is not None for block in one.blocks())
+        for one in (*recordings, *validation)
+    )
     if not there or options.period is not None:
         return usual, ()
     # Through the same filter, so that the same torque is predicted.

@@ -206,7 +206,7 @@ def identify(
     kind: FeasibleSetName = model.config.feasible_set if set_name is None or set_name == "none" else set_name
     conditions = sets[kind]
 
-    prepared = prepare(recordings, model, base, conditions)
+    prepared = prepare(recordings, model, base, conditions, validation)
     found = unconstrained(wanted, recordings, prepared, base, conditions)
     unseen = [(recording, _unseen(recording, prepared, base)) for recording in validation]
     prior = _prior(prepared.model, found, base, conditions)

@@ -78,6 +78,15 @@ def test_velocities_of_our_own_loop_are_not_asked() -> None:
     assert identified("choose", replace(noisy(*arm()), torque_held=True)).choices == ()
 
 
+def test_a_validation_without_velocities_is_judged_all_the_same() -> None:
+    model, delta = arm()
+    options = Identification.model_validate({"method": "wls"})
+    other = replace(recorded(model, delta, waves(6, 2), rate=RATE, seconds=30.0), sha256="1" * 64)
+    estimate = identify(with_options(model, options), [noisy(model, delta)], [other])
+    assert estimate.choices == ()
+    assert estimate.candidates[0].validation[0].error.relative_percent < 20.0
+
+
 def test_velocities_that_are_asked_for_and_not_there_are_missed() -> None:
     model, delta = arm()
     bare = replace(noisy(model, delta), velocity=None)
