@@ -7,6 +7,7 @@ from sim_arms import arm_config, pendulum, slider
 from drivers.arm import StopKind
 from drivers.clock import VirtualClock
 from ident_service.config.load import load_arm
+from ident_service.config.schema import Joint
 from ident_service.errors import DriverError, ParameterError
 from sim_backend.arm import SimulatedArm, from_config
 from sim_backend.faults import Fault, FaultKind
@@ -16,9 +17,10 @@ MS = 1_000_000
 
 
 def free_slider(**driver):
-    """1 kg, no weight, no friction."""
+    """1 kg, no weight, no friction, no brake."""
     config = slider(1.0, gravity=(0.0, 0.0, 0.0))
-    return config.model_copy(update={"driver": config.driver.model_copy(update=driver)})
+    driver = config.driver.model_copy(update=driver)
+    return config.model_copy(update={"driver": driver, "joints": {"s1": Joint(brake=False)}})
 
 
 def running(config, **options):
@@ -105,6 +107,16 @@ def test_the_last_sample_stays_true_when_stopped():
     assert arm.plant.velocity[0] == pytest.approx(1e-3)
     arm.exchange(None)
     assert arm.plant.velocity[0] == pytest.approx(1e-3)
+
+
+def test_a_brake_closes_when_the_torque_is_taken_off():
+    free = free_slider()
+    arm = running(free.model_copy(update={"joints": {}}))  # nothing is said, so that there is one
+    arm.exchange(np.ones(1))
+    arm.stop(StopKind.TORQUE_OFF)
+    for _ in range(100):
+        arm.exchange(None)
+    assert abs(arm.plant.velocity[0]) < 1e-9
 
 
 def test_truth_is_the_plants_at_the_stamp():
