@@ -24,8 +24,8 @@ from sim_backend.plant import Plant
 # Where limits do not say how strong a drive is, its shorted windings stop the joint in about this time [s].
 _BRAKING_TIME = 0.1
 _BRAKING_SHARE = 0.5
-# A closed brake, times the braking: creeps by 0.01 mrad/s where idle drives let the joint sink by rad/s.
-_HOLDING = 1e5
+# A closed brake, times the braking: creeps by mrad/s where idle drives let the joint sink by rad/s.
+_HOLDING = 1e3
 
 
 def build_machine(config: ArmConfig, faults: Sequence[Fault] = ()) -> Machine:

@@ -15,7 +15,7 @@ from typing import Protocol
 
 _HISTORY = 4096  # encoder readings kept for an encoder that answers late
 _COUNTS = 1 << 32
-_HOLDING = 1e5  # times the braking of shorted windings: creeps by 0.01 mrad/s where those let the joint sink by rad/s
+_HOLDING = 1e3  # times the braking of shorted windings: creeps by mrad/s where those let the joint sink by rad/s
 
 
 class Power(Enum):
@@ -71,7 +71,7 @@ class Motor:
     Attributes:
         power: what the power stage does.
         torque: that acts when `power` is TORQUE, at the motor [N m].
-        braking: with what it brakes when `power` is BRAKE [N m s/rad]; a hundred thousand times that when it is HELD.
+        braking: with what it brakes when `power` is BRAKE [N m s/rad]; a thousand times that when it is HELD.
         defects: what is wrong with it.
     """
 

@@ -31,7 +31,7 @@ from sim_backend.pucks.wires import Wires
 _POLL_NS = 20_000_000  # commands, stop and states are looked at this often
 _AT_ONCE = 256  # frames handled before time is looked at again
 # Speed below which an arm is said to rest when it has been so for a while, and above which to move [rad/s or m/s].
-_RESTS, _MOVES = 1e-3, 1e-2
+_RESTS, _MOVES = 1e-2, 3e-2  # closed brakes creep by some 1e-3
 _RESTING_NS = 500_000_000
 
 
