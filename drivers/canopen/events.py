@@ -56,7 +56,7 @@ def axis_events(events: Iterable[Event], codec: BusCodec, joint_of: Mapping[int,
 
 
 class Reports:
-    """What all buses of an arm tell, cycle by cycle."""
+    """Collect the events of all buses of an arm, cycle by cycle."""
 
     def __init__(self, driver: CanopenDriver, joints: Mapping[int, int], look_every: int) -> None:
         """Begin.

@@ -21,7 +21,7 @@ WINDOW = 0.01  # s
 
 
 class MeasuredTorque:
-    """What all drives of an arm say of their torque.
+    """Collect the torques that the drives of an arm measure.
 
     Attributes:
         torque: by the newest reports, where one came since the cycle before, else NaN [N m or N], shape (joints,);

@@ -32,7 +32,7 @@ EXIT_CODES: Final = {
     "faulted": FAULTED,
     **dict.fromkeys(("impossible", "refused"), PERSON_NEEDED),
 }
-"""Of a re-identification by how it ended; any other end is a failure."""
+"""Exit codes by the end of a re-identification; any other end is a failure."""
 
 
 def add(verbs: Verbs) -> None:

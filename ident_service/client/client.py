@@ -47,7 +47,7 @@ class Job:
 
     @property
     def live(self) -> bool:
-        """Whether it has not ended."""
+        """Tell if the job has not ended."""
         return self.state in _LIVE
 
 

@@ -128,7 +128,7 @@ class Heartbeats(Section):
 
 
 class Reactions(Section):
-    """What a drive does by itself: option codes of CiA 402, as its manual numbers them.
+    """Set how a drive reacts by itself: option codes of CiA 402, as its manual numbers them.
 
     Left out, `quick_stop` is 2, or 6 for an arm whose `control.after_stop` is `hold` or `lower`: it has no brakes, and
     stays in quick stop, where the drive goes on holding the motor.
@@ -149,7 +149,7 @@ class StatusReports(Section):
 
 
 class Emulation(GrownSection):
-    """What stands behind emulated drives: an arm with true parameters, noise and faults, as `SimulatedDriver` has.
+    """Describe the arm behind emulated drives: one with true parameters, noise and faults, as `SimulatedDriver` has.
 
     A drive whose power stage is off leaves its motor coasting, or braked where `windings_off` is `shorted`.
     """

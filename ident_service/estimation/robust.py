@@ -125,7 +125,7 @@ class _Spread:
     tables: tuple[Array, ...]
 
     def huber(self, beta: Array, rounds: int) -> tuple[Array, float]:
-        """Of at most so many rounds, the estimate that changed least, and by how many white deviations it did."""
+        """Reweight in so many rounds; give the estimate that changed least, and by how many white deviations."""
         best = (beta, np.inf)
         for _ in range(rounds):
             better = ordinary_least_squares(self._reweighted(beta))

@@ -36,7 +36,7 @@ _SAMPLES = 16384
 
 @dataclass(frozen=True)
 class Spectrum:
-    """What the spectra of a recording's positions say.
+    """Keep the frequencies that end the motion and begin the noise of a recording.
 
     Attributes:
         rate: of the samples [Hz].

@@ -1,4 +1,4 @@
-"""What becomes of an arm after a stop: its brakes hold it, the loop holds it, or it is lowered.
+"""Choose how a stopped arm is secured: its brakes hold it, the loop holds it, or it is lowered.
 
 Joints are asked by their weight: one whose gravity torque, by the prior model, is above `WEIGHS` of its torque limit in
 some posture falls when its drive lets go, unless it has a brake.
@@ -21,7 +21,7 @@ _POSTURES, _SEED = 64, 1
 
 
 class AfterStop(Enum):
-    """What follows when a stopped arm rests."""
+    """Name the ways to secure a stopped arm that rests."""
 
     BRAKE = "brake"  # held for a while, then a quick stop: brakes close, or nothing weighs
     HOLD = "hold"  # held until a person confirms that the arm is supported or home; then lowered

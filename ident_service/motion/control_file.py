@@ -182,7 +182,7 @@ class ControlFile:
 
     @property
     def waiting(self) -> bool:
-        """Whether the arm is held until a person confirms that it is supported or home."""
+        """Tell if the arm is held until a person confirms that it is supported or home."""
         return self._memory[_WAITING] != 0
 
     def wait_for_support(self) -> None:
@@ -192,7 +192,7 @@ class ControlFile:
 
     @property
     def supported(self) -> bool:
-        """Whether that was confirmed."""
+        """Tell if a person has confirmed the support since the arm began to wait."""
         return self._memory[_SUPPORTED] != 0
 
     def confirm_support(self) -> None:

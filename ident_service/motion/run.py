@@ -255,7 +255,7 @@ class _Run:
         return loop, torque
 
     def _at_floor(self) -> Callable[[Vector], bool]:
-        """Whether the lowest point of the arm is at the floor of its description."""
+        """Make the function that tells if the arm's lowest point is at the floor of its description."""
         floor = self.model.config.control.floor
         if floor is None:
             return lambda position: False
