@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.clock import Clock
-from drivers.status import AxisEvent
+from drivers.status import AxisEvent, AxisStatus
 from ident_service.errors import DriverError
 
 Vector = NDArray[np.float64]
@@ -103,6 +103,23 @@ class Sample:
     torque_difference: Vector | None = None
 
 
+@dataclass(frozen=True)
+class Watchdog:
+    """Keep how one drive stops by itself when its host is gone.
+
+    Attributes:
+        drive: its name, for people.
+        kind: what it watches: `rpdo_timer` and the like.
+        seconds: how long that may stay away before the drive acts [s]; None where nobody says.
+        of_torque: whether it is the torque frames, so that a cycle without torque withholds it.
+    """
+
+    drive: str
+    kind: str
+    seconds: float | None
+    of_torque: bool = True
+
+
 class Arm(ABC):
     """A context manager with a handful of methods. Entering opens, leaving closes; closing stops torque first."""
 
@@ -146,6 +163,20 @@ class Arm(ABC):
     def logged(self) -> str:
         """How the log of frames of the last session ended, in words; empty where none was kept."""
         return ""
+
+    def watchdogs(self) -> tuple[Watchdog, ...]:
+        """Say what each drive's watchdog watches; empty where it is the torque frames of all axes, in `status`."""
+        return ()
+
+    def withhold(self, kind: str) -> None:  # noqa: B027 - nothing to do where watchdogs watch torque frames
+        """Send no more of what watchdogs of one kind watch, until the next `stop`, and go on with everything else.
+
+        Watchdogs of torque frames need none of it: `exchange(None)` withholds those.
+        """
+
+    def drive_status(self) -> tuple[AxisStatus, ...]:
+        """Say what each drive has told last, in the order of `watchdogs`."""
+        return ()
 
     @abstractmethod
     def open(self) -> None:

@@ -5,7 +5,8 @@
     IdentError
     ├── UsageError (ValueError)        a command or call that cannot be meant: missing file, contradictory options
     │   ├── UnknownId (LookupError)    an id that the registry does not have
-    │   └── AlreadyThere               a name that is taken, where replacing it was not asked for
+    │   ├── AlreadyThere               a name that is taken, where replacing it was not asked for
+    │   └── InUse                      something that cannot be deleted, because other things refer to it
     ├── ConfigError (ValueError)       an arm description with mistakes, all of them, each with file:line:column
     ├── ModelError (ValueError)        a mechanism or array shape that the model cannot represent
     ├── RecordingError (ValueError)    a recording that cannot be used: wrong joints, NaN, too short, torn row
@@ -28,6 +29,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
+from typing import Literal
 
 
 class IdentError(Exception):
@@ -50,6 +52,29 @@ class UnknownId(UsageError, LookupError):
 
 class AlreadyThere(UsageError):
     """A name is taken, and replacing what has it was not asked for."""
+
+
+@dataclass(frozen=True)
+class Dependent:
+    """Something that refers to what is to be deleted.
+
+    Attributes:
+        kind: `run`, `motion`, `schedule`, `acceptance`, `identification`, `alarm` or `re-identification`.
+        id: which names it.
+        becomes: what becomes of it when that is deleted all the same.
+    """
+
+    kind: str
+    id: str
+    becomes: Literal["deleted", "kept"]
+
+
+class InUse(UsageError):
+    """Something was not deleted: it is in use, or `dependents` refer to it and it was not to be deleted anyway."""
+
+    def __init__(self, message: str, dependents: Sequence[Dependent] = ()) -> None:
+        self.dependents = tuple(dependents)
+        super().__init__(message)
 
 
 @dataclass(frozen=True)

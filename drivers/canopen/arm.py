@@ -5,9 +5,6 @@ taken.
 
 Torque frames begin with `enable` and then never cease while cycles come, with zero torque once the arm is stopped: a
 drive that missed them would rightly report it. `close` takes the drives back to what they were when they were powered.
-
-Boundary: the contract. Cycles are `buses.py`, states of drives `enabling.py`, joints `coordinates.py`, what drives are
-told beforehand `setup.py`.
 """
 
 from __future__ import annotations
@@ -20,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector
+from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector, Watchdog
 from drivers.canopen import dictionary as od
 from drivers.canopen.buses import Buses
 from drivers.canopen.codec import Drive, Emergency
@@ -34,17 +31,17 @@ from drivers.canopen.measured import MeasuredTorque
 from drivers.canopen.profile import bus_profiles
 from drivers.canopen.sdo import Objects
 from drivers.canopen.session_log import SessionLog, logged_links, require_format
-from drivers.canopen.setup import Setup, configure, identify, quick_stop_option, released
+from drivers.canopen.setup import Setup, configure, identify, motor_limits, quick_stop_option, released, watchdogs_of
 from drivers.canopen.stopping import StopCommand
 from drivers.canopen.words import NmtCommand, joint_status
 from drivers.canopen.zero import zeros_of
 from drivers.canopen.zeroing import ZeroingArm
 from drivers.clock import Clock, RealClock, VirtualClock
+from drivers.status import AxisStatus
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError, PositionUnknown
 
-LIMIT_SLACK = 0.05  # rad or m beyond the joints' limits that the drives are told of
 # Between two looks at everybody's heartbeats and status reports: share of a status period, and cycles at most.
 _LOOK_SHARE, _MOST_UNLOOKED = 0.1, 10
 
@@ -80,11 +77,8 @@ class CanopenArm(Arm):
         # Joints that each drive moves, and drives that each joint needs.
         self._joints_of = {k: joints for motors, joints in self._coordinates.groups for k in motors}
         self._drives_of = self._coordinates.motors_of
-        names = list(config.joints)
-        self._names = [
-            f"{' and '.join(names[j] for j in self._joints_of[k])}: drive {drive.node}"
-            for k, drive in enumerate(config.driver.drives)
-        ]
+        names, drives = list(config.joints), enumerate(config.driver.drives)
+        self._names = [f"{' and '.join(names[j] for j in self._joints_of[k])}: drive {one.node}" for k, one in drives]
         # Until the buses are open and bring theirs.
         in_step = all(bus.interface == "lock_step" for bus in config.driver.buses)
         self.clock: Clock = VirtualClock() if in_step else RealClock()
@@ -238,6 +232,18 @@ class CanopenArm(Arm):
         self._cycle += 1
         return sample
 
+    def watchdogs(self) -> tuple[Watchdog, ...]:
+        """Return the watchdog of each drive, see `Arm`."""
+        return watchdogs_of(self._driver, self._names)
+
+    def withhold(self, kind: str) -> None:
+        """Stop sending what watchdogs of a kind watch, see `Arm`."""
+        self._open().withheld.add(kind)
+
+    def drive_status(self) -> tuple[AxisStatus, ...]:
+        """Return what each drive last said of itself, see `Arm`."""
+        return tuple(drive.axis_status for drive in self._open().drives)
+
     def stop(self, kind: StopKind) -> None:
         """Tell every drive to let go, or to stop by itself; never raises. What was sent before acts until it does.
 
@@ -247,6 +253,7 @@ class CanopenArm(Arm):
         self._stops += 1
         self._no_torque()
         if self._buses is not None:
+            self._buses.withheld.clear()
             self._stop.give(self._buses, kind)
 
     def close(self) -> None:
@@ -305,15 +312,13 @@ class CanopenArm(Arm):
 
     def _configured(self, buses: Buses) -> Iterator[str]:
         """All drives identified and configured, one by one; the identity of each in words."""
-        joints = [joint.position or (-np.inf, np.inf) for joint in self._config.joints.values()]
-        lowest, highest = np.array(joints).T
-        limits = self._coordinates.count_limits(lowest - LIMIT_SLACK, highest + LIMIT_SLACK)
+        motors = motor_limits(self._config, self._coordinates)
         for number, drive in enumerate(self._driver.drives):
             objects = buses.objects(number)
             identity = identify(objects, drive.identity)
             self._begun = number + 1
             reactions = self._driver.reactions, self._quick_stop
-            configure(objects, Setup(drive, buses.profile(number), *reactions, limits[number]))
+            configure(objects, Setup(drive, buses.profile(number), *reactions, motors[number]))
             if self._zeros is not None:
                 counts = self._coordinates.zero[number]
                 if not self._zeros.keep_on(objects, number, counts, buses.restarted(number)):

@@ -28,6 +28,7 @@ from drivers.canopen.frame import Frame
 from drivers.canopen.profile import (
     EMERGENCY,
     EMERGENCY_INHIBIT,
+    GUARD_EARLY,
     HEARTBEAT,
     SYNC,
     TPDO1,
@@ -36,7 +37,8 @@ from drivers.canopen.profile import (
     bus_profiles,
 )
 from drivers.canopen.words import NmtState
-from ident_service.config.canopen import CanBus, CanopenDriver, maps_dummies
+from ident_service.config.canopen import CanBus, CanopenDriver
+from ident_service.config.eds import maps_dummies
 
 MOST_WORST, MOST_TYPICAL = 1.0, 0.9  # of a bus
 ROUND_RATES = (1000, 800, 500, 400, 250, 200, 125, 100, 50)  # Hz
@@ -230,8 +232,13 @@ def _lines(profile: BusProfile) -> Iterator[Line]:
     yield _line(profile, "positions", tuple(TPDO1 + n for n in nodes), profile.position_slots, rate, cyclic=True)
     status = profile.status_slots
     yield _line(profile, "status reports", tuple(TPDO2 + n for n in nodes), status, 1.0 / profile.status_inhibit)
-    beats = tuple(HEARTBEAT + n for n in nodes)
-    yield _line(profile, "heartbeats of the drives", beats, (HEARTBEAT_STATE,), 1.0 / profile.heartbeat_drives)
+    guarded = tuple(HEARTBEAT + n for n in profile.guarded)
+    if beats := tuple(HEARTBEAT + n for n in nodes if HEARTBEAT + n not in guarded):
+        yield _line(profile, "heartbeats of the drives", beats, (HEARTBEAT_STATE,), 1.0 / profile.heartbeat_drives)
+    if guarded:
+        often = 1.0 / (GUARD_EARLY * profile.guarding[0])
+        yield _line(profile, "questions of node guarding", guarded, (), often)
+        yield _line(profile, "answers to them", guarded, (HEARTBEAT_STATE,), often)
     yield _line(
         profile, "heartbeat of the host", (HEARTBEAT + profile.host,), (HEARTBEAT_STATE,), 1.0 / profile.heartbeat_host
     )

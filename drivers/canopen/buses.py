@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 
 from drivers.canopen.bits import worst
 from drivers.canopen.bus_event import EventCode
@@ -20,7 +21,7 @@ from drivers.canopen.codec import BusCodec, Drive
 from drivers.canopen.dictionary import CST
 from drivers.canopen.frame import Frame
 from drivers.canopen.link import Link
-from drivers.canopen.profile import SDO_REPLY, SDO_REQUEST, BusProfile
+from drivers.canopen.profile import GUARD_EARLY, HEARTBEAT, SDO_REPLY, SDO_REQUEST, BusProfile
 from drivers.canopen.sdo import TIMEOUT, Objects
 from drivers.canopen.words import NmtCommand, NmtState
 from drivers.clock import Clock
@@ -35,6 +36,15 @@ SETTLED = 5  # cycles in a row with everybody's position before an arm counts as
 _ASK = bytes([0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0])  # SDO upload of the device type, which every node has
 
 
+@dataclass
+class GuardedNode:
+    """A drive that misses us when it is not asked in time: its node, how often it is asked, and when next [ns]."""
+
+    node: int
+    period_ns: int
+    due_ns: int = 0
+
+
 class Buses:
     """The open buses of one arm.
 
@@ -44,6 +54,7 @@ class Buses:
         clock: of the links.
         complete: whether every drive answered in the last cycle.
         lost: positions that did not come in their cycle, so far.
+        withheld: kinds of watchdogs that are not fed, so that they can be seen to act.
     """
 
     def __init__(self, profiles: Sequence[BusProfile], links: Sequence[Link], period_ns: int) -> None:
@@ -71,6 +82,13 @@ class Buses:
         self._least_ns = round(min(max(LEAST * period_ns, 1e9 * wire), RECEIVE * period_ns))
         self._heartbeat_period_ns = min(round(0.5e9 * profile.heartbeat_host) for profile in profiles)
         self._heartbeat_ns = 0
+        self.withheld: set[str] = set()
+        # When each guarded drive is asked next, one after the other: remote frames in a row would delay a cycle.
+        self._guards: dict[int, GuardedNode] = {}
+        for number, (codec, _) in self._at.items():
+            period, node = codec.profile.guarding[0], drives[number].node
+            if node in codec.profile.guarded:
+                self._guards[number] = GuardedNode(node, round(1e9 * period * GUARD_EARLY))
         self._next_ns: int | None = None
 
     def close(self) -> None:
@@ -210,8 +228,9 @@ class Buses:
                 codec.receive(heard)
             for frame in frames:
                 link.send(frame)
-        for codec, link in self._pairs:
-            link.send(codec.sync())
+        if "sync_loss" not in self.withheld:
+            for codec, link in self._pairs:
+                link.send(codec.sync())
         # Not before: a drive acts when it hears SYNC.
         stamp_ns = self.clock.now_ns()
         for codec in self.codecs:
@@ -233,10 +252,20 @@ class Buses:
     def keep_alive(self) -> None:
         """Our heartbeat, when half of its period is over: one that is sent late must not be missed."""
         now_ns = self.clock.now_ns()
-        if now_ns >= self._heartbeat_ns:
+        self._ask_guarded(now_ns)
+        if now_ns >= self._heartbeat_ns and "heartbeat" not in self.withheld:
             self._heartbeat_ns = now_ns + self._heartbeat_period_ns
             for codec, link in self._pairs:
                 link.send(codec.heartbeat(NmtState.OPERATIONAL))
+
+    def _ask_guarded(self, now_ns: int) -> None:
+        """Ask the guarded drive that has waited longest, where its time has come; in one cycle no more than one."""
+        if not self._guards or "node_guarding" in self.withheld:
+            return
+        number, guard = min(self._guards.items(), key=lambda one: one[1].due_ns)
+        if now_ns >= guard.due_ns:
+            guard.due_ns = now_ns + guard.period_ns
+            self._at[number][1].send(Frame(HEARTBEAT + guard.node, b"", remote=True))
 
 
 def _on_the_wire(profile: BusProfile) -> float:

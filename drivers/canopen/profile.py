@@ -18,6 +18,7 @@ from functools import cached_property
 from drivers.canopen import dictionary as od
 from drivers.canopen.dictionary import Entry, pdo_entry
 from ident_service.config.canopen import CanBus, CanopenDrive, CanopenDriver
+from ident_service.config.watchdogs import WatchdogKind
 
 NMT, SYNC, EMERGENCY = 0x000, 0x080, 0x080
 TPDO1, RPDO1, TPDO2, RPDO2 = 0x180, 0x200, 0x280, 0x300
@@ -38,10 +39,12 @@ _NOT_VALID, _NO_REMOTE = 1 << 31, 1 << 30  # bits of a PDO's COB-ID entry
 _EVERY_SYNC, _ON_RECEPTION, _ON_CHANGE = 1, 255, 255
 _UNUSED = (3, 4)  # some drives command their axis by these out of the box
 _MOST_16 = 0xFFFF
+_STAYS_OPERATIONAL = 1  # 1029h:01 (CiA 301, 7.5.2.32)
 _STATUS_PATIENCE = 2.5  # periods without a status report: one was lost, and the next one is late as well
 
 # One emergency a second and drive (1015h): a drive with a storm of errors must not take the bus from the others.
 EMERGENCY_INHIBIT = 1.0
+GUARD_EARLY = 0.7  # of the guard time, after which a drive is asked again: questions come one a cycle
 
 
 def restricted(cob_id: int) -> bool:
@@ -141,7 +144,10 @@ class BusProfile:
         torque_frames: what carries their torques.
         heartbeat_host: period of the host's heartbeat [s].
         heartbeat_drives: period of each drive's [s].
-        heartbeat_timeout: how long either side waits for the other's [s].
+        heartbeat_timeout: how long the host waits for a drive's [s].
+        heartbeat_wait: how long drives wait for the host's whose watchdog it is [s]; None for as long.
+        watchdogs: of each drive, what it watches (`CanopenDrive.watchdog`).
+        guarding: guard time [s] and life time factor of drives that are guarded.
         torque_deadline: after which a drive without torque frames stops by itself [s].
         status_period: of a drive's status report without a change [s].
         status_inhibit: least time between two of them [s].
@@ -165,6 +171,18 @@ class BusProfile:
     status_inhibit: float
     position_slots: tuple[Entry, ...]
     status_slots: tuple[Entry, ...]
+    watchdogs: tuple[WatchdogKind, ...] = ()
+    guarding: tuple[float, int] = (0.02, 3)
+    heartbeat_wait: float | None = None
+
+    def watchdog(self, node: int) -> WatchdogKind:
+        """Return what the watchdog of a drive watches."""
+        return self.watchdogs[self.nodes.index(node)] if self.watchdogs else "rpdo_timer"
+
+    @property
+    def guarded(self) -> tuple[int, ...]:
+        """Nodes of the drives that are guarded."""
+        return tuple(node for node in self.nodes if self.watchdog(node) == "node_guarding")
 
     @property
     def fd(self) -> bool:
@@ -187,9 +205,10 @@ class BusProfile:
         if frame is None:
             raise KeyError(node)
         slots = tuple(od.TARGET_TORQUE if other == node else od.DUMMY_INT16 for other in frame.nodes)
+        deadline = _whole(self.torque_deadline, 1e-3) if self.watchdog(node) == "rpdo_timer" else 0
         inhibit, period = _whole(self.status_inhibit, 1e-4), _whole(self.status_period, 1e-3)
         return [
-            Pdo(1, False, frame.cob_id, _EVERY_SYNC, slots, timer=_whole(self.torque_deadline, 1e-3)),
+            Pdo(1, False, frame.cob_id, _EVERY_SYNC, slots, timer=deadline),
             Pdo(2, False, RPDO2 + node, _ON_RECEPTION, (od.CONTROL_WORD, od.MODE)),
             Pdo(1, True, TPDO1 + node, _EVERY_SYNC, self.position_slots),
             Pdo(2, True, TPDO2 + node, _ON_CHANGE, self.status_slots, inhibit, period),
@@ -210,12 +229,21 @@ class BusProfile:
         todo += self.silenced(node)
         for pdo in self.pdos(node):
             todo += pdo.writes()
-        wait = self.host << 16 | _whole(self.heartbeat_timeout, 1e-3)
-        return [
-            *todo,
-            Write(od.HEARTBEAT_PRODUCER, _whole(self.heartbeat_drives, 1e-3)),
-            Write(od.HEARTBEAT_CONSUMER, wait),
-        ]
+        guarded = node in self.guarded  # which a node that sends heartbeats cannot be (CiA 301, 7.2.8.3.1)
+        todo.append(Write(od.HEARTBEAT_PRODUCER, 0 if guarded else _whole(self.heartbeat_drives, 1e-3)))
+        return [*todo, *self.watched(node)]
+
+    def watched(self, node: int) -> list[Write]:
+        """Return what makes the drive miss its host, by heartbeat and by guarding; torque frames are in `pdos`."""
+        own = self.heartbeat_wait if self.watchdog(node) == "heartbeat" else None  # of the others it is a second one
+        wait = self.host << 16 | _whole(own or self.heartbeat_timeout, 1e-3)
+        todo = [Write(od.HEARTBEAT_CONSUMER, wait)]
+        if self.watchdog(node) in ("heartbeat", "node_guarding"):  # or what it does then could not be heard
+            todo.append(Write(od.ERROR_BEHAVIOUR, _STAYS_OPERATIONAL))
+        if node in self.guarded:
+            period, factor = self.guarding
+            todo += [Write(od.GUARD_TIME, _whole(period, 1e-3)), Write(od.LIFE_FACTOR, factor)]
+        return todo
 
     def silenced(self, node: int) -> list[Write]:
         """What switches the PDOs off that this profile does not use."""
@@ -261,6 +289,9 @@ def _profile(driver: CanopenDriver, rate: float, number: int, bus: CanBus) -> Bu
         driver.status.inhibit,
         (od.POSITION, od.TORQUE_ACTUAL) if driver.torque_reports == "cyclic" else (od.POSITION,),
         (od.STATUS_WORD, od.TORQUE_ACTUAL) if driver.torque_reports == "status" else (od.STATUS_WORD,),
+        tuple(driver.drives[k].watchdog for k in drives),
+        (driver.guarding.period, driver.guarding.factor),
+        driver.heartbeats.host_timeout,
     )
 
 

@@ -6,23 +6,52 @@ it does: position limits, SYNC's period and window, the interpolation period, PD
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
+from drivers.arm import Watchdog
 from drivers.canopen import dictionary as od
-from drivers.canopen.coordinates import torque_limit_counts
+from drivers.canopen.coordinates import Coordinates, torque_limit_counts
+from drivers.canopen.dictionary import Entry, Kind
 from drivers.canopen.profile import BusProfile, Write
 from drivers.canopen.sdo import DOES_NOT_EXIST, READ_ONLY, Objects, SdoRefused
 from drivers.canopen.words import POWER_OFF, state_of
 from drivers.canopen.zero import Zeros
-from ident_service.config.canopen import CanopenDrive, CanopenDriver, DriveIdentity, Reactions
+from ident_service.config.canopen import (
+    CanopenDrive,
+    CanopenDriver,
+    DriveIdentity,
+    Reactions,
+    motor_speeds,
+    quick_stop_decelerations,
+)
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import AnotherDrive, DriverError
 
+LIMIT_SLACK = 0.05  # rad or m beyond the joints' limits that the drives are told of
 DRIVE_PROFILE = 402  # low word of 1000h
 _FIRMWARE = 0x100A
+_COUNTS_PER_LINE = (1.0, 4.0)
+_GENTLER = 0.5  # of the wanted deceleration, that a drive's own may be: the ramp takes twice as long
 _LETS_GO, _STAYS = 2, 6  # values of 605Ah: a ramp, then power off, or hold on
 IDENTITY = {"vendor": od.VENDOR, "product": od.PRODUCT, "revision": od.REVISION, "serial": od.SERIAL}
+
+
+@dataclass(frozen=True)
+class MotorLimits:
+    """Keep what the joints' limits mean for one motor.
+
+    Attributes:
+        positions: lowest and highest [counts], for a drive that heeds them; None where joints have none.
+        speed: at which it turns when all joints move at their velocity limits [turns per minute].
+        deceleration: 6085h, in the drive's unit; None where neither the drive's section nor the joints say one.
+    """
+
+    positions: tuple[int, int] | None
+    speed: float = 0.0
+    deceleration: int | None = None
 
 
 @dataclass(frozen=True)
@@ -34,31 +63,37 @@ class Setup:
         profile: of its bus.
         reactions: to what it finds by itself.
         quick_stop: 605Ah, in place of what `reactions` leaves open.
-        limits: lowest and highest position [counts], for a drive that heeds them; None where joints have none.
+        motor: what the joints' limits mean for it.
     """
 
     drive: CanopenDrive
     profile: BusProfile
     reactions: Reactions
     quick_stop: int
-    limits: tuple[int, int] | None
+    motor: MotorLimits
 
     def protections(self) -> list[Write]:
         """What the drive keeps to by itself."""
         drive = self.drive
         return [
             Write(od.MAX_TORQUE, torque_limit_counts(drive.max_torque, drive.rated_torque)),
-            Write(od.MAX_SPEED, round(drive.max_speed)),
             Write(od.QUICK_STOP_OPTION, self.quick_stop),
             Write(od.FAULT_OPTION, self.reactions.fault),
             Write(od.ABORT_CONNECTION, self.reactions.abort_connection),
+            *self.watchdog(),
         ]
+
+    def watchdog(self) -> list[Write]:
+        """Return what sets a watchdog of the maker's."""
+        if (own := self.drive.watchdog_entry) is None:
+            return []
+        return [Write(Entry(own.index, own.sub, Kind[own.type.upper()], "watchdog of the drive's maker"), own.value)]
 
     def positions(self) -> list[Write]:
         """Return the position limits: no protection, since drives in torque mode give torque beyond them."""
-        if self.limits is None:
+        if self.motor.positions is None:
             return []
-        return [Write(od.LOWER_LIMIT, self.limits[0]), Write(od.UPPER_LIMIT, self.limits[1])]
+        return [Write(od.LOWER_LIMIT, self.motor.positions[0]), Write(od.UPPER_LIMIT, self.motor.positions[1])]
 
     def timing(self) -> list[Write]:
         """The cycle, for drives that want to know it."""
@@ -69,6 +104,30 @@ class Setup:
         if number <= 0xFF:
             todo += [Write(od.PERIOD_POWER, power), Write(od.PERIOD_NUMBER, number)]
         return todo
+
+
+def motor_limits(config: ArmConfig, found: Coordinates) -> list[MotorLimits]:
+    """Return what the limits of an arm's joints mean for each of its motors.
+
+    Args:
+        config: with a CANopen driver and a transmission.
+        found: its coordinates, of the zero that the drives have.
+    """
+    driver, gears, joints = config.driver, config.transmission, list(config.joints.values())
+    assert isinstance(driver, CanopenDriver)  # noqa: S101 - refused in the beginning
+    assert gears is not None  # noqa: S101 - likewise
+    lowest, highest = np.array([joint.position or (-np.inf, np.inf) for joint in joints]).T
+    limits = found.count_limits(lowest - LIMIT_SLACK, highest + LIMIT_SLACK)
+    speeds = motor_speeds(gears, [joint.velocity for joint in joints])
+    brakes = quick_stop_decelerations(driver, gears, [joint.acceleration for joint in joints])
+    return [MotorLimits(*one) for one in zip(limits, speeds, brakes, strict=True)]
+
+
+def watchdogs_of(driver: CanopenDriver, names: Sequence[str]) -> tuple[Watchdog, ...]:
+    """Return what the watchdog of each drive watches; `names` are what people call the drives."""
+    found, of_torque = zip(names, driver.drives, strict=True), ("rpdo_timer", "vendor")
+    seconds = driver.watchdog_seconds
+    return tuple(Watchdog(name, one.watchdog, seconds(one), one.watchdog in of_torque) for name, one in found)
 
 
 def differences(found: Mapping[str, int], wanted: DriveIdentity) -> list[str]:
@@ -124,7 +183,10 @@ def configure(objects: Objects, setup: Setup) -> None:
     Raises:
         DriverError: it refuses or forgets something; the message names the entry and says why.
     """
+    _encoder(objects, setup.drive)
     _rated_torque(objects, setup.drive)
+    _max_speed(objects, setup)
+    _deceleration(objects, setup)
     for write in setup.protections():
         objects.set(write)
     for write in (*setup.positions(), *setup.timing()):
@@ -133,14 +195,18 @@ def configure(objects: Objects, setup: Setup) -> None:
         raise DriverError(f"node {objects.node}: does not support cyclic synchronous torque mode (6502h, bit 9)")
     objects.write(Write(od.MODE, od.CST))
     silenced = setup.profile.silenced(setup.drive.node)
-    for write in setup.profile.writes(setup.drive.node):
-        if write in silenced:
+    writes = setup.profile.writes(setup.drive.node)
+    kind = setup.drive.watchdog
+    # Who neither waits for heartbeats nor has a torque frame's deadline may have no 1016h at all.
+    spare = (od.ERROR_BEHAVIOUR, *(() if kind in ("rpdo_timer", "heartbeat") else (od.HEARTBEAT_CONSUMER,)))
+    for write in writes:
+        if write in silenced or write.entry in spare:
             _if_there(objects, write)
         else:
             objects.write(write)
-    for guarded in (od.RPDO_DEADLINE, od.HEARTBEAT_CONSUMER):
-        write = next(write for write in setup.profile.writes(setup.drive.node) if write.entry == guarded)
-        if objects.read(write.entry) != write.value:
+    for write in writes:
+        guarded = write.entry in (od.RPDO_DEADLINE, od.HEARTBEAT_CONSUMER, od.GUARD_TIME, od.LIFE_FACTOR)
+        if guarded and write.entry not in spare and objects.read(write.entry) != write.value:
             raise DriverError(
                 f"node {objects.node}: {write.entry} does not hold {write.value}: it would not stop by itself"
             )
@@ -171,10 +237,40 @@ def released(objects: Objects, zeros: Zeros | None, number: int, restarted: Call
         counts = zeros.held(objects, number)
         yield
     objects.write(Write(od.ABORT_CONNECTION, 0))
-    objects.write(Write(od.HEARTBEAT_CONSUMER, 0))  # or 8130h would follow every session
+    for entry in (od.HEARTBEAT_CONSUMER, od.GUARD_TIME):  # or 8130h would follow every session
+        _if_there(objects, Write(entry, 0))
     if zeros is not None and counts is not None:
         yield
         zeros.keep_on(objects, number, counts, restarted)
+
+
+def _encoder(objects: Objects, drive: CanopenDrive) -> None:
+    """Compare the described counts of a motor turn with those that the drive's own scaling says, where it has them.
+
+    A drive with a gear ratio of its own (6091h) tells positions in another unit. Some give the lines of an encoder, of
+    which each has four counts.
+    """
+    counts, turns, motor, shaft = (
+        _perhaps(objects, entry) for entry in (od.ENCODER_COUNTS, od.ENCODER_TURNS, od.GEAR_MOTOR, od.GEAR_SHAFT)
+    )
+    if not counts or not turns or motor != shaft:
+        return
+    ratio = drive.counts * turns / counts
+    if ratio not in _COUNTS_PER_LINE:
+        raise DriverError(
+            f"node {objects.node}: a motor turn has {counts / turns:g} counts by the drive (608Fh), {drive.counts} by "
+            f"the description (drives.counts): the scale of its positions is wrong by {ratio:g}"
+        )
+
+
+def _perhaps(objects: Objects, entry: Entry) -> int | None:
+    """Read an entry; None where the drive has no such entry."""
+    try:
+        return objects.read(entry)
+    except SdoRefused as refused:
+        if refused.code not in DOES_NOT_EXIST:
+            raise
+        return None
 
 
 def _rated_torque(objects: Objects, drive: CanopenDrive) -> None:
@@ -190,6 +286,45 @@ def _rated_torque(objects: Objects, drive: CanopenDrive) -> None:
             raise DriverError(
                 f"node {objects.node}: its rated torque is {held} mN m and cannot be set; "
                 f"the configuration says rated_torque: {drive.rated_torque:g}"
+            ) from None
+
+
+def _max_speed(objects: Objects, setup: Setup) -> None:
+    """Set the motor's largest speed, or make sure that the drive's own leaves the joints their velocities.
+
+    Above it a drive takes its torque back, in the middle of a motion.
+    """
+    wanted = Write(od.MAX_SPEED, round(setup.drive.max_speed))
+    try:
+        objects.set(wanted)
+    except SdoRefused as refused:
+        if refused.code not in READ_ONLY:
+            raise
+        held = objects.read(od.MAX_SPEED)
+        if held < round(setup.motor.speed):
+            raise DriverError(
+                f"node {objects.node}: gives no torque above {held} turns per minute (6080h, which cannot be set), "
+                f"but its motor turns at {setup.motor.speed:.0f} at the joints' limits; lower joints.NAME.velocity"
+            ) from None
+
+
+def _deceleration(objects: Objects, setup: Setup) -> None:
+    """Set the deceleration of quick stops (6085h), where a drive has one; it may have a better one of its own."""
+    if setup.motor.deceleration is None:
+        return
+    wanted = Write(od.QUICK_STOP_DECELERATION, setup.motor.deceleration)
+    try:
+        objects.set(wanted)
+    except SdoRefused as refused:
+        if refused.code in DOES_NOT_EXIST and setup.drive.quick_stop_deceleration is None:
+            return
+        if refused.code not in READ_ONLY:
+            raise
+        held = objects.read(od.QUICK_STOP_DECELERATION)
+        if held < _GENTLER * wanted.value:
+            raise DriverError(
+                f"node {objects.node}: brakes by {held} in a quick stop (6085h, which cannot be set), {wanted.value} "
+                "wanted; give its drives.quick_stop_deceleration where its unit is not counts per square second"
             ) from None
 
 

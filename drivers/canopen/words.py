@@ -136,7 +136,7 @@ EMERGENCIES: dict[int, str] = {
     0x8600: "positioning",
     0x8611: "following error",
     0x8612: "reference limit",
-    0x8700: "SYNC",
+    0x8700: "SYNC: it has stayed away",
     0x9000: "external error",
     0xF000: "additional functions",
     0xFF00: "specific to the device",
@@ -149,7 +149,7 @@ _AXIS_STATUS: dict[DriveState, AxisStatus] = {
     DriveState.FAULT_REACTION: AxisStatus.FAULT,
     DriveState.FAULT: AxisStatus.FAULT,
 }
-_WATCHDOGS = (0x8130, 0x8250)  # we fell silent: no heartbeat, no torque frame
+_WATCHDOGS = (0x8130, 0x8250, 0x8700)  # we fell silent: no heartbeat or question, no torque frame, no SYNC
 
 # Bits of object 1001h, from the lowest.
 ERROR_REGISTER = ("generic", "current", "voltage", "temperature", "communication", "profile", "reserved", "vendor")

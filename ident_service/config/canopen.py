@@ -6,13 +6,14 @@ Boundary: data only. Frames and their cost on the wire are `drivers/canopen`, ge
 
 from __future__ import annotations
 
-import configparser
+import math
 from collections.abc import Iterator, Sequence
-from functools import lru_cache
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field, model_validator
 
+from ident_service.config.eds import eds_mistake, has_object, maps_dummies
 from ident_service.config.quantities import (
     Count,
     GrownSection,
@@ -25,11 +26,20 @@ from ident_service.config.quantities import (
 )
 from ident_service.config.recording import Transmission
 from ident_service.config.simulation import SimulatedFault, WindingsOff
+from ident_service.config.watchdogs import (
+    ABORTING,
+    Heartbeats,
+    NodeGuarding,
+    NodeId,
+    Seconds,
+    WatchdogEntry,
+    WatchdogKind,
+)
 
-NodeId = Annotated[int, Field(strict=True, ge=1, le=127)]
-Seconds = Annotated[float, Field(strict=True, ge=0.001, le=60.0)]  # whole ms of 16 bits in the drive
 InhibitTime = Annotated[float, Field(strict=True, ge=0.0001, le=6.5)]  # 100 us of 16 bits
 _KERNELS = ("raw", "socketcan")  # two ways to the same interfaces
+_ASKED = 0.7  # of the guard time, after which a drive is asked again
+_WHOLE_TURNS = 0.999  # 6080h holds whole turns per minute
 _LEAST_DEADLINE = 2.0  # cycles: one frame may be late
 _MOST_PER_MILLE = 32_767  # of a torque of 16 bits
 EmergencyCode = Annotated[int, Field(strict=True, ge=1, le=0xFFFF)]
@@ -72,7 +82,7 @@ class DriveIdentity(Section):
     serial: Unsigned32 | None = None
 
 
-class CanopenDrive(Section):
+class CanopenDrive(GrownSection):
     """One drive and its motor.
 
     `counts` are those of a motor turn (6064h); `rated_torque` [N m] at the motor is what 6076h is set to, or must be
@@ -80,6 +90,12 @@ class CanopenDrive(Section):
     the motor really gives for one that was asked for. `max_torque` [N m] and `max_speed` [turns per minute] of the
     motor are set as 6072h and 6080h. `notices` are the emergency codes by which this drive, as its manual says, only
     informs: they are told and recorded, and stop nothing.
+
+    `watchdog` says what makes this drive stop by itself when the host is gone: torque frames that stay away
+    (`rpdo_timer`, 1400h:05), the host's heartbeat (1016h), SYNC, node guarding (100Ch, 100Dh), or something of its
+    maker's that watches torque frames. For `sync_loss` and `vendor`, `watchdog_time` [s] is when, by the maker, and
+    `watchdog_entry` what sets it. `quick_stop_deceleration` is what 6085h is set to, in the drive's unit; left
+    out, it stops the joints at their acceleration limits, in counts per square second.
     """
 
     node: NodeId
@@ -91,6 +107,24 @@ class CanopenDrive(Section):
     max_torque: Positive
     max_speed: Positive
     notices: tuple[EmergencyCode, ...] = ()
+    watchdog: WatchdogKind = "rpdo_timer"
+    watchdog_time: Seconds | None = None
+    watchdog_entry: WatchdogEntry | None = None
+    quick_stop_deceleration: Annotated[Unsigned32, Field(ge=1)] | None = None
+    later = frozenset({"watchdog", "watchdog_time", "watchdog_entry", "quick_stop_deceleration"})
+
+    @model_validator(mode="after")
+    def _watchdog_is_described(self) -> CanopenDrive:
+        own = self.watchdog in ("sync_loss", "vendor")
+        if own and self.watchdog_time is None:
+            raise ValueError(
+                f"watchdog: {self.watchdog} needs watchdog_time, the time that the drive's manual promises"
+            )
+        if not own and self.watchdog_time is not None:
+            raise ValueError(f"watchdog_time is for sync_loss and vendor; the time of {self.watchdog} has its own key")
+        if self.watchdog == "vendor" and self.watchdog_entry is None:
+            raise ValueError("watchdog: vendor needs watchdog_entry, which the drive's manual names")
+        return self
 
     @model_validator(mode="after")
     def _notices_are_none_of_the_bus(self) -> CanopenDrive:
@@ -109,21 +143,6 @@ class CanopenDrive(Section):
                 f"max_torque {self.max_torque:g} is {share / 1000.0:g} times rated_torque; a torque is sent in"
                 f" thousandths of it, from 1 to {_MOST_PER_MILLE}: choose another rated_torque"
             )
-        return self
-
-
-class Heartbeats(Section):
-    """Who says that it lives, how often, and how long the others wait for it [s] (1017h, 1016h)."""
-
-    node: NodeId = 127
-    period: Seconds = 0.1
-    drives: Seconds = 0.1
-    timeout: Seconds = 0.3
-
-    @model_validator(mode="after")
-    def _patient(self) -> Heartbeats:
-        if self.timeout <= max(self.period, self.drives):
-            raise ValueError(f"a timeout of {self.timeout:g} s is not longer than the heartbeats' periods")
         return self
 
 
@@ -173,7 +192,8 @@ class CanopenDriver(GrownSection):
     (`absolute`), or count from where they were when power came; then a person leads the arm to the joints' `home` and
     says so, `ident home ARM --zero`, after every loss of power. `measured_torque` says whether drives report the torque
     that they measure (6077h): with their positions, in every cycle (`cyclic`), with their status (`status`), or not at
-    all; left out, with their status where the EDS has the object.
+    all; left out, with their status where the EDS has the object. `watchdog_reason` says why drives of an arm that can
+    fall may take longer than 0.1 s to notice that the host is gone.
     """
 
     kind: Literal["canopen"]
@@ -186,7 +206,9 @@ class CanopenDriver(GrownSection):
     bring_up: Positive = 0.5
     zero: Literal["absolute", "at_home"] = "absolute"
     measured_torque: Literal["cyclic", "status", "none"] | None = None
-    later = frozenset({"measured_torque"})
+    watchdog_reason: Annotated[str, Field(max_length=200)] = ""
+    guarding: NodeGuarding = NodeGuarding()
+    later = frozenset({"measured_torque", "watchdog_reason", "guarding"})
     heartbeats: Heartbeats = Heartbeats()
     reactions: Reactions = Reactions()
     status: StatusReports = StatusReports()
@@ -194,8 +216,17 @@ class CanopenDriver(GrownSection):
 
     @property
     def watchdog(self) -> float:
-        """How long a drive goes on without torque frames [s]."""
-        return self.torque_deadline
+        """Return how long any drive goes on at most when the host is gone [s]."""
+        return max(self.watchdog_seconds(drive) for drive in self.drives)
+
+    def watchdog_seconds(self, drive: CanopenDrive) -> float:
+        """Return how long a drive goes on when what its watchdog watches stays away [s]."""
+        times = {
+            "rpdo_timer": self.torque_deadline,
+            "heartbeat": self.heartbeats.waits,
+            "node_guarding": self.guarding.period * self.guarding.factor,
+        }
+        return times[drive.watchdog] if drive.watchdog_time is None else drive.watchdog_time
 
     @property
     def torque_reports(self) -> Literal["cyclic", "status", "none"]:
@@ -230,44 +261,38 @@ class CanopenDriver(GrownSection):
         return self
 
 
-@lru_cache(maxsize=8)
-def maps_dummies(eds: str) -> bool:
-    """Whether a drive lets 16 bits of a torque frame be another drive's: `Dummy0003=1` of its EDS (CiA 306-1).
+def motor_speeds(transmission: Transmission, velocities: Sequence[float | None]) -> list[float]:
+    """Return how fast each motor turns at most [turns per minute] when all joints move at their velocity limits.
 
     Args:
-        eds: the EDS's text; one that cannot be read says no.
+        transmission: the arm's.
+        velocities: of the joints [rad/s or m/s]; None where one has no limit, which counts as standing still.
     """
-    parser = configparser.ConfigParser(strict=False, interpolation=None)
-    try:
-        parser.read_string(eds)
-        section = next((name for name in parser.sections() if name.lower() == "dummyusage"), None)
-        return section is not None and int(parser.get(section, "Dummy0003", fallback="0"), 0) == 1
-    except (configparser.Error, ValueError):
-        return False
+    size = len(transmission.ratios)
+    coupling = np.eye(size) if transmission.coupling is None else np.array(transmission.coupling)
+    known = np.array([0.0 if one is None else one for one in velocities])
+    motors = np.abs(np.array(transmission.ratios)) * (np.abs(coupling) @ known)
+    return [float(speed) for speed in motors * 60.0 / (2.0 * math.pi)]
 
 
-@lru_cache(maxsize=8)
-def has_object(eds: str, index: int) -> bool:
-    """Return whether an EDS (CiA 306-1) lists an object; one that cannot be read lists none."""
-    parser = configparser.ConfigParser(strict=False, interpolation=None)
-    try:
-        parser.read_string(eds)
-    except configparser.Error:
-        return False
-    return any(name.upper() == f"{index:04X}" for name in parser.sections())
+def quick_stop_decelerations(
+    driver: CanopenDriver, transmission: Transmission, accelerations: Sequence[float | None]
+) -> list[int | None]:
+    """Return what 6085h of each drive is set to, None where nothing says it.
 
-
-@lru_cache(maxsize=8)
-def eds_mistake(eds: str) -> str | None:
-    """Why a text is no EDS (CiA 306-1: an ini file with the section DeviceInfo); None where it may be one."""
-    parser = configparser.ConfigParser(strict=False, interpolation=None)
-    try:
-        parser.read_string(eds)
-    except configparser.Error as error:
-        return str(error).splitlines()[0].removesuffix(" file: '<string>'")
-    if not any(name.lower() == "deviceinfo" for name in parser.sections()):
-        return "it has no section [DeviceInfo]"
-    return None
+    Args:
+        driver: the section `driver`.
+        transmission: the arm's.
+        accelerations: limits of the joints [rad/s^2 or m/s^2], by which the motors brake in counts per square second
+            where a drive's section does not say otherwise; None where a joint has none.
+    """
+    turns = motor_speeds(transmission, accelerations)
+    found: list[int | None] = []
+    for drive, perminute in zip(driver.drives, turns, strict=True):
+        counts = round(perminute / 60.0 * drive.counts)
+        own = drive.quick_stop_deceleration
+        found.append(own if own is not None else min(counts, 0xFFFF_FFFF) if counts else None)
+    return found
 
 
 def disagreements(
@@ -276,6 +301,7 @@ def disagreements(
     joints: Sequence[str],
     rate: float,
     homeless: Sequence[str] = (),
+    velocities: Sequence[float | None] = (),
 ) -> Iterator[tuple[tuple[str | int, ...], str]]:
     """What does not fit an arm of these joints: the place in the arm's file, and what is wrong.
 
@@ -285,6 +311,7 @@ def disagreements(
         joints: names of the arm's joints; none where the file does not name them.
         rate: cycles per second.
         homeless: those without a `home`.
+        velocities: of the joints [rad/s or m/s], None where one has no limit; none where the file names no joints.
     """
     if driver.zero == "at_home" and homeless:
         yield (
@@ -292,6 +319,21 @@ def disagreements(
             "driver.zero: at_home needs every joint's home, the posture in which a person zeroes the arm; missing: "
             + ", ".join(f"joints.{name}.home" for name in homeless),
         )
+    if driver.reactions.abort_connection == 0 and any(drive.watchdog in ABORTING for drive in driver.drives):
+        yield (
+            ("driver", "reactions"),
+            "driver.reactions.abort_connection: 0 has drives do nothing when the host is gone (6007h); take what the"
+            " drive's manual calls a quick stop or a fault",
+        )
+    guarded = sum(drive.watchdog == "node_guarding" for drive in driver.drives)
+    if guarded / rate > _ASKED * driver.guarding.period:
+        yield (
+            ("driver", "guarding"),
+            f"driver.guarding.period: {driver.guarding.period:g} s is too short to ask {guarded} drives, one a cycle"
+            f" at {rate:g} Hz; at least {guarded / rate / _ASKED:.3g} s",
+        )
+    if guarded and any(b.data_bitrate for b in driver.buses):
+        yield ("driver", "buses"), "driver.buses: CAN FD has no remote frames, which node guarding asks with"
     if driver.torque_deadline * rate < _LEAST_DEADLINE:
         yield (
             ("driver", "torque_deadline"),
@@ -302,6 +344,15 @@ def disagreements(
         yield ("driver",), "CANopen drives need the section transmission: gear ratios from joints to motors"
     elif len(transmission.ratios) != len(driver.drives):
         yield ("driver", "drives"), f"{len(driver.drives)} drives but {len(transmission.ratios)} ratios in transmission"
+    elif len(velocities) == len(driver.drives):
+        for k, (drive, speed) in enumerate(zip(driver.drives, motor_speeds(transmission, velocities), strict=True)):
+            if drive.max_speed < _WHOLE_TURNS * speed:
+                yield (
+                    ("driver", "drives", k),
+                    f"driver.drives: node {drive.node} would give no torque above max_speed {drive.max_speed:g} turns"
+                    f" per minute (6080h), but its motor turns at {speed:.0f} when joints move at their limits:"
+                    " raise max_speed, or lower joints.NAME.velocity",
+                )
     shares = driver.torque_frames == "shared" and any(
         sum(drive.bus == bus for drive in driver.drives) > 1 for bus in range(len(driver.buses))
     )

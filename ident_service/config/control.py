@@ -5,7 +5,10 @@ Boundary: data only; what it does is `motion/`.
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Literal
+
+from pydantic import Field
 
 from ident_service.config.quantities import GrownSection, Number, Positive
 
@@ -13,13 +16,32 @@ from ident_service.config.quantities import GrownSection, Number, Positive
 class Control(GrownSection):
     """The computed-torque loop (eq. 76): rate [Hz] and cut-off of the velocity low-pass [Hz].
 
+    The cut-off is one number or one per joint: light joints need a fast loop, heavy ones a quiet torque.
+
+    `friction_feedforward` is the share of the expected friction (the prior's, or `design.friction_guess`) that is added
+    to the torque for the reference's velocity. It stays below 1: friction that is smaller than expected would otherwise
+    be overcompensated, and push the arm ahead of its reference at every reversal.
+
     `after_stop` says what follows a stop: `brake` for drives with brakes, and for arms that gravity does not move,
     which need not say it; `hold`: held under control until a person confirms that the arm is supported or home;
     `lower`: lowered under damped control until it rests, or its lowest point is at `floor` [m above the base's origin].
     """
 
     rate: Positive = 1000.0
-    velocity_cutoff: Positive = 30.0
+    velocity_cutoff: Positive | tuple[Positive, ...] = 30.0
     after_stop: Literal["brake", "hold", "lower"] | None = None
     floor: Number | None = None
-    later = frozenset({"after_stop", "floor"})
+    friction_feedforward: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.8
+    later = frozenset({"after_stop", "floor", "friction_feedforward"})
+
+
+def disagreements(control: Control, joints: Sequence[str]) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Yield what does not fit an arm of these joints: the place in the arm's file, and what is wrong.
+
+    Args:
+        control: the section `control`.
+        joints: names of the arm's joints; none where the file does not name them.
+    """
+    cutoff = control.velocity_cutoff
+    if joints and isinstance(cutoff, tuple) and len(cutoff) != len(joints):
+        yield ("control", "velocity_cutoff"), f"control.velocity_cutoff: {len(cutoff)} values for {len(joints)} joints"

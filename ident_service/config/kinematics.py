@@ -2,14 +2,46 @@
 
 from __future__ import annotations
 
+import math
+import re
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import (
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationInfo,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
-from ident_service.config.quantities import Angle, Number, Section, TextBeside
+from ident_service.config.quantities import Angle, Number, Section, TextBeside, TextFile
 
 _LARGEST_ANGLE = 6.3  # rad
 _LONGEST_LINK = 20.0  # m; the largest arms that move torque-controlled joints are a tenth of it
+
+
+_SNAPPED_TO = math.pi / 12.0
+_ROUNDED = 2e-3  # rad; 3.14 for pi is 1.6e-3
+_RPY = re.compile(r"""(\brpy\s*=\s*)(["'])([^"']*)\2""")
+
+
+def snapped(urdf: str) -> str:
+    """Write the angles of `rpy` attributes that are nearly multiples of 15 degrees as those, with all digits."""
+
+    def angle(text: str) -> str:
+        try:
+            value = float(text)
+        except ValueError:
+            return text
+        exact = round(value / _SNAPPED_TO) * _SNAPPED_TO
+        return repr(exact) if abs(value - exact) <= _ROUNDED else text
+
+    def attribute(found: re.Match[str]) -> str:
+        start, quote, values = found.groups()
+        return f"{start}{quote}{' '.join(angle(value) for value in values.split())}{quote}"
+
+    return _RPY.sub(attribute, urdf)
 
 
 class DHRow(Section):
@@ -46,15 +78,23 @@ class Kinematics(Section):
 
     Of a URDF or MJCF file, the arm is what moves between the links `base` and `tip`, its world the frame of `base`. The
     joints of `lock` are held at a position [rad or m], all others outside at zero; what hangs on them is part of the
-    link before them.
+    link before them. With `snap`, angles in `rpy` within 0.002 rad of a multiple of 15 degrees are that multiple.
     """
 
     dh: DHTable | None = None
+    snap: bool = False
     urdf: TextBeside | None = None
     mjcf: TextBeside | None = None
     base: Annotated[str, Field(min_length=1)] | None = None
     tip: Annotated[str, Field(min_length=1)] | None = None
     lock: dict[str, Angle] = Field(default_factory=dict)
+
+    @field_validator("urdf")
+    @classmethod
+    def _snapped(cls, urdf: TextFile | None, info: ValidationInfo) -> TextFile | None:
+        if urdf is None or not info.data.get("snap"):
+            return urdf
+        return TextFile(name=urdf.name, text=snapped(urdf.text))
 
     @model_validator(mode="after")
     def _one(self) -> Kinematics:
@@ -62,10 +102,12 @@ class Kinematics(Section):
             raise ValueError("give exactly one of dh, urdf, mjcf")
         if self.dh is not None and (self.base or self.tip or self.lock):
             raise ValueError("base, tip and lock are of urdf and mjcf; a DH table lists the joints that move")
+        if self.snap and self.urdf is None:
+            raise ValueError("snap is of urdf; write the angles of a DH table or MJCF file with all their digits")
         return self
 
     @model_serializer(mode="wrap")
     def _unless_whole(self, serialized: SerializerFunctionWrapHandler) -> dict[str, Any]:
         # Descriptions without these keys keep the hashes that results and tickets have named them by.
         document: dict[str, Any] = serialized(self)
-        return {key: value for key, value in document.items() if key not in ("base", "tip", "lock") or value}
+        return {key: value for key, value in document.items() if key not in ("base", "tip", "lock", "snap") or value}

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from ident_service.config import canopen, design, recording, simulation, workspace
+from ident_service.config import canopen, control, design, recording, simulation, workspace
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.kinematics import DHTable
 from ident_service.config.quantities import MAX_FILE_BYTES, UPLOAD, Section
@@ -168,10 +168,14 @@ def _disagreements(config: ArmConfig) -> Iterator[tuple[KeyPath, str]]:
         yield from simulation.disagreements(config.driver, names, config.control.rate)
     if isinstance(config.driver, CanopenDriver):
         homeless = [name for name in names if (joint := config.joints.get(name)) is None or joint.home is None]
-        yield from canopen.disagreements(config.driver, config.transmission, names, config.control.rate, homeless)
+        velocities = [joint.velocity if (joint := config.joints.get(name)) else None for name in names]
+        yield from canopen.disagreements(
+            config.driver, config.transmission, names, config.control.rate, homeless, velocities
+        )
     yield from recording.disagreements(config.recording, config.transmission, names)
     yield from workspace.disagreements(config.geometry, config.workspace, config.supply, names)
     yield from design.disagreements(config.design, names)
+    yield from control.disagreements(config.control, names)
 
 
 def _joint_names(table: DHTable | None, config: ArmConfig) -> tuple[str, ...]:

@@ -149,7 +149,7 @@ class SimulatedDriver(GrownSection):
     `process` says where its plant lives; `bus` names a separate one that other processes may ask for, `status` the file
     it reports to, `deadline` [s] how long an answer of it may take. `watchdog` [s] without a torque frame makes
     the drives idle; idle drives brake with `braking` [N m s/rad], for 0.1 s or, where `windings_off` is `shorted`, for
-    as long as they are off.
+    as long as they are off. `watchdog_reason` says why drives of an arm that can fall may go on for longer than 0.1 s.
     """
 
     kind: Literal["simulated"]
@@ -165,9 +165,10 @@ class SimulatedDriver(GrownSection):
     torque_noise: PerJoint = 0.0
     delay_cycles: Annotated[Count, Field(le=100)] = 1
     watchdog: Positive = 0.01
+    watchdog_reason: Annotated[str, Field(max_length=200)] = ""
     braking: PerJoint | None = None
     windings_off: WindingsOff = "open"
-    later = frozenset({"windings_off"})
+    later = frozenset({"windings_off", "watchdog_reason"})
     faults: tuple[SimulatedFault, ...] = ()
 
 

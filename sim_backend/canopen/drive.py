@@ -4,10 +4,10 @@ A host configures it by SDO alone; all it does follows from its object dictionar
 and told, then the torque that came before the SYNC begins to act.
 
 What makes it stop by itself, each by the option in 6007h (0 nothing, 1 fault, 2 disable voltage, 3 quick stop;
-CiA 402-2, 10.3.2): a heartbeat that stays away (1016h, after which the node also leaves `operational`, 1029h:01), an
-RPDO that stays away for longer than its event timer, and NMT commands that end `operational`.
-
-Boundary: the parts are put together here; the motor is `sim_backend/pucks`.
+CiA 402-2, 10.3.2): a heartbeat or a question of node guarding that stays away (1016h, 100Ch and 100Dh, after which the
+node also leaves `operational`, 1029h:01), an RPDO that stays away for longer than its event timer, SYNC that stays away
+for 2F70h of its periods (1006h), a target torque that does for 2F75h [ms], and NMT commands that end `operational`. The
+two entries of the maker's stand for those of real ones.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import math
 from drivers.canopen.frame import Frame
 from sim_backend.canopen import nmt
 from sim_backend.canopen.emergency import Emergency
+from sim_backend.canopen.makers import MakersWatchdogs
 from sim_backend.canopen.mapping import COMMUNICATION, MAPPING, check_write
 from sim_backend.canopen.nmt import Nmt, State
 from sim_backend.canopen.node import Node
@@ -48,6 +49,7 @@ class CanopenDrive:
         nmt: its state in the network.
         power: its state as a drive.
         sync_identifier: which frames are a SYNC.
+        deaf: whether a defect has it go on, whatever stays away.
     """
 
     def __init__(self, eds: str, number: int, motor: Motor, identity: dict[int, int] | None = None) -> None:
@@ -74,10 +76,12 @@ class CanopenDrive:
         self.power = PowerStage(node, motor)
         self._pdos = Pdos(node, self.emergency, self._arrived, self._late)
         self._torque = TorqueLoop(self.objects, motor)
+        self._makers = MakersWatchdogs(node, self.emergency, self._late)
         self._failure = 0
         self._warned = self._evaluated = False
         self._ears: set[int] = set()
         self.sync_identifier = 0
+        self.deaf = False
         self.objects.before_read = self._about_to_read
         self.objects.veto = self._veto
         self.objects.written = self._written
@@ -123,9 +127,13 @@ class CanopenDrive:
         Returns:
             What the drive sends, in order.
         """
-        if frame.error or frame.remote or frame.extended:
+        if frame.error or frame.extended:
             return []
         self._node.now_ns = now_ns
+        if frame.remote:
+            if frame.identifier == 0x700 + self._node.number and self.nmt.state is not State.INITIALISING:
+                self.nmt.asked()
+            return self._finish()
         identifier, state = frame.identifier, self.nmt.state
         if identifier == 0:
             self.nmt.command(frame.data)
@@ -151,7 +159,7 @@ class CanopenDrive:
             if timers[name] > now_ns:
                 break
             self._node.now_ns = max(timers.pop(name), self._node.now_ns)
-            for part in (self.nmt, self._pdos, self.power, self.emergency):
+            for part in (self.nmt, self._makers, self._pdos, self.power, self.emergency):
                 part.due(name)
             self._refresh()
             self._pdos.changes()
@@ -199,6 +207,10 @@ class CanopenDrive:
         """A lasting fault is gone; it still has to be reset."""
         self._failure = 0
 
+    def ignore_watchdogs(self, deaf: bool) -> None:
+        """A defect has it go on although its host is gone, or is mended."""
+        self.deaf = deaf
+
     def warn(self, warned: bool, now_ns: int) -> list[Frame]:
         """Set or clear the warning bit of the statusword."""
         self._node.now_ns = now_ns
@@ -229,13 +241,13 @@ class CanopenDrive:
 
     def _sync(self, data: bytes) -> None:
         if data:
-            # Without a counter (1019h is 0) a SYNC has no data (CiA 301, 7.2.5).
-            self.emergency.occurs(SYNC_LENGTH)
+            self.emergency.occurs(SYNC_LENGTH)  # without a counter (1019h is 0) it has none (CiA 301, 7.2.5)
             return
+        if self.nmt.state is State.OPERATIONAL:
+            self._makers.synced()
         self._sample(self._node.now_ns)
         self._evaluated = False
-        self._pdos.sync()
-        # Limits depend on where the motor is, whether a torque has come or not.
+        self._pdos.sync()  # limits depend on where the motor is, whether a torque has come or not
         if not self._evaluated and self.power.state is PowerState.OPERATION_ENABLED:
             self._torque.evaluate(self._node.now_ns)
 
@@ -252,6 +264,8 @@ class CanopenDrive:
             mode = number(0x6060)
             if 1 <= mode <= 32 and number(0x6502) >> (mode - 1) & 1:
                 self.objects.put(0x6061, mode)
+        if 0x607100 in keys and self.nmt.state is State.OPERATIONAL:
+            self._makers.targeted()
         if 0x604000 in keys and self.power.control(number(0x6040)) and not self._failure:
             self.power.reset_fault()
             waiting = {NO_HEARTBEAT} if self.nmt.silent_nodes else set()
@@ -275,6 +289,8 @@ class CanopenDrive:
             self.emergency.is_over(NO_HEARTBEAT)
 
     def _abort_connection(self) -> None:
+        if self.deaf:
+            return
         match self.objects.number(0x6007):
             case 1:
                 self.power.trip()
@@ -288,6 +304,7 @@ class CanopenDrive:
             self._pdos.start()
         elif before is State.OPERATIONAL:
             self._pdos.stop()
+            self._makers.stop()
             self.emergency.is_over(RPDO_TIMEOUT)
             self._abort_connection()
         if before is State.INITIALISING and self.power.state is PowerState.NOT_READY:
@@ -346,6 +363,8 @@ class CanopenDrive:
             self.nmt.configure_consumers()
         elif index == 0x1017:
             self.nmt.configure_producer()
+        elif index in (0x100C, 0x100D):
+            self.nmt.configure_guarding()
         elif key == 0x100300:
             for number in range(1, 9):
                 self.objects.put(0x1003, 0, number)

@@ -1,4 +1,4 @@
-"""The NMT state machine of an emulated node and its heartbeats, sent and awaited (CiA 301, 7.2.8, 7.3.2).
+"""The NMT state machine of an emulated node, its heartbeats, sent and awaited, its guarding (CiA 301, 7.2.8, 7.3.2).
 
 Boundary: states and their frames; what a node does in a state, and about a heartbeat that stays away, is `drive.py`.
 """
@@ -15,6 +15,8 @@ _MS = 1_000_000
 _PRODUCER = "heartbeat"
 _CONSUMER = "heartbeat of "
 _BOOT = "boot"
+_LIFE = "life guarding"
+_HOST = 0  # stands for whoever asks by remote frames, who has no number
 _CONSUMERS = range(1, 5)
 
 
@@ -79,12 +81,15 @@ class Nmt:
         self.state = State.INITIALISING
         self.silent_nodes: set[int] = set()
         self.commanded = False
+        self._toggle = 0
 
     def boot(self, delay_ns: int) -> None:
         """Initialise, and say so after a while."""
         self.commanded = False
         self._to(State.INITIALISING)
         self._node.stop(_PRODUCER)
+        self._node.stop(_LIFE)
+        self._toggle = 0
         self.configure_consumers()
         self._node.after(_BOOT, delay_ns)
 
@@ -124,6 +129,23 @@ class Nmt:
         while self.silent_nodes:
             self._found(self.silent_nodes.pop())
 
+    def configure_guarding(self) -> None:
+        """Object 100Ch or 100Dh has changed; guarding begins with the next question (CiA 301, 7.2.8.2.2.1)."""
+        self._node.stop(_LIFE)
+
+    def asked(self) -> None:
+        """A remote frame asks for the state: answer it, and wait for the next one where life is guarded."""
+        objects = self._node.objects
+        if objects.number(0x1017):
+            return  # a node that sends heartbeats is not guarded
+        self._node.send(0x700 + self._node.number, bytes([self._toggle | self.state]))
+        self._toggle ^= 0x80
+        if life := objects.number(0x100C) * objects.number(0x100D):
+            self._node.after(_LIFE, life * _MS)
+            if _HOST in self.silent_nodes:
+                self.silent_nodes.discard(_HOST)
+                self._found(_HOST)
+
     def heard(self, frame: Frame) -> None:
         """A heartbeat of another node."""
         number = frame.identifier - 0x700
@@ -143,6 +165,9 @@ class Nmt:
             self._beat()
         elif name == _PRODUCER:
             self._beat()
+        elif name == _LIFE:
+            self.silent_nodes.add(_HOST)
+            self._lost(_HOST)
         elif name.startswith(_CONSUMER):
             number = int(name.removeprefix(_CONSUMER))
             self.silent_nodes.add(number)

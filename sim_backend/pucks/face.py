@@ -72,6 +72,9 @@ class Face(Protocol):
     def repaired(self) -> None:
         """A lasting fault is gone."""
 
+    def ignore_watchdogs(self, deaf: bool) -> None:
+        """It goes on although its host is gone, or does not any more."""
+
     def warn(self, warned: bool, now_ns: int) -> list[Frame]:
         """A warning comes or goes."""
 

@@ -35,6 +35,7 @@ PUCK_FAULTS: dict[str, FaultRule] = {
     # Only drives on a bus can have these.
     "emergency": FaultRule("emergency message and the drive's own fault reaction", "error code, such as 0x4310"),
     "warning": FaultRule("the warning bit of the status", stays=True),
+    "watchdog_ignored": FaultRule("it goes on, although its host is gone", stays=True),
     "heartbeat_lost": FaultRule("no heartbeat, while everything else goes on", stays=True),
     "reboot": FaultRule("the node's firmware starts again"),
     "wrong_node": FaultRule("a second node sends position frames under the same identifier", stays=True),

@@ -147,6 +147,8 @@ class Injection:
                 return face.fail(int(fault.size), now_ns)
             case "emergency_stop", _:
                 return face.supply(not begins, now_ns)
+            case "watchdog_ignored", _:
+                face.ignore_watchdogs(begins)
             case "warning", _:
                 return face.warn(begins, now_ns)
             case "reboot", True:

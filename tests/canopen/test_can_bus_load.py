@@ -12,7 +12,7 @@ from can_arms import MAX_TORQUE, RATED
 
 from drivers.canopen.coordinates import coordinates
 from ident_service.cli import DONE, USAGE, VERDICT_NO, main
-from ident_service.config.canopen import CanopenDriver
+from ident_service.config.canopen import CanopenDriver, disagreements
 from ident_service.config.limits import motion_limits
 from ident_service.config.load import load_arm
 from ident_service.errors import ConfigError
@@ -124,6 +124,25 @@ def test_shipped_arms_are_stable_and_their_drives_give_what_their_joints_may(arm
     assert (speeds <= 1.3 * turns).all()
     assert [drive.max_torque for drive in config.driver.drives] == list(MAX_TORQUE)
     assert [drive.rated_torque for drive in config.driver.drives] == list(RATED)
+
+
+def test_a_drive_that_would_take_its_torque_back_below_a_joints_velocity_limit_is_a_mistake(arms: Path) -> None:
+    config = load_arm(arms / "wam7_canopen.yaml")
+    assert isinstance(config.driver, CanopenDriver)
+    names, rate = list(config.joints), config.control.rate
+
+    def told(j4: float) -> list[str]:
+        velocities = [j4 if name == "j4" else joint.velocity for name, joint in config.joints.items()]
+        return [
+            what
+            for _, what in disagreements(config.driver, config.transmission, names, rate, velocities=velocities)  # type: ignore[arg-type]
+        ]
+
+    # 18 turns of motor 4 a turn of j4, and 430 turns a minute: 2.502 rad/s.
+    assert told(2.5) == []
+    (what,) = told(2.51)
+    assert "node 4 would give no torque above max_speed 430" in what
+    assert "its motor turns at 431" in what
 
 
 def test_the_identified_parameters_are_those_of_the_simulated_wam(arms: Path) -> None:

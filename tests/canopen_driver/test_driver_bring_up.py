@@ -105,6 +105,24 @@ def test_a_rated_torque_that_only_the_drive_decides_must_be_the_configured_one()
         assert arm.exchange(None).valid.all()
 
 
+def test_a_speed_limit_that_only_the_drive_decides_must_leave_the_joints_their_velocities() -> None:
+    """Both joints of the bench move at 1 at most; its motors turn 100 times as fast, 955 turns per minute."""
+    told = weightless_config()
+    joints = {name: joint.model_dump(mode="json") | {"velocity": 1.0} for name, joint in told.joints.items()}
+    gears = {"ratios": [100.0, 100.0], "drive_terms": "joints"}
+    changes = {"joints": joints, "transmission": gears}
+    told = ArmConfig.model_validate(told.model_dump(mode="json", by_alias=True) | changes)
+    for own, refused in (("954", True), ("955", False)):
+        bench = Bench(told, weightless_config(eds=eds_with("6080", AccessType="ro", DefaultValue=own)))
+        if refused:
+            with pytest.raises(DriverError, match=r"node 1: gives no torque above 954 turns .* turns at 955"):
+                bench.arm.open()
+            check_nothing_is_open(bench)
+        else:
+            with bench.arm as arm:
+                assert arm.exchange(None).valid.all()
+
+
 def test_a_drive_that_maps_no_dummies_says_so_in_words_whatever_its_data_sheet_says() -> None:
     real = weightless_config(eds=eds_with("DummyUsage", Dummy0003="0"), torque_frames="single")
     bench = Bench(weightless_config(), real)

@@ -265,7 +265,7 @@ def test_an_arm_is_not_zeroed_while_it_moves_is_powered_or_driven_by_another() -
 
 def test_drives_without_1020h_or_that_store_it_are_refused() -> None:
     head, _, rest = EDS.partition("[1020]")
-    without = head.replace("SupportedObjects=63", "SupportedObjects=62") + "[1029]" + rest.partition("[1029]")[2]
+    without = head.replace("SupportedObjects=65", "SupportedObjects=64") + "[1029]" + rest.partition("[1029]")[2]
     numbered = [line for line in without.split("\n") if not line.endswith("=0x1020")]
     bare = config_at(eds={"name": "bare.eds", "text": "\n".join(numbered)})
     arm = CanopenArm(bare, lambda _: [LockStepArm(bare).link(0)])
@@ -280,7 +280,7 @@ def test_drives_without_1020h_or_that_store_it_are_refused() -> None:
                 "ObjectType=0x7\nDataType=0x0005\nAccessType=const\nDefaultValue=1\nPDOMapping=0\n\n[1010sub1]\n"
                 "ParameterName=All\nObjectType=0x7\nDataType=0x0007\nAccessType=rw\nDefaultValue=2\nPDOMapping=0\n\n"
                 "[1020]",
-            ).replace("1=0x1003\n", "1=0x1003\n64=0x1010\n"),
+            ).replace("1=0x1003\n", "1=0x1003\n66=0x1010\n"),
         }
     )
     with pytest.raises(DriverError, match=r"node 1: stores parameters by itself"):

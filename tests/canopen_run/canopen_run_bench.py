@@ -59,6 +59,7 @@ def canopen(tree: dict[str, Any], bus: dict[str, Any], seed: int, **driver: Any)
         "buses": [bus],
         "drives": [drive | {"node": 1}, drive | {"node": 2}],
         "emulation": {"seed": seed, "truth": truth(), "torque_noise": TORQUE_NOISE},
+        "watchdog_reason": "an emulated arm behind a machine that stalls",
     }
     gears = {"ratios": [20.0, -20.0], "coupling": [[1.0, -0.5], [1.0, 0.5]], "drive_terms": "joints"}
     return tree | {"transmission": gears, "driver": section | driver}

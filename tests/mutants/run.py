@@ -59,6 +59,7 @@ GROUPS = {
             "tests/motion/test_motion_guard.py",
             "tests/motion/test_motion_told.py",
             "tests/motion/test_motion_owed.py",
+            "tests/motion/test_motion_owed_runs.py",
         ),
     ),
     "stop": Group(

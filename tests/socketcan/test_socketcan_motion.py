@@ -49,6 +49,7 @@ driver:
   eds: {eds}
   buses: [{{interface: {interface}, channel: {channel}}}]
   torque_deadline: 1.0
+  watchdog_reason: an emulated arm in a slow guest
   bring_up: 10.0
   heartbeats: {{period: 1.0, drives: 1.0, timeout: 5.0}}
   drives:

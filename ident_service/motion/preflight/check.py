@@ -41,7 +41,7 @@ CODES = (
 # What these find is wrong with the motion, or with where the arm stands for it; the arm may be held, and sent home.
 ABOUT_THE_MOTION = ("motion_fits", "motion_proven", "ways_clear")
 # Nothing replaces these, so that a ticket without them allows nothing, whatever its other checks say.
-INDISPENSABLE = ("gravity", "direction")
+INDISPENSABLE = ("gravity", "direction", "watchdog")
 
 
 @dataclass(frozen=True)

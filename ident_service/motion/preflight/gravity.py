@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ident_service.config.limits import MotionLimits, Vector
-from ident_service.excitation.following import ExpectedFriction
 from ident_service.model.arm_model import ArmModel
+from ident_service.model.expected_friction import ExpectedFriction
 from ident_service.motion.preflight.check import Check, failed, joint_units, judged, measures
 from ident_service.motion.preflight.plan import HOLDABLE
 from ident_service.motion.preflight.session import Rows

@@ -26,6 +26,10 @@ STEPS_OF_NOISE = 3.0  # encoder steps: an axis at rest stays on one, or between 
 VELOCITY_NOISE = 0.1  # of the velocity limit, peak: the guard stops at 1.2
 TORQUE_NOISE = 0.05  # of the torque limit, standard deviation, that the gains make of the noise
 LOST = 0.01  # of all answers
+RATE_REMEDY = (
+    "Give the process a core of its own and real-time priority (rtprio and memlock in limits.conf), stop other load, "
+    "or lower control.rate."
+)
 
 
 @dataclass(frozen=True)
@@ -193,9 +197,31 @@ def rate_check(looked: Looked, lock_step: bool) -> Check:
     return judged(
         code,
         found,
-        "Give the process a core of its own and real-time priority (rtprio and memlock in limits.conf), stop other "
-        "load, or lower control.rate.",
+        RATE_REMEDY,
     )
+
+
+def loop_rate_check(stamps_ns: Vector, period: float, lock_step: bool, before: Check) -> Check:
+    """Judge the rate of the whole loop, with the torque that holds the arm in every cycle, beside the look's.
+
+    Args:
+        stamps_ns: of the cycles [ns], shape (cycles,).
+        period: [s].
+        lock_step: whether time is virtual.
+        before: what the look said.
+    """
+    if lock_step or before.verdict is not Verdict.PASSED:
+        return before
+    gaps = np.diff(stamps_ns) * 1e-9
+    late = np.maximum(gaps - period, 0.0)
+    seconds = f"with torque frames for {float(gaps.sum()):.0f} s"
+    found = [
+        *before.measures,
+        measure(f"lateness of 99.9 % of the cycles, {seconds}", float(np.quantile(late, 0.999)) * 1e3, "ms"),
+        measure(f"worst lateness, {seconds}", float(late.max()) * 1e3, "ms", most=LONGEST_GAP * period * 1e3),
+        measure(f"late cycles, {seconds}", float((late > LATE * period).mean()), "", most=LATE_SHARE),
+    ]
+    return judged(before.code, found, RATE_REMEDY)
 
 
 def noise_check(
@@ -217,7 +243,7 @@ def noise_check(
     time = np.linspace(-1.0, 1.0, len(position))[:, None]
     slope = (time * position).sum(axis=0) / (time**2).sum()
     noise = position - position.mean(axis=0) - slope * time
-    gain = 1.0 - float(np.exp(-2.0 * np.pi * model.config.control.velocity_cutoff * period))
+    gain = 1.0 - np.exp(-2.0 * np.pi * np.asarray(model.config.control.velocity_cutoff) * period)
     velocity = np.zeros_like(noise)
     for k in range(1, len(noise)):
         velocity[k] = velocity[k - 1] + gain * ((noise[k] - noise[k - 1]) / period - velocity[k - 1])

@@ -16,15 +16,19 @@ from ident_service.excitation.proof import objections, proof_of
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
 from ident_service.model.rigid_body import InverseDynamics
-from ident_service.motion.after_stop import after_stop
+from ident_service.motion.after_stop import after_stop, falling_joints
 from ident_service.motion.plans import Destination, GoTo
-from ident_service.motion.preflight.check import Check, Measure, Verdict, failed, judged, measure, measures
+from ident_service.motion.preflight.check import Check, Measure, Verdict, failed, joint_units, judged, measure, measures
 from ident_service.motion.preflight.stability import INERTIA, LEAST_GAIN_MARGIN, delay_of, stability
 from ident_service.motion.reference import PathReference, rest
 from ident_service.motion.stop import require_stops_within_limits
 from ident_service.motion.surroundings import stop_clearance, way_clearance
 from ident_service.motion.way import way
 
+# What drives may take to notice that the host is gone where joints can fall: what falls freely has sunk 5 cm after it
+# and moves at 1 m/s, and others take no longer (moteus 0.1 s).
+LONGEST_SILENCE = 0.1
+NEAR_HOME = 0.1  # rad or m: people lead an arm home to a few hundredths
 HOLDABLE = 0.8  # of a torque limit: what holding may take, so that something is left to correct with
 _POSTURES = 8  # of the motion, at which the coupled loop is judged
 
@@ -46,6 +50,17 @@ def configuration_check(model: ArmModel) -> Check:
             code,
             "the prior's mass matrix at home is not positive definite: no real body has these parameters",
             "Give prior parameters of a feasible identification or of a CAD model.",
+        )
+    seconds = getattr(model.config.driver, "watchdog", None)
+    reason = getattr(model.config.driver, "watchdog_reason", "")
+    long = isinstance(seconds, int | float) and seconds > LONGEST_SILENCE and not reason
+    if long and (falling := falling_joints(model, limits)):
+        return failed(
+            code,
+            f"drives go on for {seconds:g} s when the host is gone, and {', '.join(falling)} can fall: at most "
+            f"{LONGEST_SILENCE:g} s",
+            "Shorten the drives' watchdog (torque_deadline, heartbeats.host_timeout, guarding, watchdog_time), or say "
+            "in driver.watchdog_reason why this arm may go on for longer.",
         )
     if isinstance(model.config.driver, CanopenDriver):
         load = budget(model.config.driver, model.config.control.rate)
@@ -118,6 +133,23 @@ def stability_check(model: ArmModel, limits: MotionLimits, excitation: Excitatio
         found,
         f"Lower kp and kd, raise control.velocity_cutoff or control.rate, or give the prior its drive inertia; inertia "
         f"is taken to be {INERTIA[0]:g} to {INERTIA[1]:g} times the model's.",
+    )
+
+
+def away_from_home(model: ArmModel, limits: MotionLimits, position: Vector) -> str:
+    """Say how far an arm stands from where motions begin, in words; empty where that is near.
+
+    Args:
+        model: of the arm.
+        limits: of the arm, with its home.
+        position: where it stands [rad or m], shape (joints,).
+    """
+    units = joint_units(model.chain.revolute, "rad", "m")
+    far = np.abs(position - limits.home)
+    return ", ".join(
+        f"{name} {away:.2g} {unit} away"
+        for name, away, unit in zip(model.chain.names, far, units, strict=True)
+        if away > NEAR_HOME
     )
 
 

@@ -8,28 +8,32 @@ what. Whatever happens, the arm is without torque and closed afterwards.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import timedelta
 
 import numpy as np
 
 from drivers.arm import Arm, ArmDescription, Sample, StopKind
 from drivers.clock import Clock, RealClock
+from drivers.status import AxisStatus
 from ident_service.config.limits import MotionLimits, Vector, motion_limits
 from ident_service.errors import ArmError, ArmFault, ModelError, MotionRefused
 from ident_service.excitation.excitation import Excitation
-from ident_service.excitation.following import ExpectedFriction, expected_friction
 from ident_service.model.arm_model import ArmModel
+from ident_service.model.expected_friction import ExpectedFriction, expected_friction
 from ident_service.model.rigid_body import InverseDynamics
 from ident_service.model.threads import one_blas_thread
 from ident_service.motion.attended import attended
 from ident_service.motion.control import ComputedTorque
 from ident_service.motion.outside import admitting, reachable
 from ident_service.motion.preflight.check import ABOUT_THE_MOTION, CODES, Check, Verdict, failed, skipped
+from ident_service.motion.preflight.delay import delay_of
 from ident_service.motion.preflight.direction import (
+    DWELL,
     Stroke,
     answer,
     direction_check,
+    expected_way,
     follow_stroke,
     sign_failure,
     strokes,
@@ -43,11 +47,13 @@ from ident_service.motion.preflight.look import (
     at_rest_check,
     identities_check,
     look,
+    loop_rate_check,
     noise_check,
     rate_check,
     unreachable,
 )
 from ident_service.motion.preflight.plan import (
+    away_from_home,
     configuration_check,
     motion_fits_check,
     motion_proven_check,
@@ -58,10 +64,12 @@ from ident_service.motion.preflight.plan import (
 from ident_service.motion.preflight.remedy import remedy_of
 from ident_service.motion.preflight.session import Rows, Session, trace_of
 from ident_service.motion.preflight.ticket import VALID, Ticket, new_ticket, subject_of
-from ident_service.motion.preflight.watchdog import Confirm, Consent, consent, watchdog_check
+from ident_service.motion.preflight.watchdog import CODE, Confirm, Consent, consent, watchdog_check
 from ident_service.motion.reference import hold, rest
 
 LOOK = 1.0  # s
+RESTS = 3.0  # s that an arm may take to come to rest when its drives have stopped
+REST_REMEDY = "Support the arm where every joint has room to move a little, keep hands off, and check again."
 _LEAST_CYCLES = 100
 _LOOK_AGAIN = 20  # cycles
 
@@ -80,6 +88,7 @@ def preflight(
     tell: Tell = lambda check: None,
     valid: timedelta = VALID,
     look_seconds: float = LOOK,
+    rate_seconds: float = 0.0,
 ) -> Ticket:
     """Check an arm and a motion.
 
@@ -94,12 +103,13 @@ def preflight(
         tell: called with every check as soon as it is made.
         valid: how long the ticket counts.
         look_seconds: how long rate and noise are measured.
+        rate_seconds: how long the rate is measured with the torque that holds the arm, at least for `HOLD`.
 
     Returns:
         The ticket, whatever its verdict; what fails is in its checks, and nothing the arm does is raised.
     """
     clock = RealClock() if clock is None else clock
-    flight = _Preflight(arm, model, excitation, confirm, identities, tell, look_seconds)
+    flight = _Preflight(arm, model, excitation, confirm, identities, tell, look_seconds, rate_seconds)
     flight.run()
     subject = subject_of(model, excitation, flight.described)
     return new_ticket(subject, flight.all_checks(), clock.now_ns() + clock.utc_offset_ns, valid)
@@ -131,11 +141,13 @@ class _Preflight:
         identities: Sequence[str] | None,
         tell: Tell,
         look_seconds: float,
+        rate_seconds: float,
     ) -> None:
         self.arm, self.model, self.excitation = arm, model, excitation
         self.confirm, self.identities, self.tell = confirm, identities, tell
-        self.look_seconds = look_seconds
+        self.look_seconds, self.rate_seconds = look_seconds, rate_seconds
         self.described: ArmDescription | None = None
+        self.away = ""  # from home, in words
         self.checks: dict[str, Check] = {}
 
     def run(self) -> None:
@@ -144,9 +156,15 @@ class _Preflight:
             return
         limits = motion_limits(self.model.config)
         motion = self.excitation
-        if motion is not None and self._passed(motion_fits_check(self.model, motion)):
+        stable = stability_check(self.model, limits, motion)
+        # Through a loop that is not stable no arm follows any motion; another motion is no remedy.
+        if (
+            motion is not None
+            and self._passed(motion_fits_check(self.model, motion))
+            and stable.verdict is Verdict.PASSED
+        ):
             self._passed(motion_proven_check(self.model, limits, motion))
-        self._passed(stability_check(self.model, limits, self.excitation))
+        self._passed(stable)
         try:
             with self.arm:
                 try:
@@ -206,11 +224,13 @@ class _Preflight:
         if not self._passed(at_rest_check(looked, self.model, self._bounds(limits))):
             return None
         home = looked.samples[-1].position.copy()
+        if self.excitation is not None:
+            self.away = away_from_home(self.model, limits, home)
         if self.excitation is None:
             self._passed(way_home_check(self.model, limits, home))
             limits = admitting(home, limits)
         elif self.checks["motion_fits"].verdict is Verdict.PASSED:
-            self._passed(ways_check(self.model, limits, self.excitation, home))
+            self._passed(ways_check(self.model, limits, self.excitation, home), of_place=True)
         self._passed(rate_check(looked, self.arm.clock.lock_step))
         friction = expected_friction(self.model, limits, self.model.config.design.friction_guess)
         session = Session(self.arm, self.model, limits, self.described, home, friction)
@@ -218,7 +238,7 @@ class _Preflight:
         if any(c.verdict is Verdict.FAILED and c.code not in ABOUT_THE_MOTION for c in self.checks.values()):
             return None
         if (impossible := holdable(session.gravity, self.model, limits)) is not None:
-            self._passed(impossible)
+            self._passed(impossible, of_place=True)
             return None
         agreed = consent(self.model, looked.samples[-1], self.confirm)
         if agreed.check is not None:
@@ -232,22 +252,23 @@ class _Preflight:
             room = admitting(session.home, motion_limits(self.model.config), 0.0)
             return strokes(session, self.model, room)
         except (ModelError, MotionRefused) as error:
-            self._passed(failed("direction", str(error), "Move the arm by hand to where every joint has room."))
+            remedy = "Move the arm by hand to where every joint has room."
+            self._passed(failed("direction", str(error), remedy), of_place=True)
             return []
 
     def _touched(self, session: Session, planned: Sequence[Stroke], gravity: _Gravity, *, try_watchdog: bool) -> None:
         """Hold the arm, move it a little, and fall silent; what came of it is judged when the arm has been let go."""
         held: Rows = ()
-        moved: list[Rows] = []
+        moved: list[tuple[Rows, Rows]] = []
         silent: Check | None = None
         try:
             session.energise()
-            held = session.follow(hold(session.home), SETTLE + HOLD)
+            held = session.follow(hold(session.home), SETTLE + max(HOLD, self.rate_seconds))
             if planned and gravity.carried_by(held_torque(held, session.period)):
                 moved += (follow_stroke(session, one) for one in planned)
                 session.follow(hold(session.home), SETTLE)
                 if try_watchdog:
-                    silent = watchdog_check(self.arm, self.model, session.period)
+                    silent = watchdog_check(self.arm, self.model, session.period, session.torque)
             if silent is None:
                 session.release()
         except ArmError as error:
@@ -259,21 +280,69 @@ class _Preflight:
             raise _Ended from error
         with attended(self.arm):
             self._judged(session, gravity, held, planned, moved)
+        if silent is not None and silent.verdict is Verdict.PASSED:
+            silent = self._silent_in_motion(silent)
         if silent is not None:
             self._passed(silent)
 
+    def _silent_in_motion(self, at_rest: Check) -> Check:
+        """Fall silent again, in the middle of a small motion of one joint; both checks in one."""
+        try:
+            self.arm.close()  # what the silence has left behind in drives ends with the session
+            self.arm.open()
+            limits, described = motion_limits(self.model.config), self.arm.describe()
+            period = 1.0 / described.rate
+            for _ in range(max(1, round(RESTS / (_LOOK_AGAIN * period)))):
+                looked = look(self.arm, _LOOK_AGAIN, period)
+                if at_rest_check(looked, self.model, reachable(limits)).verdict is Verdict.PASSED:
+                    break
+            else:
+                return failed(CODE, "the arm does not come to rest after its drives stopped", REST_REMEDY)
+            home = looked.samples[-1].position
+            if any(AxisStatus(word) & AxisStatus.FAULT for word in looked.samples[-1].status):
+                self.arm.reset()  # the host's own silence was the fault
+            with attended(self.arm):
+                limits = admitting(home, limits)
+                friction = expected_friction(self.model, limits, self.model.config.design.friction_guess)
+                session = Session(self.arm, self.model, limits, described, home, friction)
+                room = admitting(home, motion_limits(self.model.config), 0.0)
+                stroke = strokes(session, self.model, room, only=0)[0]
+            session.energise()
+            session.follow(hold(home), SETTLE)
+            session.follow(stroke, DWELL + 0.5 * stroke.there.duration)
+            moving = watchdog_check(self.arm, self.model, period, session.torque, stroke.joint)
+        except (MotionRefused, ArmFault) as error:
+            self.arm.stop(StopKind.TORQUE_OFF)
+            return failed(CODE, f"in motion: {error}", REST_REMEDY, at_rest.measures)
+        return replace(moving, measures=(*at_rest.measures, *moving.measures))
+
     def _judged(
-        self, session: Session, gravity: _Gravity, held: Rows, planned: Sequence[Stroke], moved: Sequence[Rows]
+        self,
+        session: Session,
+        gravity: _Gravity,
+        held: Rows,
+        planned: Sequence[Stroke],
+        moved: Sequence[tuple[Rows, Rows]],
     ) -> None:
         if held:
+            stamps = np.array([sample.stamp_ns for sample, _ in held], dtype=float)
+            before = self.checks["rate"]
+            rate = loop_rate_check(stamps, session.period, self.arm.clock.lock_step, before)
+            if rate is not before:
+                self._passed(rate)
             torque = held_torque(held, session.period)
             self._passed(gravity_check(torque, gravity.torque, self.model, gravity.limits, gravity.friction))
         if planned and len(moved) == len(planned):
             answers = [
                 answer(trace_of(rows, session.period), stroke, session)
-                for rows, stroke in zip(moved, planned, strict=True)
+                for (rows, _), stroke in zip(moved, planned, strict=True)
             ]
-            self._passed(direction_check(answers, self.model))
+            traces = [trace_of(shaken, session.period) for _, shaken in moved]
+            delays = [
+                delay_of(trace, expected_way(trace, session), stroke.joint)
+                for trace, stroke in zip(traces, planned, strict=True)
+            ]
+            self._passed(direction_check(answers, self.model, session, [one for one in delays if one]))
 
     def _load(self, first: Sample, limits: MotionLimits, period: float) -> Callable[[Sample], None]:
         """The control law of a run, computed and thrown away."""
@@ -322,7 +391,9 @@ class _Preflight:
             remedy = "Check power, cables, bus and the drives' own fault codes."
             self._passed(failed(code, str(error), remedy))
 
-    def _passed(self, check: Check) -> bool:
+    def _passed(self, check: Check, *, of_place: bool = False) -> bool:
+        if of_place and check.verdict is Verdict.FAILED and self.away:
+            check = replace(check, reason=f"the arm is not at home ({self.away}): `ident home`; {check.reason}")
         self.checks[check.code] = check
         self.tell(check)
         return check.verdict is Verdict.PASSED

@@ -20,12 +20,13 @@ import numpy as np
 from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector
 from ident_service.config.limits import MotionLimits
 from ident_service.errors import ArmFault
-from ident_service.excitation.following import ExpectedFriction
-from ident_service.model.arm_model import ArmModel
+from ident_service.model.arm_model import ArmModel, control_model
+from ident_service.model.expected_friction import ExpectedFriction
 from ident_service.model.rigid_body import InverseDynamics
 from ident_service.motion.control import ComputedTorque
 from ident_service.motion.deadlines import Elapsed
 from ident_service.motion.guard import Guard, Reaction
+from ident_service.motion.preflight.stability import INERTIA, known_drives
 from ident_service.motion.reference import Reference, Setpoint
 
 FARTHEST = 0.08  # rad or m from the reference, twice the amplitude of the motions that prove directions
@@ -90,7 +91,11 @@ class Session:
         home: where the arm stood [rad or m], shape (joints,).
         gravity: the model's torque there [N m or N], shape (joints,).
         mass: the model's mass matrix there, shape (joints, joints).
+        inertia: the same with the drive inertia that the description knows of and the prior lacks.
+        lightest: the least inertia that each joint may have [kg m^2 or kg], shape (joints,): links lighter than
+            modelled, and all of the described drive inertia.
         period: [s].
+        torque_limit: of the description [N m or N], shape (joints,).
     """
 
     def __init__(
@@ -113,14 +118,19 @@ class Session:
             friction: widens the band of torques.
         """
         period = 1.0 / described.rate
-        prior = np.zeros(model.layout.size) if model.prior is None else model.prior
-        dynamics = InverseDynamics(model.chain, model.layout, prior)
+        known = control_model(model).prior
+        dynamics = InverseDynamics(model.chain, model.layout, np.zeros(model.layout.size) if known is None else known)
         still = np.zeros_like(home)
         self.home = home.copy()
         self.gravity = dynamics.torque(home, still, still)
         self.mass = dynamics.mass_matrix(home)
+        self.inertia = self.mass + np.diag(known_drives(control_model(model)))
+        prior = np.zeros(model.layout.size) if model.prior is None else model.prior
+        links = InverseDynamics(model.chain, model.layout, prior).mass_matrix(home)
+        self.lightest = np.diag(self.inertia - (1.0 - INERTIA[0]) * links)
         self._arm = arm
         self.period = period
+        self.torque_limit = limits.torque
         self._band = np.minimum(BAND * limits.torque + friction.coulomb, limits.torque)
         narrow = replace(
             limits,
@@ -146,7 +156,9 @@ class Session:
         self._arm.enable()
         self._torque = self._limited(self.gravity)
 
-    def follow(self, reference: Reference, seconds: float, learning: float = 0.0) -> Rows:
+    def follow(
+        self, reference: Reference, seconds: float, learning: float = 0.0, shaking: tuple[Vector, float] | None = None
+    ) -> Rows:
         """Follow a reference for some time.
 
         Args:
@@ -155,6 +167,7 @@ class Session:
             learning: how fast the torque that dry friction takes is learned from the lag of moving joints, as a share
                 of `kp M` times that lag per second [1/s]. Without, small motions get lost in friction: what moves a
                 WAM's first joint takes 13 mrad of error.
+            shaking: amplitude [N m or N], shape (joints,), and frequency [Hz] of a sinusoidal torque on top.
 
         Returns:
             What happened, for `trace_of`.
@@ -178,9 +191,18 @@ class Session:
             if fault is not None and fault.reaction is not Reaction.WARN:
                 raise ArmFault(fault.code, fault.message, [row[0] for row in self._rows[-100:]])
             wanted = control.torque(sample.position, usable, setpoint, since)
+            if shaking is not None:
+                # On its way only: a joint that sticks would look like one whose encoder does.
+                moving = np.clip(np.abs(setpoint.velocity) / (2.0 * _CREEP), 0.0, 1.0)
+                wanted = wanted + moving * shaking[0] * np.sin(2.0 * np.pi * shaking[1] * elapsed)
             self._torque = self._limited(wanted + self._against_friction(setpoint, learning))
             if elapsed >= seconds:
                 return self._rows
+
+    @property
+    def torque(self) -> Vector:
+        """The torque that is sent next [N m or N], shape (joints,)."""
+        return self._torque
 
     def trace(self) -> Trace:
         """The cycles of the last `follow`, also of one that a fault ended."""

@@ -9,11 +9,12 @@ discrete time, with period h, low-pass gain g and torque constant over a period,
 exactly, d being the delay in cycles (1 by the Arm contract). The loop is stable where the spectral radius of this
 linear recursion is below 1. A delay between whole cycles is exact too: the torque changes within the period.
 
-The true inertia is any sum of the links' inertias, each between `INERTIA` times the model's, plus drive inertia that
-the model lacks. A model without any drive inertia for a joint (a CAD model of the links) lacks some, so that such a
-joint's link is taken to be no lighter than modelled, unless the description's `drive_inertia` says what its rotors have
-at least. Friction and gravity's stiffness are left out: the first only damps, the second is small beside K_p. Margins
-are stated for the least inertia that is known to be there: the model's, and what `drive_inertia` says beyond it.
+The model is the one that the control law computes with, so it has the drive inertia that the description states. The
+true inertia is any sum of the prior's inertias, each between `INERTIA` times as large, plus what `drive_inertia` states
+beyond the prior, which is the least that is there, plus drive inertia that the model lacks. A model without any drive
+inertia for a joint (a CAD model of the links) lacks some, so that such a joint's link is taken to be no lighter than
+modelled. Friction and gravity's stiffness are left out: the first only damps, the second is small beside K_p, and
+friction that is fed forward depends on the reference alone. Margins are stated for the model's inertia.
 
 Boundary: pure computation.
 """
@@ -28,7 +29,7 @@ import numpy as np
 from ident_service.config.limits import MotionLimits, Vector
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import UsageError
-from ident_service.model.arm_model import ArmModel
+from ident_service.model.arm_model import ArmModel, control_model
 from ident_service.model.rigid_body import InverseDynamics
 
 INERTIA = (0.5, 2.0)  # every link's true inertia, as a share of the model's
@@ -49,20 +50,21 @@ class Loop:
         kp: position gains [1/s^2], shape (joints,).
         kd: velocity gains [1/s], shape (joints,).
         period: [s].
-        cutoff: of the velocity low-pass [Hz].
+        cutoff: of the velocity low-pass [Hz], one or shape (joints,).
         delay: from a sample to the torque computed from it [cycles], at least 1, whole or not.
     """
 
     kp: Vector
     kd: Vector
     period: float
-    cutoff: float
+    cutoff: Vector | float
     delay: float = 1.0
 
     @property
-    def filter_gain(self) -> float:
-        """Gain of the low-pass, as `ComputedTorque` has it."""
-        return 1.0 - float(np.exp(-2.0 * np.pi * self.cutoff * self.period))
+    def filter_gain(self) -> Vector:
+        """Gain of the low-pass, as `ComputedTorque` has it, shape (joints,)."""
+        gain = 1.0 - np.exp(-2.0 * np.pi * np.asarray(self.cutoff) * self.period)
+        return np.asarray(np.broadcast_to(gain, self.kp.shape))
 
 
 @dataclass(frozen=True)
@@ -72,16 +74,14 @@ class JointStability:
     Attributes:
         joint: its name.
         lightest: the least true inertia looked at, as a share of the model's.
-        known: the inertia that margins are stated for, as a share of the model's; 1 without `drive_inertia`.
         radius: the largest spectral radius over the range of inertias.
-        gain_margin: the loop gain may rise by this factor at the known inertia before it oscillates; 1000 stands for
+        gain_margin: the loop gain may rise by this factor at the model's inertia before it oscillates; 1000 stands for
             more, and 1 for none.
-        delay_margin: so much may be added to the delay at the known inertia [s]; 0 for none.
+        delay_margin: so much may be added to the delay at the model's inertia [s]; 0 for none.
     """
 
     joint: str
     lightest: float
-    known: float
     radius: float
     gain_margin: float
     delay_margin: float
@@ -152,23 +152,25 @@ def stability(
     if delay_cycles < 1:
         raise UsageError(f"{delay_cycles=}, but no torque can act before it is computed")
     control = model.config.control
-    loop = Loop(limits.kp, limits.kd, 1.0 / control.rate, control.velocity_cutoff, float(delay_cycles))
+    cutoff = np.broadcast_to(np.asarray(control.velocity_cutoff, dtype=float), limits.kp.shape)
+    loop = Loop(limits.kp, limits.kd, 1.0 / control.rate, cutoff, float(delay_cycles))
     some = _postures(limits) if postures is None else postures
     lightest, unknown = _lightest_and_unknown(model)
-    drives = _known_drives(model)
-    # Where a joint's links are heaviest, its drives help least.
-    more = 0.0 * drives
-    if model.prior is not None:
-        more = drives / np.einsum("skk->sk", _mass_matrices(model, model.prior, some)).max(axis=0)
-    shares = np.array([lightest + more, 1.0 + more, INERTIA[1] + unknown])
+    own_lightest = lightest
+    used = control_model(model)
+    if used.prior is not None and model.prior is not None:
+        own, whole = (np.einsum("skk->sk", _mass_matrices(model, one, some)) for one in (model.prior, used.prior))
+        # Where a joint's links are heaviest, its drives help least.
+        own_lightest = ((lightest * own + whole - own) / whole).min(axis=0)
     joints = tuple(
-        _joint(name, _alone(loop, k), *(float(share) for share in shares[:, k]))
+        _joint(name, _alone(loop, k), float(own_lightest[k]), float(INERTIA[1] + unknown[k]))
         for k, name in enumerate(model.chain.names)
     )
     coupled: float | None = None
-    if model.prior is not None:
+    if used.prior is not None and model.prior is not None:
         coupled = max(
-            float(spectral_radius(loop, R).max()) for R in _ratios(model, model.prior, some, lightest, unknown, drives)
+            float(spectral_radius(loop, R).max())
+            for R in _ratios(model, model.prior, used.prior, some, lightest, unknown)
         )
     return StabilityReport(loop.period, delay_cycles, joints, coupled)
 
@@ -201,9 +203,9 @@ def transition(loop: Loop, ratio: Vector) -> Vector:
     A[..., dq, older] += h * late * ratio
     A[..., q, newer] += h * h * 0.5 * (1.0 - late) ** 2 * ratio
     A[..., dq, newer] += h * (1.0 - late) * ratio
-    A[..., filtered, q] = g / h * eye
-    A[..., filtered, before] = -g / h * eye
-    A[..., filtered, filtered] = (1.0 - g) * eye
+    A[..., filtered, q] = np.diag(g / h)
+    A[..., filtered, before] = -np.diag(g / h)
+    A[..., filtered, filtered] = np.diag(1.0 - g)
     for place in range(queued - 1):
         A[..., at(4 + place), at(5 + place)] = eye
     last = at(3 + queued)
@@ -220,22 +222,23 @@ def spectral_radius(loop: Loop, ratio: Vector) -> Vector:
 
 def _alone(loop: Loop, joint: int) -> Loop:
     kept = slice(joint, joint + 1)
-    return Loop(loop.kp[kept], loop.kd[kept], loop.period, loop.cutoff, loop.delay)
+    cutoff = np.broadcast_to(np.asarray(loop.cutoff), loop.kp.shape)
+    return Loop(loop.kp[kept], loop.kd[kept], loop.period, cutoff[kept], loop.delay)
 
 
-def _joint(name: str, loop: Loop, least: float, known: float, most: float) -> JointStability:
-    factors = np.geomspace(least, max(most, known), 16)
+def _joint(name: str, loop: Loop, least: float, most: float) -> JointStability:
+    factors = np.geomspace(least, most, 16)
     radius = float(spectral_radius(loop, (1.0 / factors)[:, None, None]).max())
     gains = np.geomspace(1.0, _MOST_GAIN, 64)
-    gain = _first(gains, lambda some: spectral_radius(loop, some[:, None, None] / known))
+    gain = _first(gains, lambda some: spectral_radius(loop, some[:, None, None]))
     extra = np.linspace(0.0, _MOST_DELAY, 101)
-    delay = _first(extra, lambda some: np.array([_delayed(loop, float(more), known) for more in some]))
-    return JointStability(name, least, known, radius, gain, delay * loop.period)
+    delay = _first(extra, lambda some: np.array([_delayed(loop, float(more)) for more in some]))
+    return JointStability(name, least, radius, gain, delay * loop.period)
 
 
-def _delayed(loop: Loop, more: float, known: float) -> float:
+def _delayed(loop: Loop, more: float) -> float:
     later = Loop(loop.kp, loop.kd, loop.period, loop.cutoff, loop.delay + more)
-    return float(spectral_radius(later, np.ones((1, 1)) / known))
+    return float(spectral_radius(later, np.ones((1, 1))))
 
 
 def _first(values: Vector, radii: Callable[[Vector], Vector]) -> float:
@@ -254,16 +257,25 @@ def _first(values: Vector, radii: Callable[[Vector], Vector]) -> float:
 
 
 def _lightest_and_unknown(model: ArmModel) -> tuple[Vector, Vector]:
-    """The least true inertia of a link, and drive inertia that the model may lack, in shares, each shape (joints,)."""
+    """Return the least share of the prior that is true, and the share of drive inertia that the model may lack.
+
+    Each of shape (joints,).
+    """
     n = model.chain.joints
-    if model.prior is None:
+    used = control_model(model).prior
+    if used is None:
         return np.full(n, INERTIA[0]), np.full(n, UNKNOWN_DRIVE)
-    known = model.layout.term_values("drive_inertia", model.prior) > 0.0
-    said = _known_drives(model) > 0.0
-    return np.where(known | said, INERTIA[0], 1.0), np.where(known, KNOWN_DRIVE, UNKNOWN_DRIVE)
+    known = np.diag(_drive_matrix(model, used)) > 0.0
+    return np.where(known, INERTIA[0], 1.0), np.where(known, KNOWN_DRIVE, UNKNOWN_DRIVE)
 
 
-def _known_drives(model: ArmModel) -> Vector:
+def _drive_matrix(model: ArmModel, delta: Vector) -> Vector:
+    """Return what drives add to the mass matrix, shape (joints, joints)."""
+    coupling = model.chain.coupling
+    return np.asarray(coupling.T @ (model.layout.term_values("drive_inertia", delta)[:, None] * coupling))
+
+
+def known_drives(model: ArmModel) -> Vector:
     """Drive inertia that the description knows of beyond the prior's [kg m^2 or kg], shape (joints,)."""
     joints = [model.config.joints.get(name) for name in model.chain.names]
     said = np.array([0.0 if joint is None else joint.drive_inertia or 0.0 for joint in joints])
@@ -291,18 +303,19 @@ def _link_factors(lightest: Vector) -> Iterator[Vector]:
 
 
 def _ratios(
-    model: ArmModel, prior: Vector, postures: Vector, lightest: Vector, unknown: Vector, known: Vector
+    model: ArmModel, prior: Vector, used: Vector, postures: Vector, lightest: Vector, unknown: Vector
 ) -> Iterator[Vector]:
     """`M_true^-1 M_model` at all postures, case by case, each of shape (samples, joints, joints)."""
-    nominal = _mass_matrices(model, prior, postures)
+    nominal = _mass_matrices(model, used, postures)
     own = np.einsum("skk->sk", nominal)
+    stated = _drive_matrix(model, used) - _drive_matrix(model, prior)
     for factors in _link_factors(lightest):
         delta = np.array(prior, dtype=float)
         for link, factor in enumerate(factors):
             delta[model.layout.inertial(link)] *= factor
         rigid = _mass_matrices(model, delta, postures)
-        for drives in (known + 0.0 * own, known + unknown * own):
-            yield np.linalg.solve(rigid + drives[:, :, None] * np.eye(own.shape[1]), nominal)
+        for lacking in (0.0 * own, unknown * own):
+            yield np.linalg.solve(rigid + stated + lacking[:, :, None] * np.eye(own.shape[1]), nominal)
 
 
 def _mass_matrices(model: ArmModel, delta: Vector, postures: Vector) -> Vector:

@@ -1,7 +1,8 @@
-"""Whether the drives stop by themselves when we fall silent: the one protection that works when the host dies.
+"""Prove that the drives stop by themselves when we fall silent: the one protection that works when the host dies.
 
-Done last, where the arm has just been held: no torque is sent any more, only looked at what the drives say of
-themselves. An arm without brakes then sinks onto its support, so a person must have typed the arm's name first.
+Done last, where the arm has just been held, and again in the middle of a small motion: what the drives' watchdogs watch
+is withheld, and looked at what the drives say of themselves. An arm without brakes then sinks onto its support, so a
+person must have typed the arm's name first.
 """
 
 from __future__ import annotations
@@ -9,18 +10,29 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.arm import Arm, Sample, StopKind
+import numpy as np
+
+from drivers.arm import Arm, Sample, StopKind, Vector, Watchdog
 from drivers.status import AxisStatus
 from ident_service.model.arm_model import ArmModel
 from ident_service.motion.preflight.check import Check, Verdict, failed, judged, measure, skipped
+from ident_service.motion.preflight.plan import LONGEST_SILENCE
 
 CODE = "watchdog"
-# What a drive may take where the driver's section does not say: the longest that others use (moteus 0.1 s).
-LONGEST_SILENCE = 0.1
+_STOPS = 0.5  # s that a slow joint is given to come to rest
+_WORDS = {
+    "heartbeat": "heartbeat",
+    "node_guarding": "node guarding",
+    "vendor": "torque frames",
+    "rpdo_timer": "torque frames",
+    "torque_frames": "torque frames",
+    "sync_loss": "SYNC",
+}
+_ORDER = list(_WORDS)  # what leaves the most of the others alone comes first; without SYNC no position comes
 _LATER = 2.0  # times the configured time, some cycles, and what its report may wait, until a drive has said so
 _CYCLES = 10
 REMEDY = (
-    "Set the drives' own deadline for torque frames (CANopen: RPDO event timer 1400h:05, and 1016h with 6007h), or "
+    "Set the drives' own watchdog (CANopen: 1400h:05, or another of drives.watchdog, and 6007h for its reaction), or "
     "stop here: without it nothing stops the arm when this computer dies."
 )
 
@@ -53,9 +65,9 @@ def consent(model: ArmModel, sample: Sample, confirm: Confirm) -> Consent:
         return Consent(False, skipped(CODE, why, "Prove it by hand: pull the bus cable while the arm is supported."))
     name = model.config.name
     typed = confirm(
-        f"The drives' own watchdog is tried at the end: they are left without torque frames, must give up torque by "
-        f"themselves, and an arm without brakes sinks. If {name} is supported where it stands and nobody is within its "
-        f"reach, type its name: "
+        f"The drives' own watchdog is tried at the end, at rest and in a small motion: they hear no more of what "
+        f"it watches, must give up torque by themselves, and an arm without brakes sinks. If {name} is supported where "
+        f"it stands and nobody is within its reach, type its name: "
     )
     if typed.strip() == name:
         return Consent(True, None)
@@ -65,44 +77,99 @@ def consent(model: ArmModel, sample: Sample, confirm: Confirm) -> Consent:
     return Consent(False, Check(CODE, Verdict.NEEDS_PERSON, (), why, remedy))
 
 
-def watchdog_check(arm: Arm, model: ArmModel, period: float) -> Check:
+def watchdogs_of(arm: Arm, model: ArmModel) -> tuple[Watchdog, ...]:
+    """Return what each drive's watchdog watches; where the driver does not say, torque frames, by joint."""
+    seconds = getattr(model.config.driver, "watchdog", None)
+    most = float(seconds) if isinstance(seconds, int | float) else None
+    return arm.watchdogs() or tuple(Watchdog(name, "torque_frames", most) for name in model.chain.names)
+
+
+def watchdog_check(arm: Arm, model: ArmModel, period: float, torque: Vector, moving: int | None = None) -> Check:
     """Fall silent on an arm that is held, and look at what its drives do; the arm is without torque afterwards.
+
+    What one kind of watchdog watches is withheld after the other, and everything else goes on: a drive that stops for
+    another reason has not proven its watchdog.
 
     Args:
         arm: enabled, held by the last torque sent, which goes on acting until a drive gives it up.
-        model: for names, and the watchdog's time in the driver's section.
+        model: for names, and the watchdog's time in the driver's section where the driver does not tell it.
         period: [s].
+        torque: the last one sent [N m or N], shape (joints,).
+        moving: number of the joint that moves, whose travel is measured; None at standstill.
 
     Raises:
         DriverError: the arm does not answer.
     """
-    driver = model.config.driver
-    configured, told = getattr(driver, "watchdog", None), getattr(driver, "report_delay", 0.0)
-    most = _LATER * configured + _CYCLES * period + told if isinstance(configured, int | float) else LONGEST_SILENCE
-    names = model.chain.names
-    begin_ns: int | None = None
-    gave_up: dict[str, float] = {}
-    words: tuple[int, ...] = ()
+    dogs = watchdogs_of(arm, model)
+    told = float(getattr(model.config.driver, "report_delay", 0.0))
+    where = "at rest" if moving is None else "in motion"
+    gave_up: dict[int, tuple[float, AxisStatus]] = {}
+    strange: list[str] = []
+    begun: float | None = None
+    at: Vector = np.zeros(0)
     try:
-        while True:
-            sample = arm.exchange(None)
-            if begin_ns is None:
-                begin_ns = sample.stamp_ns
-                if not all(word & AxisStatus.POWERED for word in sample.status):
-                    return failed(CODE, "the drives do not report that they have power", REMEDY)
-            silent = (sample.stamp_ns - begin_ns) * 1e-9
-            words = sample.status
-            for name, word in zip(names, words, strict=False):
-                if not word & AxisStatus.POWERED:
-                    gave_up.setdefault(name, silent)
-            if len(gave_up) == len(names) or silent > most:
-                break
+        for kind in sorted({dog.kind for dog in dogs}, key=_ORDER.index):
+            watched = [number for number, dog in enumerate(dogs) if dog.kind == kind]
+            most = max(_most(dogs[number], period, told) for number in watched)
+            of_torque = dogs[watched[0]].of_torque
+            if not of_torque:
+                arm.withhold(kind)
+            begin_ns: int | None = None
+            while True:
+                sample = arm.exchange(None if of_torque else torque)
+                status = arm.drive_status() or tuple(AxisStatus(word) for word in sample.status)
+                if begin_ns is None:
+                    begin_ns = sample.stamp_ns
+                    if begun is None:
+                        begun, at = sample.stamp_ns, sample.position
+                        if not all(word & AxisStatus.POWERED for word in status):
+                            return failed(CODE, "the drives do not report that they have power", REMEDY)
+                silent = (sample.stamp_ns - begin_ns) * 1e-9
+                for number, word in enumerate(status):
+                    if number in gave_up or word & AxisStatus.POWERED:
+                        continue
+                    gave_up[number] = silent, word
+                    if number not in watched:
+                        strange.append(f"{dogs[number].drive} stopped when {_WORDS[kind]} stayed away, not by its own")
+                if all(number in gave_up for number in watched) or silent > most:
+                    break
+        travel = _travel(arm, at, moving) if moving is not None else None
     finally:
         arm.stop(StopKind.TORQUE_OFF)
-    found = [measure("torque given up after", gave_up.get(name), "s", joint=name, most=most) for name in names]
-    other = [
-        f"{name} gave up for another reason ({AxisStatus(word)!r})"
-        for name, word in zip(names, words, strict=False)
-        if name in gave_up and word & (AxisStatus.FAULT | AxisStatus.EMERGENCY_STOP)
-    ]
-    return failed(CODE, "; ".join(other), REMEDY, found) if other else judged(CODE, found, REMEDY)
+    found = []
+    for number, dog in enumerate(dogs):
+        seconds, word = gave_up.get(number, (None, AxisStatus(0)))
+        what = f"{where}, {_WORDS[dog.kind]} withheld: {_reaction(word) if seconds is not None else 'goes on'} after"
+        found.append(measure(what, seconds, "s", joint=dog.drive, most=_most(dog, period, told)))
+        # A host that is gone may be a fault to a drive; any other fault is no watchdog.
+        fault = bool(word & AxisStatus.FAULT and not word & AxisStatus.WATCHDOG)
+        if fault or word & AxisStatus.EMERGENCY_STOP:
+            strange.append(f"{dog.drive} gave up for another reason ({word!r})")
+    if moving is not None and travel is not None:
+        unit = "rad" if model.chain.revolute[moving] else "m"
+        found.append(measure("in motion, way until it rests", travel, unit, joint=model.chain.names[moving]))
+    return failed(CODE, "; ".join(strange), REMEDY, found) if strange else judged(CODE, found, REMEDY)
+
+
+def _most(dog: Watchdog, period: float, told: float) -> float:
+    """How long a drive may take until it has said that it stopped [s]."""
+    return LONGEST_SILENCE if dog.seconds is None else _LATER * dog.seconds + _CYCLES * period + told
+
+
+def _reaction(word: AxisStatus) -> str:
+    """What a drive does by itself, in words."""
+    if word & AxisStatus.FAULT:
+        return "fault"
+    return "quick stop" if word & AxisStatus.IDLE else "torque off"
+
+
+def _travel(arm: Arm, begin: Vector, joint: int) -> float:
+    """How far a joint goes from where its host fell silent until it rests, or for `_STOPS` [rad or m]."""
+    now = begin
+    last_ns: int | None = None
+    while True:
+        sample = arm.exchange(None)
+        last_ns = sample.stamp_ns if last_ns is None else last_ns
+        now = np.where(sample.valid, sample.position, now)
+        if (sample.stamp_ns - last_ns) * 1e-9 > _STOPS:
+            return float(abs(now[joint] - begin[joint]))

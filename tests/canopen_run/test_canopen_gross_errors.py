@@ -1,0 +1,68 @@
+"""Gross errors of a WAM's description or drives, each seen by preflight and named."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from drivers.canopen.arm import CanopenArm
+from ident_service.config.load import load_arm
+from ident_service.config.schema import ArmConfig
+from ident_service.model.arm_model import arm_model
+from ident_service.motion.preflight.check import Check, Verdict
+from ident_service.motion.preflight.preflight import preflight
+from sim_backend.pucks.faults import parse_fault
+from sim_backend.pucks.lock_step import LockStepArm
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+
+
+def wam(ratio: float = 1.0, **drives: dict[str, Any]) -> ArmConfig:
+    """The shipped one at 500 Hz in virtual time; `m1={...}` changes a drive, `ratio` the first gear's."""
+    tree = load_arm("wam7_canopen_500hz").model_dump(mode="json", by_alias=True)
+    tree["driver"]["buses"] = [{"interface": "lock_step", "channel": "wam"}]
+    tree["transmission"]["ratios"][0] *= ratio
+    for name, changes in drives.items():
+        tree["driver"]["drives"][int(name[1:]) - 1] |= changes
+    return ArmConfig.model_validate(tree)
+
+
+def checked(told: ArmConfig, real: ArmConfig, *faults: str) -> dict[str, Check]:
+    behind = LockStepArm(real)
+    behind.inject(*(parse_fault(fault, tuple(told.joints)) for fault in faults))
+    arm = CanopenArm(told, lambda _: [behind.link(0)])
+    ticket = preflight(arm, arm_model(told), None, confirm=lambda question: told.name, look_seconds=0.2)
+    return {check.code: check for check in ticket.checks}
+
+
+def test_a_sound_wam_passes_with_every_watchdog_proven_twice() -> None:
+    checks = checked(wam(), wam())
+    assert [check.reason for check in checks.values() if check.verdict is Verdict.FAILED] == []
+    watchdogs = checks["watchdog"].measures
+    assert len(watchdogs) == 2 * 7 + 1
+    assert "j2 and j3: drive 3" in [one.joint for one in watchdogs]
+
+
+def test_counts_of_joint_7_times_two_are_a_scale_and_no_sign() -> None:
+    reason = checked(wam(m7={"counts": 8192}), wam())["identities"].reason
+    assert "node 7: a motor turn has 4096 counts" in reason
+    assert "the scale of its positions is wrong by 2" in reason
+
+
+def test_twice_the_torque_of_motor_1_is_refused() -> None:
+    check = checked(wam(), wam(m1={"torque_scale": 2.0}))["direction"]
+    assert check.verdict is Verdict.FAILED
+    assert check.reason.startswith("j1: answer to torque")
+
+
+def test_a_gear_ratio_twice_too_large_is_told_and_leads_to_the_scale() -> None:
+    check = checked(wam(ratio=2.0), wam())["direction"]
+    assert "j1 answers torque 0.22 times as the model expects: a gear ratio configured twice too large" in check.reason
+    assert "`ident check ARM --scale`" in check.reason
+
+
+def test_a_hidden_delay_of_a_cycle_is_refused() -> None:
+    check = checked(wam(), wam(), "hidden_delay size=0.002")["direction"]
+    assert check.verdict is Verdict.FAILED
+    assert "hidden delay from torque to position" in check.reason
