@@ -48,7 +48,7 @@ _SHIPPED = {1000: "wam7_canopen", 500: "wam7_canopen_500hz"}
 
 def described(folder: Path, rate: int, bus: dict[str, Any], **driver: Any) -> Path:
     """The shipped WAM on another bus, with drives that put up with a machine that stalls."""
-    patience = {"torque_deadline": 0.9, "heartbeats": {"timeout": 1.0}}
+    patience = {"watchdog_reason": "an emulated arm", "torque_deadline": 0.9, "heartbeats": {"timeout": 1.0}}
     section = {"kind": "canopen", "buses": [bus], **patience, **driver}
     tree = {"extends": str(shipped_arms()[_SHIPPED[rate]]), "name": "bench", "driver": section}
     path = folder / f"bench{time.monotonic_ns()}.yaml"

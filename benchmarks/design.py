@@ -1,6 +1,7 @@
 """Excitation design: what a minute of search reaches, against the published motion, and what the result is worth.
 
-Ten seeds of a minute each and a few shorter searches: about a quarter of an hour. `python -m benchmarks.design`.
+Ten seeds of a minute each, a few shorter searches, and a plain search beside ours on five arms: about half an hour.
+`python -m benchmarks.design`.
 """
 
 from __future__ import annotations
@@ -14,24 +15,27 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.harness import Row, median_seconds, table, write
+from benchmarks.plain_search import PlainSearch
 from ident_service.config.design import Criterion
 from ident_service.config.limits import motion_limits
 from ident_service.config.load import load_arm
+from ident_service.config.schema import ArmConfig
 from ident_service.estimation.identify import identify
 from ident_service.excitation.design import Designed, design_motion, family, settled
 from ident_service.excitation.excitation import Excitation
 from ident_service.excitation.expectation import described_noise, expected_deviations, information
-from ident_service.excitation.path import FourierPath
+from ident_service.excitation.path import FourierPath, PosturePath
 from ident_service.excitation.plan import excitation
 from ident_service.excitation.problem import Problem
 from ident_service.excitation.proof import objections
 from ident_service.excitation.search import Budget
+from ident_service.excitation.task import usable_limits
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.base import base_parameters
+from ident_service.model.base import BaseParameters, base_parameters
 from ident_service.model.threads import one_blas_thread
 from ident_service.motion.factory import make_arm
 from ident_service.record.open import open_recording
-from ident_service.record.part import TrimmedRecording
+from ident_service.record.part import RangeRecording
 from ident_service.service.commission import record_motion
 
 _SEEDS = int(os.environ.get("IDENT_BENCH_SEEDS", "10"))
@@ -41,7 +45,7 @@ _SECONDS = float(os.environ.get("IDENT_BENCH_SECONDS", "60"))
 def measure() -> list[Row]:
     """All figures."""
     plain, noisy = arm_model(load_arm("wam7")), arm_model(load_arm("wam7_sim"))
-    return [*_evaluation(plain), *_condition_numbers(plain), *_gain(noisy), *_small_arms()]
+    return [*_evaluation(plain), *_condition_numbers(plain), *_gain(noisy), *_small_arms(), *against_plain_search()]
 
 
 def _designed(model: ArmModel, criterion: Criterion, seed: int, seconds: float, **changes: object) -> Designed:
@@ -151,6 +155,55 @@ def _small_arms() -> list[Row]:
     return rows
 
 
+def bench_arms() -> dict[str, ArmModel]:
+    """Five arms that the searches are compared on."""
+    ur10 = load_arm("ur10").model_dump(by_alias=True)
+    # A description for identification only: limits, gains and bodies as round as a first guess would be.
+    for joint in ur10["joints"].values():
+        joint |= {"position": [-3.0, 3.0], "acceleration": 8.0, "jerk": 80.0, "following_error": 0.2, "home": 0.0}
+        joint |= {"kp": 400.0, "kd": 40.0, "brake": True, "drive_inertia": 1.0}
+    ur10["joints"]["shoulder_lift_joint"]["home"] = -1.5
+    masses = (7.8, 12.9, 3.9, 2.0, 2.0, 0.2)
+    ur10["prior"] = {f"m{k}": mass for k, mass in enumerate(masses, start=1)}
+    ur10["prior"] |= {
+        f"L{axis}{k}": 0.02 * mass for k, mass in enumerate(masses, start=1) for axis in ("xx", "yy", "zz")
+    }
+    ur10["workspace"] = {"clearance": 0.0}
+    names = {"wam7": "wam7", "six-axis": "sixaxis", "planar": "planar2"}
+    arms = {name: arm_model(load_arm(arm)) for name, arm in names.items()}
+    arms["panda-like"] = arm_model(load_arm(Path(__file__).parent / "arms" / "panda_like.yaml"))
+    arms["ur10"] = arm_model(ArmConfig.model_validate(ur10))
+    return arms
+
+
+def against_plain_search(seconds: float | None = None) -> list[Row]:
+    """Both searches on five arms: same family, same limits and margins, same time, one process each."""
+    rows, budget = [], _SECONDS if seconds is None else seconds
+    for name, model in bench_arms().items():
+        base, limits = base_parameters(model.chain, model.layout), motion_limits(model.config)
+        noise, design = described_noise(model, limits).deviation, model.config.design
+        plain = PlainSearch(model, design, usable_limits(model.chain.names, limits, design), base.base, noise)
+        for criterion, what in (("condition_number", "condition number"), ("d_optimal", "log det")):
+            changed = design.model_copy(update={"criterion": criterion})
+            ours = design_motion(model, changed, budget=Budget(budget, None, 1)).excitation.path
+            theirs = plain.run(criterion, 0, budget)
+            pair = [_figure(path, model, base, noise, criterion) for path in (ours, theirs)]
+            better = pair[0] <= pair[1] if criterion == "condition_number" else pair[0] >= pair[1]
+            rows.append(Row(f"{what}, {name}, ours", pair[0], "", None))
+            rows.append(Row(f"{what}, {name}, plain search", pair[1], "", None))
+            print(f"{name}, {what}: {pair[0]:.4g} against {pair[1]:.4g} {'' if better else 'WORSE'}", flush=True)
+    return rows
+
+
+def _figure(
+    path: FourierPath | PosturePath, model: ArmModel, base: BaseParameters, noise: np.ndarray, criterion: str
+) -> float:
+    """Condition number of the plain rows, or log-determinant of the whitened information per second."""
+    if criterion == "condition_number":
+        return _root(information(path, model, base, np.ones_like(noise)))
+    return float(np.linalg.slogdet(information(path, model, base, noise))[1])
+
+
 def _require_proven(model: ArmModel, found: Designed, margin: float) -> None:
     limits = motion_limits(model.config)
     if wrong := objections(found.proof, model, limits):
@@ -169,7 +222,7 @@ def _deviations(model: ArmModel, motion: Excitation, path: Path) -> np.ndarray:
         raise TypeError("a Fourier motion")
     rate = model.config.control.rate
     around = report.cycles / rate - fourier.periods * fourier.series.period
-    part = TrimmedRecording(recording, 0.5 * around, 0.5 * around)
+    part = RangeRecording(recording, 0.5 * around, report.cycles / rate - 0.5 * around)
     return identify(model, [part]).standard_deviations
 
 

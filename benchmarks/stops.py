@@ -1,10 +1,11 @@
 """How long a stop takes when everything else waits: from the first byte of the request until the arm has the word.
 
 `python -m benchmarks.stops`, about a minute. Ten clients stop an arm each, at once, again and again. Meanwhile another
-process keeps the registry's write lock, a description is being checked without a pause, and a thousand connections have
-sent half a request; one that the daemon closes is opened again after one to three seconds. The daemon has 1,024
-descriptors. The time is that of the arms: one process that holds their control files and looks at them every
-millisecond, as the control loop looks once a cycle. `$IDENT_BENCH_ROUNDS` (20) changes how often.
+process keeps the registry's write lock, a description is being checked without a pause, forty viewers follow the stream
+of all events, and a thousand connections have sent half a request; one that the daemon closes is opened again after one
+to three seconds. The daemon has 1,024 descriptors. The time is that of the arms: one process that holds their control
+files and looks at them every millisecond, as the control loop looks once a cycle. `$IDENT_BENCH_ROUNDS` (20) says how
+often.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from ident_service.service.arm_state import control_path
 from ident_service.service.registry.database import FILE
 
 ROUNDS = int(os.environ.get("IDENT_BENCH_ROUNDS", "20"))
-CLIENTS, HALF_OPEN, DESCRIPTORS = 10, 1000, 1024
+CLIENTS, VIEWERS, HALF_OPEN, DESCRIPTORS = 10, 40, 1000, 1024
 TARGET = "< 100"
 _HALF = b"POST /api/v1/jobs HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Le"
 _PATIENCE = 30.0  # s
@@ -54,12 +55,14 @@ class Measured:
         answered: until the client had its answer, likewise [s].
         log_bytes: that the daemon wrote.
         checked: descriptions that were checked meanwhile.
+        watched: pieces of news that all viewers were told.
     """
 
     obeyed: list[float]
     answered: list[float]
     log_bytes: int
     checked: int
+    watched: int
 
 
 def measure(folder: Path, rounds: int = ROUNDS, *, quiet: bool = False) -> Measured:
@@ -73,14 +76,16 @@ def measure(folder: Path, rounds: int = ROUNDS, *, quiet: bool = False) -> Measu
     state, log = folder / "state", folder / "serve.log"
     obeyed, answered = list[float](), list[float]()
     with _daemon(state, log) as address, _part("arms", str(state), str(rounds)) as arms, ExitStack() as load:
-        halves = checks = None
+        halves = checks = viewers = None
         if not quiet:
             other = sqlite3.connect(state / FILE, isolation_level=None)
             load.callback(other.close)
             other.execute("BEGIN IMMEDIATE")
             halves = load.enter_context(_part("halves", *address))
-            checks = load.enter_context(_part("checks", *address, (state / "token").read_text().strip()))
-            for part in (halves, checks):
+            token = (state / "token").read_text().strip()
+            viewers = load.enter_context(_part("viewers", *address, token))
+            checks = load.enter_context(_part("checks", *address, token))
+            for part in (viewers, halves, checks):
                 _line(part)
             time.sleep(2.0)
         for _ in range(rounds):
@@ -90,7 +95,8 @@ def measure(folder: Path, rounds: int = ROUNDS, *, quiet: bool = False) -> Measu
             obeyed += [(seen[k] - sent[k]) * 1e-9 if seen[k] else _PATIENCE for k in range(CLIENTS)]
             answered += [(done[k] - sent[k]) * 1e-9 for k in range(CLIENTS)]
         checked = 0 if checks is None else int(_said(checks))
-    return Measured(obeyed, answered, log.stat().st_size, checked)
+        watched = 0 if viewers is None else int(_said(viewers))
+    return Measured(obeyed, answered, log.stat().st_size, checked, watched)
 
 
 def _stops(address: tuple[str, str]) -> tuple[list[int], list[int]]:
@@ -242,6 +248,28 @@ def checks(host: str, port: str, token: str) -> None:
     print(lost, count, flush=True)
 
 
+def viewers(host: str, port: str, token: str) -> None:
+    """Follow the stream of all events forty times; say how many were told, when standard input ends."""
+    head = f"GET /api/v1/events HTTP/1.1\r\nHost: {host}\r\nAuthorization: Bearer {token}\r\n\r\n".encode()
+    selector, told, ending = selectors.DefaultSelector(), 0, threading.Event()
+    threading.Thread(target=lambda: (sys.stdin.read(), ending.set()), daemon=True).start()
+    for _ in range(VIEWERS):
+        link = socket.create_connection((host, int(port)), _PATIENCE)
+        link.sendall(head)
+        link.recv(1)
+        link.setblocking(False)
+        selector.register(link, selectors.EVENT_READ)
+    print("ready", flush=True)
+    while not ending.is_set():
+        for key, _ in selector.select(0.1):
+            assert isinstance(key.fileobj, socket.socket)  # noqa: S101 - ours
+            data = key.fileobj.recv(65536)
+            if not data:
+                raise RuntimeError("the daemon has cut the line of a viewer")
+            told += data.count(b"event: ")
+    print(told, flush=True)
+
+
 def _rows(name: str, seconds: list[float], target: str | None) -> list[Row]:
     ordered = sorted(seconds)
     return [
@@ -262,11 +290,12 @@ def main() -> None:
         rows += _rows(f"{name}: answered", measured.answered, None)
         rows.append(Row(f"{name}: log", measured.log_bytes / 1e3, "kB"))
     rows.append(Row("descriptions checked meanwhile", measured.checked, ""))
+    rows.append(Row("events told to viewers meanwhile", measured.watched, ""))
     print(table(rows))
     print(f"written to {write(rows, Path(__file__).parent / 'results', 'stops')}")
 
 
-PARTS = {"arms": arms, "halves": halves, "checks": checks}
+PARTS = {"arms": arms, "halves": halves, "checks": checks, "viewers": viewers}
 
 if __name__ == "__main__":
     if len(sys.argv) > 1:

@@ -6,7 +6,8 @@ In a cell of half width h about the time t_i, joint k moves no farther from q_k(
 
 with M the path's bound of its fifth derivative, and a pair's distance falls by no more than `sum_k L_k m_k`
 (`model/reach.py`). Cells end at the path's seams, where the fourth derivative may jump. Cells whose bound is too low
-are divided until it is proven, a sample disproves it, or they are shorter than 0.1 ms.
+are divided until it is proven, a sample disproves it, or they are shorter than 0.1 ms. An arm that is up to e_k away
+from the path in a cell (`tracking.py`) is nearer than the path by no more than `sum_k L_k e_k`.
 
 Boundary: judges motions, makes none.
 """
@@ -31,6 +32,8 @@ _ROUNDING = 1e-6  # m, more than what coal's distances are wrong by
 # From times [s] and half widths [s], shape (cells,), to positions and what each joint moves in a cell at most,
 # shape (cells, joints).
 _Motion = Callable[[Array, Array], tuple[Array, Array]]
+# From the same to how far each joint of the arm may be from its reference in a cell, shape (cells, joints).
+Tube = Callable[[Array, Array], Array]
 
 
 @dataclass(frozen=True)
@@ -57,13 +60,14 @@ class Clearance:
         return self.lower_bound >= self.required
 
 
-def certified_clearance(collision: CollisionModel, path: Path, clearance: float) -> Clearance:
+def certified_clearance(collision: CollisionModel, path: Path, clearance: float, tube: Tube | None = None) -> Clearance:
     """Prove, or disprove, that a path keeps every pair apart.
 
     Args:
         collision: the pairs.
         path: the motion.
         clearance: distance to be kept [m].
+        tube: how far from the path the arm may be; nowhere when None.
 
     Raises:
         ModelError: the path has another number of joints, or a sliding joint has no position limits.
@@ -82,7 +86,7 @@ def certified_clearance(collision: CollisionModel, path: Path, clearance: float)
     for begin, end in path.distinct:
         corners = [begin, *seams[(seams > begin) & (seams < end)].tolist(), end]
         stretches += list(pairwise(corners))
-    return _certified(collision, motion, stretches, clearance)
+    return _certified(collision, motion, stretches, clearance, tube)
 
 
 def certified_along(
@@ -124,7 +128,11 @@ def posture_clearance(collision: CollisionModel, position: Array) -> tuple[float
 
 
 def _certified(
-    collision: CollisionModel, motion: _Motion, stretches: Sequence[tuple[float, float]], clearance: float
+    collision: CollisionModel,
+    motion: _Motion,
+    stretches: Sequence[tuple[float, float]],
+    clearance: float,
+    tube: Tube | None = None,
 ) -> Clearance:
     if not collision.pairs:
         return Clearance(clearance, float("inf"), float("inf"), None, None)
@@ -136,6 +144,8 @@ def _certified(
     while time.size:
         position, moved = motion(time, half)
         distances = collision.distances(position)
+        if tube is not None:
+            distances = distances - tube(time, half) @ reach.T
         nearest = distances.min(axis=1)
         sample = int(np.argmin(nearest))
         if nearest[sample] < sampled:

@@ -1,8 +1,11 @@
 """One start of the search: from a random motion to a good one that keeps every limit at the samples.
 
-An augmented Lagrangian in a few rounds of L-BFGS, the criterion sharpened and the limits hardened from round to round,
-then the largest motion on the way from standing still to the result that keeps the limits. Standing still in a good
-posture always does, so that there is a result however the rounds went.
+A start is an augmented Lagrangian in a few rounds of L-BFGS, the criterion sharpened and the limits hardened from round
+to round. What is good already is polished by sequential quadratic programming (SLSQP, Kraft 1988): limits of position
+and its derivatives are linear in the variables and so are kept exactly, at the peaks of the motion, of which each round
+adds new ones; all other limits stay in the augmented Lagrangian. What comes out is the largest motion on the way from
+standing still to the result that keeps the limits. Standing still in a good posture always does, so that there is a
+result however the rounds went.
 
 Boundary: one process, no clock of its own; whoever calls decides when to stop.
 """
@@ -15,11 +18,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize
 
-from ident_service.excitation.problem import Problem
+from ident_service.excitation.problem import LINEAR, Problem
 from ident_service.model.chain import Array
 
 _ROUNDS = ((2.0, 1.0, 60), (4.0, 3.0, 60), (8.0, 9.0, 60), (16.0, 27.0, 80), (24.0, 81.0, 80))
-_POLISH = ((16.0, 30.0, 60), (24.0, 90.0, 80), (32.0, 270.0, 80))
+_SHARPER = (24.0, 64.0)  # exponent of the condition number's power means, in the first rounds of the polish and later
+_WEIGHT, _HARDER = 30.0, 1.5  # of violated limits that are not linear, to begin with and from round to round
+_SQP_ROUNDS, _SQP_STEPS = 10, 60
+_NEAR, _NEARER = 0.5, 0.8  # share of a limit above which a peak of the first and of later motions counts
+_SETTLED = 2e-4  # change of the criterion in a round after which no further one is worth its time
 _HOPELESS = 0.3  # share of a limit that a third round leaves exceeded where no further one will mend it
 _SPREAD = 0.25  # of the scaled coefficients of a random start
 _HALVINGS = 24
@@ -81,8 +88,8 @@ def climbed(
     Raises:
         Stopped: `check` raised Interrupted; with the best of what the rounds had come through until then.
     """
-    # A motion that is good already must not be lost to rounds that led nowhere.
-    before = [kept(problem, x, safe, start)] if polish else []
+    if polish:
+        return _polished(problem, x, safe, start, check)
     state = problem.no_multipliers(1.0)
     reached, latest = [x], [x]
 
@@ -92,7 +99,7 @@ def climbed(
         return problem.value_and_gradient(x, sharpness, state)
 
     try:
-        for sharpness, weight, iterations in _POLISH if polish else _ROUNDS:
+        for sharpness, weight, iterations in _ROUNDS:
             state.weight = weight
             x = minimize(
                 objective,
@@ -109,8 +116,62 @@ def climbed(
                 break  # caught on the wrong side of an obstacle; another start will do better
     except Interrupted:
         # Half a round may have left the limits far behind; where it came from may be worth more.
-        raise Stopped(_best_of([*before, *(kept(problem, one, safe, start) for one in (*reached, *latest))])) from None
-    return _best_of([*before, kept(problem, x, safe, start)])
+        raise Stopped(_best_of([kept(problem, one, safe, start) for one in (*reached, *latest)])) from None
+    return kept(problem, x, safe, start)
+
+
+def _polished(problem: Problem, x: Array, safe: Array, start: int, check: Callable[[], None]) -> Candidate:
+    """Improve a motion that is good already; it is not lost to rounds that lead nowhere.
+
+    Raises:
+        Stopped: as `climbed`.
+    """
+    best = kept(problem, x, safe, start)
+    peaks = problem.linear_peaks(x, _NEAR)
+    state = problem.no_multipliers(_WEIGHT)
+    latest = [x]
+
+    def objective(x: Array, sharpness: float) -> tuple[float, Array]:
+        check()
+        latest[0] = x.copy()
+        return problem.value_and_gradient(x, sharpness, state)
+
+    try:
+        before = best.value
+        for number in range(_SQP_ROUNDS):
+            sharpness = _SHARPER[min(number // 2, 1)]
+            A, b = problem.linear_rows(sorted(peaks))
+            x = _stepped(objective, x, sharpness, A, b)
+            here = problem.state(x, sharpness)
+            best = _best_of([best, kept(problem, x, safe, start)])
+            if before - best.value < _SETTLED and number >= 2:
+                break
+            before = best.value
+            # Peaks keep the linear limits; what is exceeded between them becomes a peak itself.
+            others = {n: np.full_like(v, -np.inf) if n in LINEAR else v for n, v in here.limits.items()}
+            state = state.tightened(others, _HARDER)
+            peaks |= problem.linear_peaks(x, _NEARER)
+    except Interrupted:
+        raise Stopped(_best_of([best, kept(problem, latest[0], safe, start)])) from None
+    return best
+
+
+def _stepped(
+    objective: Callable[[Array, float], tuple[float, Array]], x: Array, sharpness: float, A: Array, b: Array
+) -> Array:
+    """Minimise under `A x <= b`; the best point that SLSQP comes to, shape (size,)."""
+    slope = -A
+    conditions = [{"type": "ineq", "fun": lambda z: b - A @ z, "jac": lambda z: slope}] if len(b) else []
+    found = minimize(
+        objective,
+        x,
+        args=(sharpness,),
+        jac=True,
+        method="SLSQP",
+        constraints=conditions,
+        options={"maxiter": _SQP_STEPS, "ftol": 1e-7},
+    ).x
+    return np.asarray(found if np.isfinite(found).all() else x)
 
 
 def _best_of(candidates: list[Candidate]) -> Candidate:

@@ -17,7 +17,7 @@ from ident_service.config.workspace import Supply
 from ident_service.errors import MotionRefused
 from ident_service.excitation.enclosure import Stretches, stretches
 from ident_service.excitation.path import Path
-from ident_service.model.arm_model import ArmModel
+from ident_service.model.arm_model import ArmModel, control_model
 from ident_service.model.chain import Array
 from ident_service.model.regressor import traced_regressor
 from ident_service.model.tape import Value
@@ -101,8 +101,9 @@ def demands(path: Path, model: ArmModel) -> Demands:
         "highest": bounds["highest"] - cells.values[0].max(axis=0),
     }
     enclosed = {kind: cells.of(order) for order, kind in enumerate(("velocity", "acceleration", "jerk"), start=1)}
-    if model.prior is not None:
-        enclosed["torque"] = torque_enclosures(cells, model, model.prior)
+    prior = control_model(model).prior
+    if prior is not None:
+        enclosed["torque"] = torque_enclosures(cells, model, prior)
     for kind, values in enclosed.items():
         sizes = np.array([value.size for value in values])
         bounds[kind] = sizes.max(axis=1)

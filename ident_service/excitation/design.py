@@ -15,20 +15,22 @@ from ident_service.config.design import Criterion, Design
 from ident_service.config.limits import MotionLimits, motion_limits
 from ident_service.errors import MotionRefused, UsageError
 from ident_service.excitation.basis import Basis, FourierBasis, PostureBasis
+from ident_service.excitation.binding import binding, binding_words
 from ident_service.excitation.criteria import condition_number, criterion
 from ident_service.excitation.demands import demands
 from ident_service.excitation.excitation import LONGEST, Excitation
 from ident_service.excitation.expectation import described_noise, information, seconds_of_information
-from ident_service.excitation.following import dry_friction, expected_friction
+from ident_service.excitation.following import dry_friction
 from ident_service.excitation.path import FourierPath, PosturePath
 from ident_service.excitation.postures import safe_posture
 from ident_service.excitation.proof import Proof, largest_proven, objections, proof_of
 from ident_service.excitation.search import Budget, Found, Progress, search
 from ident_service.excitation.task import Task, usable_limits
-from ident_service.model.arm_model import ArmModel
+from ident_service.model.arm_model import ArmModel, control_model
 from ident_service.model.base import BaseParameters, base_parameters, static_base_parameters
 from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel
+from ident_service.model.expected_friction import expected_friction
 
 _PER_HARMONIC = 50  # samples of a search per period of its highest harmonic
 _PER_WAY = 24  # samples of a search per way between postures
@@ -44,12 +46,14 @@ class Designed:
         proof: bounds that hold at every instant.
         condition_number: of the stacked regressor over one pass, as in the paper.
         found: of the search, to go on from.
+        binding: what holds the motion back, and what it costs, in words.
     """
 
     excitation: Excitation
     proof: Proof
     condition_number: float
     found: Found
+    binding: tuple[str, ...] = ()
 
 
 def family(design: Design, model: ArmModel) -> tuple[Basis, BaseParameters]:
@@ -96,7 +100,7 @@ def settled(
     plain = design.criterion == "condition_number"
     own_noise = described_noise(model, full).deviation if noise is None else noise
     return Task(
-        model=model,
+        model=control_model(model),
         columns=base.base,
         basis=basis,
         limits=limits,
@@ -185,10 +189,14 @@ def design_motion(
     _require_holdable_home(model, task.limits)
     found = search(task, safe, seed, budget or Budget(), per_period(basis), tell, cancelled, earlier)
 
+    why: list[str] = []
+
     def proven(coefficients: Array) -> Proof | None:
-        proof = proof_of(basis.path(coefficients), model, task.limits, collision)
-        unsound = objections(proof, model, task.limits) or veto(basis.path(coefficients))
-        return None if unsound else proof
+        proof = proof_of(basis.path(coefficients), model, task.limits, collision, design.torque_margin)
+        why[:] = objections(proof, model, task.limits)
+        if not why and (vetoed := veto(basis.path(coefficients))) is not None:
+            why[:] = [vetoed]
+        return None if why else proof
 
     best: tuple[float, Array, Proof] | None = None
     for candidate in found.candidates:
@@ -199,9 +207,15 @@ def design_motion(
             value = criterion_of(task, basis.path(result[0]), base)
             if best is None or value < best[0]:
                 best = (value, *result)
+    if best is None and any(candidate.start >= 0 for candidate in found.candidates):
+        raise MotionRefused(
+            f"{model.config.name}: of {found.finished} motions found none is one that the arm can follow for certain, "
+            f"however small: {'; '.join(why)}. Stiffer gains, a wider following_error, or friction and drive_inertia "
+            "as they are would help"
+        )
     if best is None:
         still = basis.standing(safe)
-        proof = proof_of(basis.path(still), model, task.limits, collision)
+        proof = proof_of(basis.path(still), model, task.limits, collision, design.torque_margin)
         if wrong := objections(proof, model, task.limits):
             raise MotionRefused(f"not even standing still keeps the limits: {'; '.join(wrong)}")
         best = (criterion_of(task, basis.path(still), base), still, proof)
@@ -211,7 +225,20 @@ def design_motion(
     excitation = Excitation(
         "designed", path, model.config.motion_sha256, _made(model, design, seed, found, kappa, value, proof)
     )
-    return Designed(excitation, proof, kappa, found)
+    held = (
+        ()
+        if value >= criterion_of(task, basis.path(basis.still(coefficients)), base)
+        else (
+            *binding_words(
+                binding(task, coefficients, per_period(basis)),
+                task,
+                motion_limits(model.config),
+                proof.demands.velocity,
+                ["rad" if turns else "m" for turns in model.chain.revolute],
+            ),
+        )
+    )
+    return Designed(excitation, proof, kappa, found, held)
 
 
 def require_bearable(basis: Basis) -> None:

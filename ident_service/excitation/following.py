@@ -1,62 +1,47 @@
-"""How far the arm will fall behind: friction that the control law does not know against how stiffly it holds.
+"""Friction in the control law, and how far the arm falls behind by what the law does not know of it.
 
-Computed torque (eq. 76) answers an unknown torque d with the error `e = K_p^-1 M(q)^-1 d`, once it has settled. Where
-little inertia stands behind a joint, as behind the upper arm's rotation when the elbow is straight, little friction
-moves it far. Static, so a forecast and no bound; the guard keeps the limit itself.
+Drives are expected to take `f(w) = F_c s(w) + F_v w` at their velocity w. The law adds the share s_f of it, for the
+velocity of the reference (`FrictionFeedforward`). What is left, `d = (b - s_f) f` where friction is b times what is
+expected, computed torque (eq. 76) answers with the error `e = K_p^-1 M(q)^-1 d`, once it has settled. Where little
+inertia stands behind a joint, as behind the upper arm's rotation when the elbow is straight, little friction moves it
+far. Static, so a forecast and no bound; the guard keeps the limit itself.
 
 Boundary: forecasts; friction is the prior's where it has some, else a guess from the torque limits.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.sparse
 
 from ident_service.config.limits import MotionLimits
-from ident_service.model.arm_model import ArmModel
+from ident_service.model.arm_model import ArmModel, control_model
 from ident_service.model.chain import Array
+from ident_service.model.expected_friction import ExpectedFriction
 from ident_service.model.inertia_response import InertiaResponse
+
+if TYPE_CHECKING:
+    import scipy.sparse
 
 # Where the inertia behind a joint changes, so does how far it falls behind, and its speed is another than asked for.
 TOLERATED = 1.05  # of the velocity limit; the guard stops at 1.2
 USABLE = 0.8  # of the limit: settling overshoots a little, and the forecast is static
-
-
-@dataclass(frozen=True)
-class ExpectedFriction:
-    """Friction of the drives.
-
-    Attributes:
-        coulomb: [N m or N], shape (joints,).
-        viscous: [N m s/rad or N s/m], shape (joints,).
-    """
-
-    coulomb: Array
-    viscous: Array
-
-
-def expected_friction(model: ArmModel, limits: MotionLimits, guess: tuple[float, float]) -> ExpectedFriction:
-    """The prior's friction, or, of drives of which it has none, the guess.
-
-    Args:
-        model: of the arm.
-        limits: its full limits.
-        guess: Coulomb friction, and viscous friction at the velocity limit, in shares of the torque limit.
-    """
-    coulomb, viscous = guess[0] * limits.torque, guess[1] * limits.torque / limits.velocity
-    if model.prior is None:
-        return ExpectedFriction(coulomb, viscous)
-    known = [model.layout.term_values(term, model.prior) for term in ("coulomb", "viscous")]
-    some = (known[0] > 0.0) | (known[1] > 0.0)
-    return ExpectedFriction(np.where(some, known[0], coulomb), np.where(some, known[1], viscous))
+# Times the expected friction, between which an arm's own lies for a forecast: it changes by a third between a cold and
+# a warm drive (Bittencourt & Gunnarsson 2012, figure 5).
+DOUBT = (0.6, 1.4)
 
 
 def dry_friction(model: ArmModel, delta: Array) -> tuple[Array, Array]:
     """The most that dry friction can take, of every drive and of every joint [N m or N], each of shape (joints,)."""
     drives = np.abs(model.layout.term_values("coulomb", delta)) + np.abs(model.layout.term_values("stribeck", delta))
     return drives, drives @ np.abs(model.chain.coupling)
+
+
+def unknown_friction(friction: ExpectedFriction, share: float) -> ExpectedFriction:
+    """Return the most of the expected friction that a feed-forward of a share leaves, either way, within `DOUBT`."""
+    left = max(DOUBT[1] - share, share - DOUBT[0])
+    return ExpectedFriction(left * friction.coulomb, left * friction.viscous, 0.0 * friction.offset)
 
 
 class FollowingError:
@@ -68,13 +53,14 @@ class FollowingError:
         Args:
             model: with prior parameters.
             limits: for the gains.
-            friction: of the drives.
+            friction: of the drives, as much of it as the law does not know (`unknown_friction`).
             creep: velocity over which a joint's Coulomb friction turns round [rad/s or m/s], shape (joints,).
 
         Raises:
             ModelError: no prior, or one that no real body has.
         """
-        prior = np.zeros(model.layout.size) if model.prior is None else model.prior
+        known = control_model(model).prior
+        prior = np.zeros(model.layout.size) if known is None else known
         self._response = InertiaResponse(model.chain, model.layout, prior)
         self._coupling, self._kp = model.chain.coupling, limits.kp
         self._friction, self._creep = friction, creep
@@ -99,6 +85,8 @@ def rate_of_change(times: Array) -> scipy.sparse.csr_array:
 
     Neighbours are samples of one stretch; where times jump or turn back, another stretch begins.
     """
+    import scipy.sparse  # loads for 0.1 s, and only a design needs it
+
     steps = np.diff(times)
     usual = np.median(np.abs(steps))
     jumps = np.abs(steps) > 1.6 * usual
@@ -118,6 +106,16 @@ def rate_of_change(times: Array) -> scipy.sparse.csr_array:
 def forecast(
     model: ArmModel, limits: MotionLimits, friction: ExpectedFriction, position: Array, velocity: Array
 ) -> Array:
-    """The largest forecast error of every joint over samples of a motion [rad or m], shape (joints,)."""
+    """The largest forecast error of every joint over samples of a motion [rad or m], shape (joints,).
+
+    Args:
+        model: of the arm; its description says which share of the friction is fed forward.
+        limits: for the gains.
+        friction: expected of the drives.
+        position: [rad or m], shape (samples, joints).
+        velocity: [rad/s or m/s], shape (samples, joints).
+    """
     sharp = np.full(len(limits.kp), 1e-6)
-    return np.asarray(np.abs(FollowingError(model, limits, friction, sharp).run(position, velocity)).max(axis=0))
+    unknown = unknown_friction(friction, model.config.control.friction_feedforward)
+    behind = FollowingError(model, limits, unknown, sharp).run(position, velocity)
+    return np.asarray(np.abs(behind).max(axis=0))

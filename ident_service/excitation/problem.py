@@ -11,13 +11,21 @@ limits. What holds between the samples is proven afterwards (`demands.py`, `clea
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ident_service.excitation.basis import maps
 from ident_service.excitation.criteria import Value, criterion
-from ident_service.excitation.following import TOLERATED, USABLE, FollowingError, dry_friction, rate_of_change
+from ident_service.excitation.following import (
+    TOLERATED,
+    USABLE,
+    FollowingError,
+    dry_friction,
+    rate_of_change,
+    unknown_friction,
+)
 from ident_service.excitation.task import Task
 from ident_service.model.base import base_parameters
 from ident_service.model.capsules import CapsuleModel
@@ -31,7 +39,10 @@ _CREEP = 0.05  # of the velocity limit: friction's direction turns round over so
 _DEPTH = 0.05  # m; a clearance missed by so much counts like another limit missed altogether
 _BETWEEN = 0.02  # m, the most that is kept free for what happens between two samples; the proof mends the rest
 _LINE = 25  # points on the way from home to where the motion begins
+_INSIDE = 0.0005  # by so much linear conditions are harder than the limits, so that rounding leaves none exceeded
 Limits = dict[str, Array]
+Peak = tuple[int, int, int, bool]  # order of the derivative, sample, joint, and whether its upper limit is near
+LINEAR = ("position", "velocity", "acceleration", "jerk")  # limits that are linear in the variables
 
 
 @dataclass
@@ -93,7 +104,8 @@ class Problem:
         self._torque_parameters()
         self._following: FollowingError | None = None
         if task.friction is not None and model.prior is not None:
-            self._following = FollowingError(model, limits, task.friction, _TURNING * limits.velocity)
+            unknown = unknown_friction(task.friction, model.config.control.friction_feedforward)
+            self._following = FollowingError(model, limits, unknown, _TURNING * limits.velocity)
             self._allowed = USABLE * limits.following_error
             self._rate_of = rate_of_change(times)
         self._capsules = CapsuleModel(model)
@@ -104,7 +116,7 @@ class Problem:
         # The straight way from home to where the motion begins, for which only clearance matters.
         self._line = np.linspace(0.0, 1.0, _LINE)[:, None]
         self._begin = maps(task.basis, np.zeros(1))[0]
-        self.names = ["position", "velocity", "acceleration", "jerk"]
+        self.names = list(LINEAR)
         self.names += ["torque"] * (model.prior is not None) + ["power"] * (self._supply is not None)
         self.names += ["following error", "forecast speed"] * (self._following is not None)
         self.names += ["clearance"] * bool(self._capsules.pairs)
@@ -147,6 +159,42 @@ class Problem:
         samples = len(self._weights)
         shapes = {"power": (samples, 1), "clearance": (samples + _LINE, len(self._capsules.pairs))}
         return Multipliers({name: np.zeros(shapes.get(name, (samples, self._n))) for name in self.names}, weight)
+
+    def linear_peaks(self, x: Array, share: float) -> set[Peak]:
+        """Return where the limits that are linear in x are used most: local peaks above a share, and their neighbours.
+
+        Args:
+            x: variables, shape (size,).
+            share: of a limit.
+        """
+        X = self.coefficients(x)
+        found: set[Peak] = set()
+        for order, (values, middle, limit) in enumerate(self._linear()):
+            used = (values @ X.T - middle) / limit
+            size = np.abs(used)
+            peak = (size >= np.roll(size, 1, axis=0)) & (size >= np.roll(size, -1, axis=0)) & (size > share)
+            peak |= np.roll(peak, 1, axis=0) | np.roll(peak, -1, axis=0)
+            found |= {(order, sample, joint, bool(used[sample, joint] > 0.0)) for sample, joint in np.argwhere(peak)}
+        return found
+
+    def linear_rows(self, peaks: Sequence[Peak]) -> tuple[Array, Array]:
+        """Return A and b of the conditions `A x <= b` that keep the limits at peaks, shapes (peaks, size), (peaks,)."""
+        A, b = np.zeros((len(peaks), *self._scale.shape)), np.zeros(len(peaks))
+        linear = self._linear()
+        for row, (order, sample, joint, above) in enumerate(peaks):
+            values, middle, limit = linear[order]
+            side = 1.0 if above else -1.0
+            A[row, joint] = side * values[sample] * self._scale[joint] / limit[joint]
+            at_zero = (values[sample] @ self._offset[joint] - middle[joint]) / limit[joint]
+            b[row] = 1.0 - _RESERVE - _INSIDE - side * at_zero
+        return A.reshape(len(peaks), self.size), b
+
+    def _linear(self) -> tuple[tuple[Array, Array, Array], ...]:
+        """Maps of position and its derivatives, with the middle and the size of what each may be, shape (joints,)."""
+        limits, zero = self.task.limits, np.zeros(self._n)
+        middles = (self._middle, zero, zero, zero)
+        sizes = (self._half, limits.velocity, limits.acceleration, limits.jerk)
+        return tuple(zip(self._maps, middles, sizes, strict=True))
 
     def state(self, x: Array, sharpness: float) -> State:
         """Criterion and limits at x."""
@@ -193,7 +241,9 @@ class Problem:
             found["power"], power_slopes = self._power(torque, dq)
         if self._capsules.pairs:
             way = limits.home + self._line * (self._begin @ X.T - limits.home)
-            found["clearance"] = (self._clearance - self._capsules.distances(np.concatenate([q, way])).T) / _DEPTH
+            # The arm, which falls behind, and not its reference has to keep clear.
+            where = q if self._following is None else q - behind
+            found["clearance"] = (self._clearance - self._capsules.distances(np.concatenate([where, way])).T) / _DEPTH
         state = State(X, value, found)
         if multipliers is None:
             return state, value.value, np.zeros(0)
@@ -208,13 +258,16 @@ class Problem:
         on_ddq = pushes["acceleration"] / limits.acceleration
         on_jerk = pushes["jerk"] / limits.jerk
         on_begin = np.zeros(self._n)
+        on_behind = np.zeros_like(q)
         if "clearance" in found:
             by_posture = self._capsules.pull(-forces["clearance"].T / _DEPTH)
             on_q = on_q + by_posture[: len(q)]
+            on_behind = -by_posture[: len(q)]
             on_begin = (self._line * by_posture[len(q) :]).sum(axis=0)
         if self._following is not None:
             on_speed = pushes["forecast speed"] / (TOLERATED * limits.velocity)
-            by_q, by_dq = self._following.pull(pushes["following error"] / self._allowed - self._rate_of.T @ on_speed)
+            on_behind = on_behind + pushes["following error"] / self._allowed - self._rate_of.T @ on_speed
+            by_q, by_dq = self._following.pull(on_behind)
             on_q, on_dq = on_q + by_q, on_dq + by_dq + on_speed
         seeds = np.zeros_like(H)
         for k, (rows, felt, noise) in enumerate(zip(H, self._regressor.supports, task.noise, strict=True)):

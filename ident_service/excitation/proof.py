@@ -9,15 +9,16 @@ import numpy as np
 
 from ident_service.config.limits import MotionLimits
 from ident_service.excitation.basis import Basis
-from ident_service.excitation.clearance import Clearance, certified_clearance
+from ident_service.excitation.clearance import Clearance, Tube, certified_clearance
 from ident_service.excitation.demands import Demands, demands
 from ident_service.excitation.path import STEP_PEAKS, FourierPath, PosturePath
+from ident_service.excitation.tracking import Tracking, track, way_width
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel
 
 _CALM, _SHORTEST = 0.5, 0.5  # share of the limits on the ways to and from a motion; s
-_SHRINKS = tuple(1.0 - 0.002 * 1.35**k for k in range(20))  # 0.998 ... 0.4
+_SHRINKS = (*(1.0 - 0.002 * 1.35**k for k in range(20)), 0.2, 0.1, 0.05, 0.01)  # 0.998 ... 0.4 ... 0.01
 
 
 @dataclass(frozen=True)
@@ -29,33 +30,48 @@ class Proof:
         clearance: the smallest distance, None where the arm has no geometry.
         approach: the smallest distance on the straight way from home to where the motion begins and back, likewise.
         ways: what calm ways from home and back ask, home itself included.
+        tracking: how a simulated arm follows the motion, None where nothing was simulated; clearances are the arm's
+            then, and else the reference's.
     """
 
     demands: Demands
     clearance: Clearance | None
     approach: Clearance | None
     ways: Demands
+    tracking: Tracking | None = None
 
 
 def proof_of(
-    path: FourierPath | PosturePath, model: ArmModel, limits: MotionLimits, collision: CollisionModel
+    path: FourierPath | PosturePath,
+    model: ArmModel,
+    limits: MotionLimits,
+    collision: CollisionModel,
+    torque_margin: float | None = None,
 ) -> Proof:
-    """Bound everything a motion asks.
+    """Bound everything a motion asks, and simulate the arm where the reference keeps its limits.
 
     Args:
         path: the motion.
         model: of the arm.
-        limits: for home and for how fast the ways to and from it are.
+        limits: that the motion may use, also for home and for how fast the ways to and from it are.
         collision: geometry of the arm.
+        torque_margin: share of the torque that the motion keeps free for what the model does not know; the
+            description's when None.
     """
+    margin = model.config.design.torque_margin if torque_margin is None else torque_margin
     least = model.config.workspace.clearance
     ways = _ways(path, limits)
     asked, on_ways = demands(path, model), demands(ways, model)
+    tracking: Tracking | None = None
+    tubes: tuple[Tube | None, Tube | None] = (None, None)
+    if model.prior is not None and not asked.violations(model.chain.names, limits, model.config.supply):
+        tracking = track(path, model, margin)
+        if collision.pairs and not tracking.objections(model.chain.names, limits):
+            tubes = tracking.width, way_width(ways, model, margin)
     if not collision.pairs:
-        return Proof(asked, None, None, on_ways)
-    return Proof(
-        asked, certified_clearance(collision, path, least), certified_clearance(collision, ways, least), on_ways
-    )
+        return Proof(asked, None, None, on_ways, tracking)
+    near = [certified_clearance(collision, one, least, tube) for one, tube in zip((path, ways), tubes, strict=True)]
+    return Proof(asked, near[0], near[1], on_ways, tracking)
 
 
 def _ways(path: FourierPath | PosturePath, limits: MotionLimits) -> PosturePath:
@@ -74,6 +90,8 @@ def objections(proof: Proof, model: ArmModel, limits: MotionLimits) -> list[str]
     found = proof.demands.violations(model.chain.names, limits, model.config.supply)
     forces = proof.ways.forces_beyond(model.chain.names, limits, model.config.supply)
     found += [f"at home, or on the way from it or back: {one}" for one in forces]
+    if proof.tracking is not None:
+        found += proof.tracking.objections(model.chain.names, limits)
     least = model.config.workspace.clearance
     for what, clearance in (("the motion", proof.clearance), ("the way from home or back", proof.approach)):
         if clearance is not None and clearance.lower_bound < least:
@@ -92,6 +110,9 @@ def largest_proven(
 ) -> tuple[Array, Proof] | None:
     """The largest motion between standing still and the given one of which everything can be proven.
 
+    Sizes are tried ever more coarsely until one can be proven, then halfway back. That takes a few proofs, of seconds
+    each, where one size after another would take twenty.
+
     Args:
         basis: the family.
         coefficients: of the motion, shape (joints, size).
@@ -104,8 +125,17 @@ def largest_proven(
     if (proof := proven(coefficients)) is not None:
         return coefficients, proof
     for anchor in (basis.still(coefficients), safe):
-        for share in (*_SHRINKS, 0.2, 0.1, 0.05, 0.01):
-            smaller = anchor + share * (coefficients - anchor)
+        found: tuple[Array, Proof] | None = None
+        too_large, small_enough = -1, len(_SHRINKS)
+        step = 1
+        while small_enough - too_large > 1:
+            size = too_large + step if found is None else (too_large + small_enough) // 2
+            size = min(size, len(_SHRINKS) - 1)
+            smaller = anchor + _SHRINKS[size] * (coefficients - anchor)
             if (proof := proven(smaller)) is not None:
-                return smaller, proof
+                found, small_enough = (smaller, proof), size
+            else:
+                too_large, step = size, 2 * step
+        if found is not None:
+            return found
     return None

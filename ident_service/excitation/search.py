@@ -1,7 +1,9 @@
 """The search: many random starts on all cores, the best of them polished, within a budget of time or starts.
 
 Start number k of seed s is always the same motion to begin with, so that a search bounded by starts gives the same
-result every time, and one bounded by time can be resumed. Starts take seven tenths of the time, polishing the rest.
+result every time, and one bounded by time can be resumed. Starts take a quarter of the time, because polishing gains
+more than the best of many starts is better than the first. What time is left when the best are polished goes to further
+starts, which are polished in their turn.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ from ident_service.model.threads import one_blas_thread
 
 _KEPT = 8  # candidates
 _POLISHED = 4
-_STARTS_SHARE = 0.7
+_STARTS_SHARE = 0.25
+_STARTS_TAKE = 0.5  # of all the time, where their number is given
 _FINER = 2  # the grid of the polish against that of the starts
 _TICK = 0.2
 
@@ -123,6 +126,9 @@ def search(
     with _crew(task, safe, seed, budget, per_period, cancelled) as crew:
         run.starts(crew)
         run.polish(crew)
+        while run.goes_on():
+            run.starts(crew)
+            run.polish(crew)
     return run.found()
 
 
@@ -153,20 +159,30 @@ class _Run:
         self._first = self._finished = 0 if earlier is None else earlier.finished
         self._best: list[Candidate] = [] if earlier is None else list(earlier.candidates)
         self._standing = Candidate(-1, np.inf, task.basis.standing(safe))
+        self._number = self._first  # of the next start
+        self._polished: set[int] = set()
 
     def found(self) -> Found:
         elapsed = self._before + time.monotonic() - self._begun
         return Found(self._seed, self._finished, elapsed, tuple(self._best) or (self._standing,))
 
+    def goes_on(self) -> bool:
+        """Tell whether there is time for further starts, and leave to make them."""
+        seconds, starts = self._budget.seconds, self._budget.starts
+        return seconds is not None and starts is None and not self._over(self._begun + seconds)
+
     def starts(self, crew: _Crew) -> None:
-        until = None if self._budget.seconds is None else self._begun + _STARTS_SHARE * self._budget.seconds
+        """Make starts in a share of the time that is left, or as many as are asked for."""
+        seconds, now = self._budget.seconds, time.monotonic()
+        until = None if seconds is None else now + _STARTS_SHARE * (self._begun + seconds - now)
         last = None if self._budget.starts is None else self._first + self._budget.starts
-        number = self._first
         running: set[Future[Candidate]] = set()
         while True:
-            while len(running) < self._budget.workers and not self._over(until) and (last is None or number < last):
-                running.add(crew.submit(number, None, until))
-                number += 1
+            while len(running) < self._budget.workers and not self._over(until):
+                if last is not None and self._number >= last:
+                    break
+                running.add(crew.submit(self._number, None, until))
+                self._number += 1
             if not running or self._broken:
                 return
             for candidate in self._finished_of(crew, running, "starts"):
@@ -176,7 +192,8 @@ class _Run:
     def polish(self, crew: _Crew) -> None:
         until = None if self._budget.seconds is None else self._begun + self._budget.seconds
         running: set[Future[Candidate]] = set()
-        waiting = list(self._best[:_POLISHED])
+        waiting = [one for one in self._best if one.start not in self._polished][:_POLISHED]
+        self._polished |= {one.start for one in waiting}
         while (waiting or running) and not self._broken:
             while waiting and len(running) < self._budget.workers and not self._over(until):
                 running.add(crew.submit(waiting[0].start, waiting.pop(0), until))
@@ -210,7 +227,7 @@ class _Run:
         if self._budget.seconds is not None:
             bounds.append(self._budget.seconds - elapsed)
         if self._budget.starts is not None and (done := self._finished - self._first):
-            bounds.append(elapsed / _STARTS_SHARE / done * self._budget.starts - elapsed)
+            bounds.append(elapsed / _STARTS_TAKE / done * self._budget.starts - elapsed)
         return max(0.0, min(bounds)) if bounds else float("nan")
 
     def _take(self, candidate: Candidate) -> None:

@@ -11,9 +11,9 @@ from ident_service.config.design import Criterion, Design
 from ident_service.config.limits import MotionLimits
 from ident_service.errors import MotionRefused
 from ident_service.excitation.basis import Basis
-from ident_service.excitation.following import ExpectedFriction
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array
+from ident_service.model.expected_friction import ExpectedFriction
 
 
 @dataclass(frozen=True)

@@ -83,3 +83,24 @@ def arm_model(config: ArmConfig) -> ArmModel:
     if prior is not None:
         prior.setflags(write=False)
     return ArmModel(config, chain, layout, prior)
+
+
+def control_model(model: ArmModel) -> ArmModel:
+    """Return the model that the control law, and every forecast of it, computes torques with.
+
+    Its prior has the drive inertia that the description states (`joints.*.drive_inertia`) where the prior, often a CAD
+    model of the links alone, has less. The description states what is felt at the joint, `sum_d C_dj^2 Ia_d` of drives
+    that move several joints; their own share is the non-negative solution nearest to that.
+    """
+    columns = model.layout.term_columns("drive_inertia")
+    joints = [model.config.joints.get(name) for name in model.chain.names]
+    at_joints = np.array([0.0 if joint is None else joint.drive_inertia or 0.0 for joint in joints])
+    if model.prior is None or not len(columns) or not at_joints.any():
+        return model
+    from scipy.optimize import nnls  # most arms are only looked at, and need no solver
+
+    stated, _ = nnls((model.chain.coupling**2).T, at_joints)
+    prior = model.prior.copy()
+    prior[columns] = np.maximum(prior[columns], stated)
+    prior.setflags(write=False)
+    return replace(model, prior=prior)

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from ident_service.errors import ParameterError
@@ -22,6 +21,7 @@ from ident_service.model.regressor import joint_regressor
 
 _RANK_TOLERANCE = 1e-8
 _DECIMALS = 11
+_FAINT = 0.01  # of a column's length; of the shipped arms' none is below 0.4
 _SEED = 20140301
 
 
@@ -34,12 +34,15 @@ class BaseParameters:
         K: eq. 38, shape (base, link parameters).
         base: columns P_b selects, increasing, shape (base,); `K[:, base]` is invertible.
         units: the unit of each base parameter, empty strings where unknown.
+        independence: of each base column, the share of its length that the base columns before it do not explain,
+            shape (base,); None where it is not known.
     """
 
     names: tuple[str, ...]
     K: Array
     base: NDArray[np.intp]
     units: tuple[str, ...]
+    independence: Array | None = None
 
     def __post_init__(self) -> None:
         self.K.setflags(write=False)
@@ -84,12 +87,30 @@ def grouping(H: Array, names: tuple[str, ...], units: tuple[str, ...]) -> BasePa
         names: of the parameters.
         units: of the parameters.
     """
-    base, K_d = _first_independent(H)
+    base, independence, K_d = _first_independent(H)
     K = np.zeros((len(base), len(names)))
     K[np.arange(len(base)), base] = 1.0
     dependent = np.setdiff1d(np.arange(len(names)), base)
     K[:, dependent] = K_d
-    return BaseParameters(names, K, base, tuple(units[column] for column in base))
+    return BaseParameters(names, K, base, tuple(units[column] for column in base), independence)
+
+
+def remarks_on_angles(base: BaseParameters) -> tuple[str, ...]:
+    """Tell which base parameters are only there because angles of the mechanism are rounded, in words.
+
+    Columns of real mechanisms are a third independent of the others, or not at all; 1.5708 for pi/2 leaves a millionth.
+    """
+    if base.independence is None:
+        return ()
+    faint = np.flatnonzero(base.independence < _FAINT)
+    if not len(faint):
+        return ()
+    named = ", ".join(base.names[base.base[place]] for place in faint[:5])
+    return (
+        f"{len(faint)} of {base.size} base parameters ({named}{', ...' if len(faint) > 5 else ''}) can hardly be told"
+        f" from the others (by {base.independence[faint].max():.1g} of their effect): angles of the mechanism are"
+        " probably rounded, as 1.5708 for pi/2; set kinematics.snap: true for a URDF, or write more digits",
+    )
 
 
 def static_base_parameters(chain: Chain, layout: Layout) -> BaseParameters:
@@ -104,9 +125,11 @@ def static_base_parameters(chain: Chain, layout: Layout) -> BaseParameters:
     return grouping(H.transpose(0, 2, 1).reshape(-1, layout.size), layout.names, layout.units)
 
 
-def _first_independent(H: Array) -> tuple[NDArray[np.intp], Array]:
-    """First independent columns from the left, and what the others are made of: `H_d = H_b K_d` (eq. 32)."""
-    base = _independent_columns(H)
+def _first_independent(H: Array) -> tuple[NDArray[np.intp], Array, Array]:
+    """First independent columns from the left, how independent, and what the others are made of (eq. 32)."""
+    import scipy.linalg  # loads for 0.2 s, and no process that moves an arm needs it
+
+    base, independence = _independent_columns(H)
     norms = np.linalg.norm(H, axis=0)
     dependent = np.setdiff1d(np.arange(H.shape[1]), base)
     H_b = H[:, base] / norms[base]
@@ -115,7 +138,7 @@ def _first_independent(H: Array) -> tuple[NDArray[np.intp], Array]:
     K_d += scipy.linalg.solve_triangular(r, q.T @ (H[:, dependent] - H_b @ K_d))
     K_d /= norms[base][:, None]
     K_d[:, norms[dependent] <= _RANK_TOLERANCE * norms.max()] = 0.0
-    return base, _round_digits(K_d)
+    return base, independence, _round_digits(K_d)
 
 
 def _round_digits(values: Array) -> Array:
@@ -133,6 +156,8 @@ def base_from_expressions(expressions: tuple[str, ...], names: tuple[str, ...]) 
     Raises:
         ParameterError: no expressions, or ones that do not parse, use foreign names, or depend on each other.
     """
+    import scipy.linalg
+
     if not expressions:
         raise ParameterError("no expressions: a table of base parameters has at least one")
     K = parameter_matrix(expressions, names)
@@ -144,15 +169,19 @@ def base_from_expressions(expressions: tuple[str, ...], names: tuple[str, ...]) 
         raise ParameterError(
             f"expression {int(order[rank]) + 1} is a combination of the others: {expressions[order[rank]]!r}"
         )
-    base = _independent_columns(K)
+    base, _ = _independent_columns(K)
     return BaseParameters(names, K, base, ("",) * len(expressions))
 
 
-def _independent_columns(matrix: Array) -> NDArray[np.intp]:
-    """First independent columns from the left; numerically null columns are none."""
+def _independent_columns(matrix: Array) -> tuple[NDArray[np.intp], Array]:
+    """First independent columns from the left, and the share of each that those before it leave.
+
+    Numerically null columns are none.
+    """
     norms = np.linalg.norm(matrix, axis=0)
     Q = np.zeros((matrix.shape[0], 0))
     chosen: list[int] = []
+    lengths: list[float] = []
     # Columns that are only rounding noise must go before any scaling, or the noise looks like rank.
     for column in np.flatnonzero(norms > _RANK_TOLERANCE * norms.max()):
         residual = matrix[:, column] / norms[column]
@@ -161,5 +190,6 @@ def _independent_columns(matrix: Array) -> NDArray[np.intp]:
         length = float(np.linalg.norm(residual))
         if length > _RANK_TOLERANCE:
             chosen.append(int(column))
+            lengths.append(length)
             Q = np.column_stack([Q, residual / length])
-    return np.array(chosen, dtype=np.intp)
+    return np.array(chosen, dtype=np.intp), np.array(lengths)

@@ -6,6 +6,7 @@ can be weighted afterwards. Columns that a joint cannot feel (links nearer the b
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,12 +48,37 @@ class Information:
         Raises:
             ModelError: the two belong to different models.
         """
+        self.require_same(other)
+        factors = tuple(triangle(np.vstack(pair)) for pair in zip(self.factors, other.factors, strict=True))
+        return Information(self.supports, factors, self.rows + other.rows, self.base)
+
+    @staticmethod
+    def sum(parts: Iterable[Information]) -> Information:
+        """Merge any number of sets of equations, at least one, by one decomposition a joint.
+
+        Raises:
+            ModelError: they belong to different models.
+        """
+        every = tuple(parts)
+        first = every[0]
+        if len(every) == 1:
+            return first
+        for other in every[1:]:
+            first.require_same(other)
+        factors = tuple(triangle(np.vstack([part.factors[joint] for part in every])) for joint in range(first.joints))
+        rows = np.sum([part.rows for part in every], axis=0)
+        return Information(first.supports, factors, rows, first.base)
+
+    def require_same(self, other: Information) -> None:
+        """Refuse information of another model.
+
+        Raises:
+            ModelError: it is.
+        """
         if self.base != other.base or self.joints != other.joints:
             raise ModelError(
                 f"{self.base} base parameters of {self.joints} joints against {other.base} of {other.joints}"
             )
-        factors = tuple(triangle(np.vstack(pair)) for pair in zip(self.factors, other.factors, strict=True))
-        return Information(self.supports, factors, self.rows + other.rows, self.base)
 
     def stacked(self, weights: Array | None = None) -> Array:
         """The triangular factor of all joints' equations together, `[R1 rho1; 0 |rho2|]` of eqs. 64-70.

@@ -11,7 +11,6 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dposv
 
 from ident_service.config.kinematics import Kinematics
 from ident_service.config.quantities import TextFile
@@ -121,17 +120,31 @@ class InverseDynamics:
     """Torque of a chain with known parameters at one state, fast enough for a control loop; no friction."""
 
     def __init__(self, chain: Chain, layout: Layout, delta: Array) -> None:
+        """Take the parameters.
+
+        Raises:
+            ModelError: `delta` does not fit the layout, or a link has no positive mass.
+        """
+        coupling = chain.coupling
+        self._drives: Array | None = None
+        if not np.array_equal(coupling, np.diag(np.diag(coupling))):
+            # Pinocchio has an armature per joint only; drives that move several joints add their own matrix.
+            self._drives = coupling.T @ (layout.term_values("drive_inertia", delta)[:, None] * coupling)
+            chain, delta = replace(chain, coupling=np.eye(chain.joints)), delta.copy()
+            delta[layout.term_columns("drive_inertia")] = 0.0
         self._model = pinocchio_model(chain, layout, delta)
         self._data = self._model.createData()
 
     def torque(self, position: Array, velocity: Array, acceleration: Array) -> NDArray[np.float64]:
         """`M(q) ddq + c(q, dq) + g(q)` [N m or N], shape (joints,), drive inertia included."""
-        return np.asarray(pin.rnea(self._model, self._data, position, velocity, acceleration))
+        rigid = np.asarray(pin.rnea(self._model, self._data, position, velocity, acceleration))
+        return rigid if self._drives is None else np.asarray(rigid + self._drives @ acceleration)
 
     def mass_matrix(self, position: Array) -> NDArray[np.float64]:
         """M(q), shape (joints, joints), drive inertia included."""
         upper = pin.crba(self._model, self._data, position)
-        return np.asarray(np.triu(upper) + np.triu(upper, 1).T)
+        rigid = np.asarray(np.triu(upper) + np.triu(upper, 1).T)
+        return rigid if self._drives is None else np.asarray(rigid + self._drives)
 
 
 class ForwardDynamics:
@@ -144,8 +157,14 @@ class ForwardDynamics:
 
     _CREEP = 1e-3  # rad/s or m/s
 
-    def __init__(self, chain: Chain, layout: Layout, delta: Array) -> None:
+    def __init__(self, chain: Chain, layout: Layout, delta: Array, friction: tuple[Array, Array] | None = None) -> None:
         """Take the parameters.
+
+        Args:
+            chain: the mechanism.
+            layout: of `delta`.
+            delta: parameters [SI], shape (layout.size,).
+            friction: Coulomb and viscous friction of the drives instead of those of `delta`, each of shape (joints,).
 
         Raises:
             ModelError: `delta` does not fit the layout, or a link has no positive mass.
@@ -157,6 +176,8 @@ class ForwardDynamics:
         self._data = self._model.createData()
         self._coupling = chain.coupling
         self._terms = {term: layout.term_values(term, delta) for term in TERM_SYMBOLS}
+        if friction is not None:
+            self._terms["coulomb"], self._terms["viscous"] = friction
         self._stribeck_velocity = np.array(layout.stribeck_velocity or np.ones(chain.joints))
         inertia = self._terms["drive_inertia"]
         self._drive_matrix = chain.coupling.T @ (inertia[:, None] * chain.coupling)
@@ -194,6 +215,8 @@ class ForwardDynamics:
         Raises:
             ModelError: the mass matrix is not positive definite.
         """
+        from scipy.linalg.lapack import dposv  # loads for 0.2 s, and no process that moves an arm needs it
+
         damping = self._secant(self._coupling @ velocity)
         rest = pin.nonLinearEffects(self._model, self._data, position, velocity)
         resistance = self._coupling.T @ (damping[:, None] * self._coupling)

@@ -11,7 +11,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dtbtrs
 
 Array = NDArray[np.float64]
 
@@ -70,6 +69,8 @@ def butterworth_sections(order: int, cutoff: float, rate: float) -> list[tuple[f
 
 
 def _one_way(columns: Array, sections: list[tuple[float, float, float]]) -> Array:
+    from scipy.linalg.lapack import dtbtrs  # loads for 0.2 s; who looks at drives alone filters nothing
+
     # Unit gain at rest: what departs from the first value is filtered from zero, and the first value comes back.
     first = columns[:1]
     signal = np.asfortranarray(columns - first)

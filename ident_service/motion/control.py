@@ -1,9 +1,11 @@
 """Computed torque with a proportional and derivative loop (5.2.1, eq. 76, figure 3), and damping alone.
 
-    alpha = ddq_r + K_d (dq_r - dq) + K_p (q_r - q)          tau = M(q) alpha + c(q, dq) + g(q)
+    alpha = ddq_r + K_d (dq_r - dq) + K_p (q_r - q)          tau = M(q) alpha + c(q, dq) + g(q) + f(dq_r)
 
-with the prior (CAD) model. Velocity comes from encoder differences through a first-order low-pass, because at 1 kHz
-one encoder step is a tenth of a radian per second. An arm that is only held, or lowered, is asked for no position:
+with the prior (CAD) model, the drive inertia that the description states included, and a share of the expected friction
+f at the velocity of the reference (`model/expected_friction.py`). Velocity comes from encoder differences through a
+first-order low-pass, because at 1 kHz one encoder step is a tenth of a radian per second. An arm that is only held, or
+lowered, is asked for no position:
 
     tau = M(q) (K_p e - K_d dq) + c(q, dq) + s g(q) + tau_0
 
@@ -12,12 +14,11 @@ where e is how far it is to be brought back inside its position limits.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from drivers.arm import Flags, Vector
 from ident_service.config.limits import MotionLimits
+from ident_service.model.expected_friction import FrictionFeedforward
 from ident_service.model.rigid_body import InverseDynamics
 from ident_service.motion.reference import Setpoint
 
@@ -30,12 +31,19 @@ class ComputedTorque:
         velocity: filtered velocity of the last update [rad/s or m/s], shape (joints,).
         correction: what the errors added to the last torque, `M(q) (K_d (dq_r - dq) + K_p (q_r - q))` [N m or N],
             shape (joints,); nothing when the arm is only damped.
+        feedforward: friction in the last torque [N m or N], shape (joints,); nothing when the arm is only damped.
         answer: the acceleration in it, `K_d (dq_r - dq) + K_p (q_r - q)` [rad/s^2 or m/s^2], shape (joints,); nothing
             likewise.
     """
 
     def __init__(
-        self, dynamics: InverseDynamics, limits: MotionLimits, period: float, velocity_cutoff: float, position: Vector
+        self,
+        dynamics: InverseDynamics,
+        limits: MotionLimits,
+        period: float,
+        velocity_cutoff: Vector | float | tuple[float, ...],
+        position: Vector,
+        friction: FrictionFeedforward | None = None,
     ) -> None:
         """Begin at rest.
 
@@ -43,18 +51,20 @@ class ComputedTorque:
             dynamics: the prior model.
             limits: for the gains.
             period: of the loop [s].
-            velocity_cutoff: of the low-pass [Hz].
+            velocity_cutoff: of the low-pass [Hz], one or per joint.
             position: where the arm stands [rad or m], shape (joints,).
+            friction: to feed forward; none when None.
         """
         self._dynamics = dynamics
         self._kp, self._kd = limits.kp, limits.kd
         self._period = period
-        self._cutoff = velocity_cutoff
-        self._gain = _gain(velocity_cutoff, period)
+        self._friction = friction
+        self._cutoff = np.asarray(velocity_cutoff, dtype=float)
+        self._gain = _gain(self._cutoff, period)
         self.position = position.copy()
         self.velocity = np.zeros_like(position)
         self._none = np.zeros_like(position)
-        self.correction = self.answer = self._none
+        self.correction = self.answer = self.feedforward = self._none
 
     def torque(self, position: Vector, valid: Flags, reference: Setpoint, elapsed: float | None = None) -> Vector:
         """One update.
@@ -72,7 +82,10 @@ class ComputedTorque:
         self.answer = self._kd * (reference.velocity - self.velocity) + self._kp * (reference.position - position)
         torque = self._dynamics.torque(position, self.velocity, reference.acceleration + self.answer)
         self.correction = torque - self._dynamics.torque(position, self.velocity, reference.acceleration)
-        return torque
+        if self._friction is None:
+            return torque
+        self.feedforward = self._friction.torque(reference.velocity)
+        return torque + self.feedforward
 
     def damping(
         self,
@@ -97,7 +110,7 @@ class ComputedTorque:
             Torque [N m or N], shape (joints,), not yet limited.
         """
         position = self._filtered(position, valid, elapsed)
-        self.correction = self.answer = self._none
+        self.correction = self.answer = self.feedforward = self._none
         answer = self._kp * back - self._kd * self.velocity
         torque = self._dynamics.torque(position, self.velocity, answer) + added
         if share < 1.0:
@@ -115,6 +128,6 @@ class ComputedTorque:
         return position
 
 
-def _gain(cutoff: float, seconds: float) -> float:
-    """Of a first-order low-pass [Hz] over a time [s], whatever its length."""
-    return 1.0 - math.exp(-2.0 * math.pi * cutoff * seconds)
+def _gain(cutoff: Vector, seconds: float) -> Vector:
+    """Return the gain of a first-order low-pass [Hz] over a time [s], whatever its length."""
+    return np.asarray(1.0 - np.exp(-2.0 * np.pi * cutoff * seconds))

@@ -10,9 +10,11 @@
 | 18 | uint8 | finish: not 0 when the run shall end early, in order; never taken back |
 | 19 | uint8 | waiting: not 0 while the arm is held until a person confirms that it is supported; of the loop |
 | 20 | uint8 | supported: not 0 when that was confirmed; counts while the arm waits for it |
+| 21 | uint8 | homing: 1 when a person asked that the held arm be led home, then the loop's answer (`controls.Homing`) |
 | 24 | int64 | when the lease was renewed last [ns of the machine's monotonic clock] |
 | 32 | int64 | how long it lasts [ns]; 0 for none |
 | 40 | int64 | when a stop was asked for last, whether or not the arm moved then [ns of the same]; 0 for never |
+| 48 | int64 | when the lease of a way home was renewed last [ns of the same] |
 
 A motion takes seconds to begin, in which nobody can be reached yet. So a stop leaves its time behind, and a motion that
 was asked for before it takes the controls with the stop in them.
@@ -38,9 +40,11 @@ from types import TracebackType
 from typing import Self
 
 from ident_service.errors import DriverError, UsageError
+from ident_service.motion.controls import LEASE_SECONDS, Homing
 
 _MAGIC, _VERSION, _SIZE = b"identctl", 1, 64
 _PID, _STOP, _PAUSE, _FINISH, _WAITING, _SUPPORTED, _RENEWED, _LENGTH, _STOPPED = 12, 16, 17, 18, 19, 20, 24, 32, 40
+_HOMING, _HOME_RENEWED = 21, 48
 _TRIES, _TRY_AGAIN = 20, 0.005  # s; who looks whether the file is in use holds it for a moment
 
 
@@ -204,6 +208,40 @@ class ControlFile:
         if not self.waiting:
             raise UsageError("the arm is not held after a stop; there is nothing to confirm")
         self._memory[_SUPPORTED] = 1
+
+    @property
+    def homing(self) -> Homing:
+        """Say how far the way home of a held arm has come."""
+        return Homing(self._memory[_HOMING])
+
+    def tell_homing(self, stage: Homing) -> None:
+        """Say how far it has come; for whoever moves the arm."""
+        if stage is Homing.GOING:
+            self._memory[_WAITING] = 0
+        self._memory[_HOMING] = stage
+
+    def ask_home(self) -> None:
+        """Have the arm, which is held after a stop, led home; `renew_home` from now on, four times a second.
+
+        Raises:
+            UsageError: the arm is not held; one that moves is stopped before it is led elsewhere.
+        """
+        if not self.waiting:
+            raise UsageError("the arm is not held after a stop; `ident stop` comes first, or its run is waited for")
+        begun = self._now_ns()
+        self.renew_home()
+        self._memory[_STOP] = self._memory[_PAUSE] = 0
+        if self._words[_STOPPED // 8] >= begun:  # asked for by somebody else in this moment
+            self._memory[_STOP] = 1
+        self._memory[_HOMING] = Homing.ASKED
+
+    def renew_home(self) -> None:
+        """Say that whoever had the arm led home is still there."""
+        self._words[_HOME_RENEWED // 8] = self._now_ns()
+
+    def home_lease_ok(self) -> bool:
+        """Tell if whoever had the arm led home has said so within `LEASE_SECONDS`."""
+        return self._now_ns() - self._words[_HOME_RENEWED // 8] <= round(LEASE_SECONDS * 1e9)
 
     def renew(self) -> None:
         """Say that whoever asked for motion is still there."""

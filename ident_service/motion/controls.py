@@ -9,10 +9,21 @@ Stop needs no lease. Hold-to-run is nothing but a short lease.
 from __future__ import annotations
 
 from collections.abc import Callable
+from enum import IntEnum
 from typing import Protocol
 
 LEASE_SECONDS = 2.0  # ARCHITECTURE.md: renewed every 0.5 s
 HOLD_TO_RUN_SECONDS = 0.25
+
+
+class Homing(IntEnum):
+    """Name how far the way home of an arm that is held after a stop has come."""
+
+    NONE = 0
+    ASKED = 1
+    GOING = 2
+    ENDED = 3  # it stands again and is held, at home unless it was stopped
+    REFUSED = 4  # it stands where it stood
 
 
 class Controls(Protocol):
@@ -37,6 +48,13 @@ class Controls(Protocol):
     def wait_for_support(self) -> None:
         """Say that the arm is held until somebody confirms that; called once for each hold."""
 
+    @property
+    def homing(self) -> Homing:
+        """Say whether a person wants the arm, which is held, led home, and how far that has come."""
+
+    def tell_homing(self, stage: Homing) -> None:
+        """Say how far it has come; whoever asked for it is from `GOING` on the one whose lease counts."""
+
     def lease_ok(self, now_ns: int) -> bool:
         """Whether whoever asked for motion is still there at this time of the loop's clock [ns]."""
 
@@ -49,6 +67,7 @@ class StopWhen:
 
     pause = False
     finish = False
+    homing = Homing.NONE
 
     def __init__(
         self, asked: Callable[[], bool] = lambda: False, supported: Callable[[], bool] = lambda: False
@@ -68,6 +87,9 @@ class StopWhen:
     def wait_for_support(self) -> None:
         """Nothing more: the function is asked."""
 
+    def tell_homing(self, stage: Homing) -> None:
+        """Nobody asks for it."""
+
     def lease_ok(self, now_ns: int) -> bool:
         """There is no lease to lose."""
         return True
@@ -82,6 +104,7 @@ class Switches:
         finish: the run is to end early.
         supported: the arm, which is held, is supported.
         waiting: whether the arm is held until that is so.
+        homing: the arm, which is held, is to be led home.
     """
 
     def __init__(self, lease_seconds: float | None = None) -> None:
@@ -94,12 +117,19 @@ class Switches:
         self.pause = False
         self.finish = False
         self.supported = self.waiting = False
+        self.homing = Homing.NONE
         self._length_ns = None if lease_seconds is None else round(lease_seconds * 1e9)
         self._renewed_ns: int | None = None
 
     def wait_for_support(self) -> None:
         """Wait for the switch `supported`; one that was set before does not count."""
         self.supported, self.waiting = False, True
+
+    def tell_homing(self, stage: Homing) -> None:
+        """Remember it; the switch `stop`, which led here, is off while the arm goes home."""
+        if stage is Homing.GOING:
+            self.stop = self.pause = self.waiting = False
+        self.homing = stage
 
     def renew(self, now_ns: int) -> None:
         """Say at a time of the loop's clock [ns] that somebody is still there."""

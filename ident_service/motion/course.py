@@ -10,14 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Generator, Sequence
 
-from ident_service.config.limits import MotionLimits
+from ident_service.config.limits import MotionLimits, Vector
 from ident_service.errors import MotionRefused
 from ident_service.motion.pause import Paused, Resumed
+from ident_service.motion.plans import HOMING_SPEED
 from ident_service.motion.reference import Reference, Setpoint, hold, rest
+from ident_service.motion.speed import slowed_limits
 from ident_service.motion.states import MOVING, STOPPABLE, State, States
 from ident_service.motion.stop import stop
 from ident_service.motion.surroundings import Surroundings
-from ident_service.motion.way import RuckigReference
+from ident_service.motion.way import RuckigReference, calm_way_in_slices
 
 _UNDER_WAY = (*MOVING, State.PAUSING, State.PAUSED, State.RESUMING)
 
@@ -31,6 +33,7 @@ class Course:
         complete: whether the last way has been followed to its end.
         finished_at: of a run that was finished early, how much of its excitation was made [s]; None for any other.
         not_finished: why a run that was to be finished early goes on; empty for any other.
+        led: whether the arm was led home out of a stop: what was to be done is not done by that.
     """
 
     def __init__(
@@ -71,7 +74,8 @@ class Course:
         self._search: Generator[None, None, Resumed | RuckigReference] | None = None
         self._back: Resumed | None = None
         self._finishing = False  # asked for, which counts once
-        self._away: RuckigReference | None = None  # the way back of a run that is finished early
+        self._away: RuckigReference | None = None  # the way back of a run that is finished early, or home
+        self.led = False
 
     def at(self, stamp_ns: int) -> Setpoint:
         """The reference of the cycle with this stamp [ns]; states follow each other as their references end."""
@@ -88,7 +92,7 @@ class Course:
                 (state, self._way), self._back = self._later.pop(0), None
                 states.enter(state)
                 continue
-            self.complete = True
+            self.complete = not self.led
             states.enter(State.STOPPING if self._held else State.DONE)
             self._way = hold(self._way.at(self._way.duration).position, 0.0)
         self.reference = self._way.at(elapsed)
@@ -169,6 +173,31 @@ class Course:
         elif self._back is not None:
             self._states.enter(State.RESUMING)
             self._begin_ns, self._way = stamp_ns, self._back
+
+    def lead_home(self, start: Vector) -> None:
+        """Begin to look for the slow, straight way home of an arm that is stopped; `look_for_way_back` goes on with it.
+
+        Args:
+            start: from where [rad or m], shape (joints,).
+        """
+        limits = slowed_limits(self._limits, HOMING_SPEED)
+
+        def search() -> Generator[None, None, Resumed | RuckigReference]:
+            home = yield from calm_way_in_slices(rest(start), rest(self._limits.home), limits)
+            if self._surroundings is not None:
+                yield from self._surroundings.require_clear(home, limits)
+            return home
+
+        self._away, self._search = None, search()
+
+    def leads_home(self, stamp_ns: int) -> bool:
+        """Go home as soon as the way is found; tell if that is now."""
+        if self._away is None:
+            return False
+        self._states.enter(State.RETURNING)
+        self.led = self._held = True
+        self._later, self._back, self._begin_ns, self._way, self._away = [], None, stamp_ns, self._away, None
+        return True
 
     def _elapsed(self, stamp_ns: int) -> float:
         return 0.0 if self._begin_ns is None else (stamp_ns - self._begin_ns) * 1e-9

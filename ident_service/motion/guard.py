@@ -119,6 +119,7 @@ class Guard:
         correction: Vector,
         answer: Vector | None = None,
         elapsed: float | None = None,
+        feedforward: Vector | float = 0.0,
     ) -> tuple[Flags, Fault | None]:
         """Judge a sample.
 
@@ -129,6 +130,8 @@ class Guard:
             correction: of the torque before this sample, what the errors added to it [N m or N], shape (joints,).
             answer: the acceleration in it [rad/s^2 or m/s^2], shape (joints,); without, nothing is owed.
             elapsed: since the sample before [s]; one period when None.
+            feedforward: friction in the torque before this sample [N m or N], shape (joints,), which pushes a joint
+                against its own friction as the correction does.
 
         Returns:
             Which axes' positions may be used, and the most severe fault found, if any.
@@ -136,12 +139,12 @@ class Guard:
         self.findings.cycle += 1
         self._elapsed = self._period if elapsed is None else elapsed
         answered = bool(sample.valid.all())
-        self._count_still(sample, correction)
+        self._count_still(sample, correction + feedforward)
         self._count_unchanged(sample, velocity)
         if self._owed is not None and answer is not None:
             up, down = sample.position > self._shown, sample.position < self._shown
             direction = np.where(sample.valid, up * 1.0 - down, 0.0)
-            self._owes = self._owed.update(direction, correction, answer, self._position)
+            self._owes = self._owed.update(direction, correction, answer, self._position, feedforward)
         held = answered and self._all_fresh and self._quiet(sample.position, reference.position, velocity)
         if held and self._plain(sample):
             # Copied, in case that a driver fills the same array again.

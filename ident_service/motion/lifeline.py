@@ -12,6 +12,7 @@ from __future__ import annotations
 import select
 
 from ident_service.motion.control_file import ControlFile
+from ident_service.motion.controls import Homing
 
 
 class Lifeline:
@@ -55,10 +56,24 @@ class Lifeline:
         self._controls.wait_for_support()
 
     @property
+    def homing(self) -> Homing:
+        """Say how far the way home of a held arm has come."""
+        return self._controls.homing
+
+    def tell_homing(self, stage: Homing) -> None:
+        """Say how far it has come."""
+        self._controls.tell_homing(stage)
+
+    @property
     def cut(self) -> bool:
         """Whether the other end of the pipe is closed."""
         return bool(self._poll.poll(0))
 
     def lease_ok(self, now_ns: int) -> bool:
-        """Whether whoever asked for the motion is there; a system call that does not wait."""
+        """Tell whether whoever asked for the motion is there; a system call that does not wait.
+
+        A held arm that is led home was asked for by somebody else, whose lease counts instead.
+        """
+        if self._controls.homing is Homing.GOING:
+            return self._lock_step or self._controls.home_lease_ok()
         return not self.cut and (self._lock_step or self._controls.lease_ok(now_ns))

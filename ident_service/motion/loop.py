@@ -20,9 +20,9 @@ import numpy as np
 from drivers.arm import Arm, Flags, Sample, Vector
 from ident_service.config.limits import MotionLimits
 from ident_service.errors import ArmFault, DriverError
-from ident_service.motion.after_stop import AfterStop
+from ident_service.motion.after_stop import HOME_AFTER, AfterStop
 from ident_service.motion.control import ComputedTorque
-from ident_service.motion.controls import Controls
+from ident_service.motion.controls import Controls, Homing
 from ident_service.motion.course import Course
 from ident_service.motion.deadlines import Deadlines
 from ident_service.motion.faults import FAULTS, LOWER, LOWER_AFTER, SETTLE, Fault, Reaction, Severity
@@ -39,6 +39,7 @@ REST_SPEED: Final = 0.05  # of the velocity limit, below which a joint counts as
 REST_CYCLES: Final = 20  # of rest in a row
 HOLD_SPEED: Final = 0.25  # of the velocity limit, above which an arm that is held has come loose
 WAITS: Final = "held until a person confirms, by `ident supported`, that the arm is supported or home"
+LEADS: Final = "led home, slowly, by a person's word; held again at its end"
 LOWERS: Final = "lowered under damped control until it rests"
 
 
@@ -86,7 +87,7 @@ class Loop:
         self._since_ns = 0  # of the hold or the lowering
         self._lowering: Lowering | None = None
         self._anchor: Anchor | None = None  # of an arm that is held for as long as it takes
-        self._waiting = False  # for a person's word
+        self._waiting = self._leading = False  # for a person's word; for a way home
         self._recorded = False  # all that is recorded of the run
         self._told: set[str] = set()
         self._rest_speed = REST_SPEED * self.limits.velocity
@@ -129,6 +130,7 @@ class Loop:
             self.control.correction,
             self.control.answer,
             self.deadlines.elapsed,
+            self.control.feedforward,
         )
         torque, torque_fault = self.guard.torque(self._law(sample, usable, reference, free))
         compute_ns = self.arm.clock.now_ns() - woken_ns
@@ -170,7 +172,8 @@ class Loop:
         self._level = fault.reaction
         if fault.reaction >= Reaction.QUICK_STOP:
             raise self._end(fault)
-        self.ended_by = fault
+        if self.ended_by is None or not self.course.led:  # on the way home the first one stays the reason
+            self.ended_by = fault
         self.latch.set(fault.code, fault.message, stamp_ns)
         self.course.stop(stamp_ns)
         self.tell(fault.severity, stamp_ns, f"{fault.code}: {fault.message}")
@@ -179,7 +182,6 @@ class Loop:
             self._lower(stamp_ns, LOWER_AFTER)
 
     def _lower(self, stamp_ns: int, after: float = 0.0) -> None:
-        """Begin to lower the arm."""
         self._lowering, self._since_ns = Lowering(self.limits, stamp_ns, after), stamp_ns
 
     def _rests(self, stamp_ns: int) -> bool:
@@ -200,7 +202,7 @@ class Loop:
         overdue = self.course.overdue(stamp_ns)
         if overdue >= 0.0 and (np.abs(self.control.velocity) <= self._rest_speed).all():
             self._rested += 1
-            self._needed = self._needed + self.control.correction
+            self._needed = self._needed + self.control.correction + self.control.feedforward
         else:
             self._forget_rest()
         if self._rested >= REST_CYCLES:
@@ -226,12 +228,43 @@ class Loop:
             return False
         if not self._waiting:
             self._waiting, self._anchor = True, Anchor(self.limits, self.control.position)
+            if self._asked_controls(lambda: self.controls.homing is Homing.GOING, stamp_ns):
+                self._tell_homing(Homing.ENDED, stamp_ns)
             self._asked_controls(self.controls.wait_for_support, stamp_ns)
             self.tell(Severity.WARNING, stamp_ns, WAITS)
         elif self._asked_controls(lambda: self.controls.supported, stamp_ns):
             self.tell(Severity.WARNING, stamp_ns, LOWERS)
             self._lower(stamp_ns)
+        elif self._asked_controls(lambda: self.controls.homing is Homing.ASKED, stamp_ns):
+            self._lead_home(stamp_ns)
         return False
+
+    def _lead_home(self, stamp_ns: int) -> None:
+        """Look for the way home of a held arm, a slice in each cycle, and take it."""
+        refusal = None
+        if self.ended_by is not None and self.ended_by.code not in HOME_AFTER:
+            refusal = f"it was stopped by {self.ended_by.code}; support it, and confirm that"
+        elif not self._leading:
+            # From where the stop has left the reference, unless the arm was led away by hand: the torque has no step.
+            wanted, here = self.course.reference.position, self.control.position
+            near = (np.abs(wanted - here) <= 0.5 * self.limits.following_error).all()
+            self.course.lead_home(wanted if near else here)
+            self._leading = True
+        else:
+            refusal = self.course.look_for_way_back()
+        if refusal is not None:
+            self._leading = False
+            self.tell(Severity.WARNING, stamp_ns, f"not led home: {refusal}")
+            self._tell_homing(Homing.REFUSED, stamp_ns)
+        elif self.course.leads_home(stamp_ns):
+            self._leading = self._waiting = False
+            self._anchor, self._level = None, Reaction.WARN
+            self._forget_rest()
+            self.tell(Severity.WARNING, stamp_ns, LEADS)
+            self._tell_homing(Homing.GOING, stamp_ns)
+
+    def _tell_homing(self, stage: Homing, stamp_ns: int) -> None:
+        self._asked_controls(lambda: self.controls.tell_homing(stage), stamp_ns)
 
     def _asked_controls(self, ask: Callable[[], object], stamp_ns: int) -> bool:
         """Ask the controls about a held arm, which must not fall because they fail."""

@@ -1,16 +1,19 @@
 """How far joints whose positions stand still to the last bit would have moved if nothing but dry friction held them.
 
 Behind a light joint a small torque makes a large speed before a push that is large for the drive is reached, so what is
-asked is not how hard a joint is pushed but what the push must have done. Dry friction f holds a joint that stands still
-within `[-f, f]`, so the correction (`control.py`) can change by `2 f` from the `c_0` with which the position last
-changed before the joint must move; one that was sliding is held by `f` already, and a change that pushes it on in its
-direction moves it, but for what friction is larger at rest. With the allowance b of the one case or the other
+asked is not how hard a joint is pushed but what the push must have done. The push c is the correction and the friction
+fed forward (`control.py`). Dry friction f holds a joint that stands still within `[-f, f]`, so the push can change by
+`2 f` from the `c_0` with which the position last changed before the joint must move; one that was sliding is held by
+`f` already, and a change that pushes it on in its direction moves it, but for what friction is larger at rest. With the
+allowance b of the one case or the other
 
-    dv = max(|c - c_0| - b, 0) / M_jj(q) dt          dd = v dt
+    dv = max(|c - c_0| - b, 0) / m_jj(q) dt          dd = v dt
 
-Of the change only as much counts as is also the joint's own, `M_jj (a - a_0)_j` with a the acceleration that its own
-errors ask for: the rest balances what other joints' corrections do to it. A joint that owes more than a way `d` which
-it could hide in its encoder's steps is not where its encoder says. A jammed joint looks the same, and so does one
+with m the inertia of the prior alone: the drive inertia that the description states would have a joint owe more slowly,
+and behind a light one too slowly. Of the change only as much counts as is also the joint's own, what is fed forward and
+`M_jj (a - a_0)_j` with M the control law's inertia and a the acceleration that its own errors ask for: the rest
+balances what other joints' corrections do to it. A joint that owes more than a way `d` which it could hide in its
+encoder's steps is not where its encoder says. A jammed joint looks the same, and so does one
 whose dry friction is far larger than the configuration says.
 
 Boundary: one observer of all joints; what follows is `guard.py`'s.
@@ -22,8 +25,8 @@ import numpy as np
 
 from drivers.arm import Counts, Flags, Vector
 from ident_service.config.limits import MotionLimits
-from ident_service.excitation.following import expected_friction
 from ident_service.model.arm_model import ArmModel
+from ident_service.model.expected_friction import expected_friction
 from ident_service.model.rigid_body import InverseDynamics
 
 # Times the friction expected, which is a guess: how far the correction may change against a joint that stands, and on
@@ -37,29 +40,44 @@ class Owed:
     """The ways that joints owe."""
 
     def __init__(
-        self, dynamics: InverseDynamics, limits: MotionLimits, period: float, friction: Vector, resolution: Vector
+        self,
+        dynamics: InverseDynamics,
+        limits: MotionLimits,
+        period: float,
+        friction: Vector,
+        resolution: Vector,
+        least: InverseDynamics | None = None,
     ) -> None:
         """Begin with nothing owed.
 
         Args:
-            dynamics: the prior model.
+            dynamics: the control law's model.
             limits: of the arm.
             period: of the loop [s].
             friction: dry friction expected of each joint [N m or N], shape (joints,).
             resolution: smallest step of the positions [rad or m], shape (joints,).
+            least: the prior model; the control law's when None.
         """
-        self._dynamics, self._period = dynamics, period
+        self._dynamics, self._least, self._period = dynamics, least or dynamics, period
         self._standing, self._sliding = STANDING * friction, SLIDING * friction
         self._hidden = OWED * limits.following_error + STEPS * resolution
         self._speed, self._way = np.zeros_like(friction), np.zeros_like(friction)
         self._base, self._base_answer = np.zeros_like(friction), np.zeros_like(friction)
+        self._base_fed = np.zeros_like(friction)
         self._none: Flags = np.zeros(len(friction), dtype=bool)
         self._direction, self._slid = np.zeros_like(friction), np.zeros_like(friction)
         self._cycle = 0
         self._stepped: Counts = np.zeros(len(friction), dtype=np.int64)
         self._owing = False
 
-    def update(self, direction: Vector, correction: Vector, answer: Vector, position: Vector) -> Flags:
+    def update(
+        self,
+        direction: Vector,
+        correction: Vector,
+        answer: Vector,
+        position: Vector,
+        feedforward: Vector | float = 0.0,
+    ) -> Flags:
         """One cycle.
 
         Args:
@@ -69,32 +87,36 @@ class Owed:
                 asked for, of which nothing follows.
             answer: the acceleration in it [rad/s^2 or m/s^2], shape (joints,).
             position: last known [rad or m], shape (joints,).
+            feedforward: friction in the torque [N m or N], shape (joints,).
 
         Returns:
             Which joints owe more than can be hidden, shape (joints,).
         """
         self._cycle += 1
+        pushed = correction + feedforward
         changed = direction != 0.0
         if changed.any():
             slides = (direction == self._direction) & (self._cycle - self._stepped <= SLID)
             np.copyto(self._slid, direction * slides, where=changed)
             np.copyto(self._direction, direction, where=changed)
             np.copyto(self._stepped, self._cycle, where=changed)
-            np.copyto(self._base, correction, where=changed)
+            np.copyto(self._base, pushed, where=changed)
             np.copyto(self._base_answer, answer, where=changed)
-        change = correction - self._base
+            np.copyto(self._base_fed, feedforward, where=changed)
+        change = pushed - self._base
         allowed = np.where(change * self._slid > 0.0, self._sliding, self._standing)
         if not (np.abs(change) > allowed).any():
             self._forgive()
             return self._none
         if not correction.any():
             self._base, self._base_answer = correction.copy(), answer.copy()
+            self._base_fed = np.zeros_like(correction)
             self._forgive()
             return self._none
         inertia = np.diag(self._dynamics.mass_matrix(position))
-        own = np.sign(change) * inertia * (answer - self._base_answer)
+        own = np.sign(change) * (inertia * (answer - self._base_answer) + feedforward - self._base_fed)
         push = np.minimum(np.abs(change), own) - allowed
-        acting, gained = push > 0.0, push / inertia * self._period
+        acting, gained = push > 0.0, push / np.diag(self._least.mass_matrix(position)) * self._period
         self._speed = np.where(acting, self._speed + gained, 0.0)
         self._way = np.where(acting, self._way + self._speed * self._period, 0.0)
         self._owing = True
@@ -111,4 +133,5 @@ def owed_ways(
     """The observer of an arm: dry friction is the prior's, but never less than the configuration's guess."""
     guess = model.config.design.friction_guess
     expected = expected_friction(model, limits, guess).coulomb
-    return Owed(dynamics, limits, period, np.maximum(expected, guess[0] * limits.torque), resolution)
+    least = None if model.prior is None else InverseDynamics(model.chain, model.layout, model.prior)
+    return Owed(dynamics, limits, period, np.maximum(expected, guess[0] * limits.torque), resolution, least)

@@ -16,8 +16,9 @@ from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector
 from ident_service.config.limits import MotionLimits, motion_limits
 from ident_service.errors import ArmFault, DriverError, MotionRefused
 from ident_service.excitation.excitation import Excitation
-from ident_service.model.arm_model import ArmModel
+from ident_service.model.arm_model import ArmModel, control_model
 from ident_service.model.contact import Contact
+from ident_service.model.expected_friction import friction_feedforward
 from ident_service.model.rigid_body import InverseDynamics
 from ident_service.motion.after_stop import after_stop
 from ident_service.motion.attended import attended
@@ -183,8 +184,8 @@ class _Run:
     def _prepared(self) -> tuple[Loop, Vector]:
         """Everything checked and put together, and the torque that holds the arm where it stands."""
         model, chain, arm = self.model, self.model.chain, self.arm
-        limits = motion_limits(model.config)
-        if model.prior is None:
+        limits, prior = motion_limits(model.config), control_model(model).prior
+        if prior is None:
             raise MotionRefused(f"{model.config.name}: computed torque needs prior parameters")
         self.after_stop = after_stop(model, limits)
         described = arm.describe()
@@ -198,7 +199,7 @@ class _Run:
         period = 1.0 / described.rate
         sample = self._look(limits, period)
         with attended(arm):
-            dynamics = InverseDynamics(chain, model.layout, model.prior)
+            dynamics = InverseDynamics(chain, model.layout, prior)
             loop, torque = self._planned(dynamics, sample, limits, described)
         self._loop = loop
         self._stamp_ns = sample.stamp_ns
@@ -223,7 +224,8 @@ class _Run:
             owed=owed,
             max_age=described.lost_cycles,
         )
-        control = ComputedTorque(dynamics, limits, period, model.config.control.velocity_cutoff, home)
+        friction = friction_feedforward(model, limits)
+        control = ComputedTorque(dynamics, limits, period, model.config.control.velocity_cutoff, home, friction)
         torque, cannot_hold = guard.torque(control.torque(home, sample.valid, rest(home)))
         if cannot_hold is not None:
             raise MotionRefused(f"the arm cannot be held where it stands: {cannot_hold.message}")

@@ -31,8 +31,9 @@ MOVING = (State.APPROACHING, State.EXCITING, State.RETURNING)
 STOPPABLE = (State.ARMED, *MOVING, State.PAUSING, State.PAUSED, State.RESUMING)
 
 # Stopping and faulting are lawful from every state that is energised. A way that ends where nothing supports the arm
-# ends as a stop does, held at rest, and is done after that. Out of a pause a run that is finished early returns. Out of
-# the ends leads only the way to the next run, out of a fault only when nothing is latched any more.
+# ends as a stop does, held at rest, and is done after that. Out of a pause a run that is finished early returns, and
+# out of a stop an arm that is held and led home. Out of the ends leads only the way to the next run, out of a fault
+# only when nothing is latched any more.
 LAWFUL: dict[State, tuple[State, ...]] = {
     State.IDLE: (State.CHECKED, State.FAULTED),
     State.CHECKED: (State.ARMED, State.IDLE, State.FAULTED),
@@ -45,7 +46,7 @@ LAWFUL: dict[State, tuple[State, ...]] = {
     State.RESUMING: (*MOVING, State.PAUSING, State.STOPPING, State.FAULTED),
     State.STOPPING: (State.STOPPED, State.FAULTED),
     State.DONE: (State.IDLE, State.FAULTED),
-    State.STOPPED: (State.DONE, State.IDLE, State.FAULTED),
+    State.STOPPED: (State.RETURNING, State.DONE, State.IDLE, State.FAULTED),
     State.FAULTED: (State.IDLE,),
 }
 

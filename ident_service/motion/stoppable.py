@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector
+from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector, Watchdog
+from drivers.status import AxisStatus
 from ident_service.errors import DriverError
 
 
@@ -42,6 +43,18 @@ class StoppableArm(Arm):
         if torque is not None:
             self._require_not_asked()
         return self._arm.exchange(torque)
+
+    def watchdogs(self) -> tuple[Watchdog, ...]:
+        """As the arm says."""
+        return self._arm.watchdogs()
+
+    def withhold(self, kind: str) -> None:
+        """As the arm does."""
+        self._arm.withhold(kind)
+
+    def drive_status(self) -> tuple[AxisStatus, ...]:
+        """As the arm says."""
+        return self._arm.drive_status()
 
     def stop(self, kind: StopKind) -> None:
         """As the arm does."""

@@ -19,13 +19,13 @@ from ident_service.excitation.basis import Basis, FourierBasis, PostureBasis
 from ident_service.excitation.clearance import certified_clearance
 from ident_service.excitation.demands import demands
 from ident_service.excitation.design import Designed
-from ident_service.excitation.following import ExpectedFriction
 from ident_service.excitation.proof import objections
 from ident_service.excitation.search import Budget
 from ident_service.excitation.task import Task
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base import base_parameters
 from ident_service.model.collision import CollisionModel
+from ident_service.model.expected_friction import ExpectedFriction
 from ident_service.model.layout import Layout
 
 Array = np.ndarray
@@ -72,7 +72,7 @@ def random_task(seed: int, joints: int, kind: Any, basis: Basis, *, branches: bo
         chosen=np.sort(rng.choice(len(columns), size=3, replace=False)) if seed % 2 else None,
         scale=rng.uniform(0.1, 1.0, size=len(columns)) if seed % 3 else None,
         noise=rng.uniform(0.1, 1.0, size=joints),
-        friction=ExpectedFriction(*rng.uniform(0.2, 2.0, size=(2, joints))),
+        friction=ExpectedFriction(*rng.uniform(0.2, 2.0, size=(2, joints)), np.zeros(joints)),
         rate=100.0,
         added=0.1 * factor @ factor.T,
     )

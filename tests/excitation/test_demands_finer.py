@@ -21,7 +21,7 @@ from ident_service.excitation.design import per_period
 from ident_service.excitation.enclosure import stretches
 from ident_service.excitation.path import FourierPath, PosturePath
 from ident_service.excitation.plan import excitation
-from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.model.arm_model import ArmModel, arm_model, control_model
 from ident_service.model.layout import Layout
 from ident_service.model.regressor import joint_regressor
 
@@ -77,9 +77,10 @@ def fine_samples(path: FourierPath | PosturePath, finer: int) -> Iterator[Array]
 def sampled(path: FourierPath | PosturePath, model: ArmModel, finer: int) -> dict[str, Array]:
     """The largest that is found of everything, by the names of `Demands`."""
     found: dict[str, Array] = {}
+    delta = control_model(model).prior
     for time in fine_samples(path, finer):
         q, dq, ddq, jerk = path.at(time)
-        torque = np.einsum("jps,p->sj", joint_regressor(model.chain, model.layout, q, dq, ddq), model.prior)
+        torque = np.einsum("jps,p->sj", joint_regressor(model.chain, model.layout, q, dq, ddq), delta)
         values = {"highest": q.max(axis=0), "lowest": q.min(axis=0)}
         sizes = {"velocity": dq, "acceleration": ddq, "jerk": jerk, "torque": torque}
         values |= {name: np.abs(size).max(axis=0) for name, size in sizes.items()}

@@ -45,8 +45,8 @@ def test_a_small_arm_runs_its_designed_motion(name: str, tmp_path: Path) -> None
     assert_runs(arm, motion, tmp_path)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("starts", [1, pytest.param(4, marks=pytest.mark.campaign)])
+@pytest.mark.campaign
+@pytest.mark.parametrize("starts", [1, 4])
 def test_the_wam_runs_its_designed_motion(starts: int, tmp_path: Path) -> None:
     arm = load_arm("wam7_sim")
     design = arm.design.model_copy(update={"harmonics": 2, "base_frequency": 0.2, "periods": 1})

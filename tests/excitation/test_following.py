@@ -11,10 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ident_service.config.limits import motion_limits
-from ident_service.excitation.following import ExpectedFriction, expected_friction, forecast, rate_of_change
+from ident_service.excitation.following import forecast, rate_of_change
+from ident_service.model.expected_friction import ExpectedFriction, expected_friction
 from ident_service.model.regressor import joint_regressor
 
 Array = np.ndarray
+
+
+UNKNOWN = 0.6  # of the friction expected: what 1.4 times as much has beyond the 0.8 that the law feeds forward
 
 
 @settings(max_examples=20)
@@ -33,7 +37,7 @@ def test_the_forecast_is_friction_through_the_mass_matrix_and_the_gains(seed: in
     M = np.einsum("jps,p->js", rows, model.prior) - offset[:, None]
     rate = model.chain.coupling @ dq
     torque = model.chain.coupling.T @ (task.friction.coulomb * np.sign(rate) + task.friction.viscous * rate)
-    expected = np.abs(np.linalg.solve(M, torque) / task.limits.kp)
+    expected = UNKNOWN * np.abs(np.linalg.solve(M, torque) / task.limits.kp)
     found = forecast(model, task.limits, task.friction, q[None], dq[None])
     np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-10)
 
@@ -49,9 +53,9 @@ def test_the_mass_matrix_above_is_pinocchio_s() -> None:
     q = np.array([0.3, -0.4, 0.5])
     M = pin.crba(reference, reference.createData(), q)
     M = np.triu(M) + np.triu(M, 1).T + np.diag(model.layout.term_values("drive_inertia", model.prior))
-    friction = ExpectedFriction(np.array([1.0, 2.0, 3.0]), np.zeros(3))
+    friction = ExpectedFriction(np.array([1.0, 2.0, 3.0]), np.zeros(3), np.zeros(3))
     found = forecast(model, task.limits, friction, q[None], np.ones((1, 3)))
-    expected = np.abs(np.linalg.solve(M, friction.coulomb)) / task.limits.kp
+    expected = UNKNOWN * np.abs(np.linalg.solve(M, friction.coulomb)) / task.limits.kp
     np.testing.assert_allclose(found, expected, rtol=1e-8)
 
 

@@ -29,7 +29,7 @@ def recorded(model: ArmModel, purpose: str, path: Path) -> RunReport:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["planar2", "threelink"])
+@pytest.mark.parametrize("name", [pytest.param("planar2", marks=pytest.mark.campaign), "threelink"])
 def test_a_small_arm_moves_and_is_identified(name: str, tmp_path: Path) -> None:
     # At a quarter of the rate the same motion costs a quarter.
     config = load_arm(name)

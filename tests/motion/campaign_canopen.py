@@ -176,6 +176,11 @@ def wam_canopen_config(buses: int = 1) -> ArmConfig:
     return wam_config("wam7_canopen", driver=driver)
 
 
+def of_joint(kind: str) -> bool:
+    """Tell if a fault may be one drive's."""
+    return kind not in WIRE and PUCK_FAULTS[kind].of_joint
+
+
 @cache
 def canopen_subject(name: str) -> Subject:
     """`bench canopen`, `loose canopen`, which has no brakes, `wam canopen`, or `wam two buses`."""
@@ -195,6 +200,6 @@ def canopen_subject(name: str) -> Subject:
         pause,
         lambda strike, observer: EmulatedArm(config, strike, observer),
         CANOPEN_PROMISES,
-        lambda kind: kind not in WIRE and PUCK_FAULTS[kind].of_joint,
+        of_joint,
         step,
     )

@@ -115,7 +115,7 @@ def plant_stays_within_limits(which: Subject, outcome: Outcome) -> None:
     torque = np.abs([moment.torque for moment in truth])
     assert (torque <= limits.torque * (1 + 1e-9) + which.torque_step).all()
     speed, acceleration = (np.abs([getattr(moment, name) for moment in truth]) for name in ("velocity", "acceleration"))
-    unseen = 1.0 / (2.0 * np.pi * which.config.control.velocity_cutoff) + 2.0 * PERIOD
+    unseen = 1.0 / (2.0 * np.pi * np.asarray(which.config.control.velocity_cutoff)) + 2.0 * PERIOD
     gained = acceleration[-20:].max(axis=0) * unseen
     assert (speed <= VELOCITY_OFF * limits.velocity + gained).all()
 

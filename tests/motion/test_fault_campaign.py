@@ -14,11 +14,11 @@ from typing import Any
 
 import pytest
 from branches import outcomes
-from campaign_bench import PROMISES, Case, Outcome, subject
+from campaign_bench import PROMISES, STOPPED, Case, Outcome, subject
 from campaign_checks import keep_their_promises, keeps_its_promise, together
 
 from ident_service.config.simulation import FAULT_RULES
-from ident_service.motion.faults import FAULTS
+from ident_service.motion.faults import FAULTS, Reaction
 from ident_service.motion.states import State
 from sim_backend.faults import Fault, FaultKind
 
@@ -52,15 +52,21 @@ def slow_freezes(arm: str, times: int) -> Iterator[Case]:
 
 
 def sample() -> list[Case]:
-    """A few of each kind on the small arm, a few of all on the large one."""
+    """A few of each kind on the small arm, a few on the large one of those that do not end in a minute of sinking."""
     rng = random.Random(SEED)  # noqa: S311 - not for secrets
-    small, large = list(cases("bench", 3, 2)), list(cases("wam", 2, 2))
+    small, large = list(cases("bench", 3, 2)), [case for case in cases("wam", 2, 2) if not sinks(case)]
     chosen = [
         case for kind in FaultKind for case in rng.sample([case for case in small if case.kind == kind.value], 2)
     ]  # fmt: skip
-    chosen += rng.sample([case for case in large if case.state in (State.EXCITING, State.STOPPING)], 5)
+    chosen += rng.sample([case for case in large if case.state is State.EXCITING], 5)
     resuming = [case for case in slow_freezes("bench", 1) if case.state is State.RESUMING]
     return chosen + resuming
+
+
+def sinks(case: Case) -> bool:
+    """Tell if an arm without brakes may be lowered in the end, which is simulated until it rests."""
+    codes = PROMISES[FaultKind(case.kind)].codes
+    return case.state in STOPPED or any(FAULTS[code].reaction < Reaction.QUICK_STOP for code in codes)
 
 
 def test_every_kind_of_fault_has_its_promise() -> None:

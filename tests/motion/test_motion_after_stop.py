@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,13 +13,15 @@ from motion_bench import JOINTS, LOOKED, Story, WatchedArm, bench_config
 from drivers.arm import StopKind
 from ident_service.config.limits import motion_limits
 from ident_service.config.load import load_arm
-from ident_service.errors import ArmFault, MotionRefused
+from ident_service.errors import ArmFault, MotionRefused, UsageError
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.after_stop import AfterStop, after_stop, falling_joints
-from ident_service.motion.controls import Switches
+from ident_service.motion.control_file import ControlFile
+from ident_service.motion.controls import Homing, Switches
 from ident_service.motion.latch import Latch
-from ident_service.motion.loop import LOWERS, WAITS
+from ident_service.motion.lifeline import Lifeline
+from ident_service.motion.loop import LEADS, LOWERS, WAITS
 from ident_service.motion.lowering import SPEED, lowest_point
 from ident_service.motion.plans import Destination, GoTo
 from ident_service.motion.run import RunReport, follow, run
@@ -148,6 +152,7 @@ def held() -> Rig:
     return rig
 
 
+@pytest.mark.slow
 def test_a_held_arm_stands_until_a_person_confirms(held: Rig) -> None:
     waits, lowers = held.told(WAITS), held.told(LOWERS)
     assert lowers - waits >= 10_000
@@ -157,6 +162,7 @@ def test_a_held_arm_stands_until_a_person_confirms(held: Rig) -> None:
     assert held.story.states[-2:] == ["stopping", "stopped"]
 
 
+@pytest.mark.slow
 def test_what_is_let_go_of_sinks_slowly_and_needs_no_torque_at_the_end(held: Rig) -> None:
     lowers = held.told(LOWERS)
     speed = np.abs(held.column("velocity", lowers, -1))
@@ -166,12 +172,14 @@ def test_what_is_let_go_of_sinks_slowly_and_needs_no_torque_at_the_end(held: Rig
     assert (held.moves_when_left() < 0.02).all()
 
 
+@pytest.mark.slow
 def test_a_long_hold_is_not_recorded(held: Rig) -> None:
     stamps = held.story.column("stamp_ns") * 1e-9 / PERIOD
     assert stamps[-1] <= held.told(WAITS) + HOLD / PERIOD + 2
     assert (np.diff(stamps) < 1.5).all()
 
 
+@pytest.mark.slow
 def test_a_word_that_was_given_too_early_does_not_count() -> None:
     rig = Rig(loose("hold"))
     rig.arm.open()
@@ -191,6 +199,7 @@ def test_a_word_that_was_given_too_early_does_not_count() -> None:
     assert rig.told(LOWERS) - rig.told(WAITS) >= 498
 
 
+@pytest.mark.slow
 def test_an_arm_is_lowered_without_a_word_where_its_description_says_so() -> None:
     rig = Rig(loose("lower"))
     assert rig.run().state is State.STOPPED
@@ -218,6 +227,7 @@ def test_the_height_of_the_lowest_point_is_that_of_bodies_or_frames() -> None:
     assert thick(np.array([-np.pi / 2, 0.0])) == pytest.approx(-1.13)
 
 
+@pytest.mark.slow
 def test_a_joint_at_the_end_of_its_range_rests_there() -> None:
     """Hanging straight down is outside the limits of both joints of this arm."""
     joints = {"shoulder": LOOSE["shoulder"] | {"position": (-0.6, 1.8)}, "elbow": LOOSE["elbow"]}
@@ -240,6 +250,7 @@ def test_drives_and_their_own_reaction_come_before_any_holding(kind: FaultKind, 
     assert rig.story.states[-1] == "faulted"
 
 
+@pytest.mark.slow
 def test_a_controlled_stop_after_a_fault_is_held_too() -> None:
     rig = Rig(loose("hold"), Fault(STOP, FaultKind.LATE_CYCLE, None, 50, 0.4e-3))
     with pytest.raises(ArmFault, match="late_cycles"):
@@ -260,6 +271,7 @@ def test_an_arm_that_does_not_follow_is_lowered_until_it_rests(after: str) -> No
     assert (rig.moves_when_left() < 0.05).all()
 
 
+@pytest.mark.slow
 def test_a_way_home_ends_held() -> None:
     rig = Rig(loose("hold"))
     rig.arm.open()
@@ -269,6 +281,109 @@ def test_a_way_home_ends_held() -> None:
     assert rig.told(LOWERS) - rig.told(WAITS) >= 1000
 
 
+class Leader(Person):
+    """Has the held arm led home some cycles after it began to wait, and confirms when it waits again."""
+
+    def __init__(self, arm: WatchedArm, *, stop_again: int | None = None, lease_lost: bool = False) -> None:
+        super().__init__(arm)
+        self.stages: list[Homing] = []
+        self._went: int | None = None
+        self._stop_again, self._lease_lost = stop_again, lease_lost
+
+    def lease_ok(self, now_ns: int) -> bool:
+        cycle = self._arm.cycle
+        if cycle == STOP:
+            self.stop = not self._lease_lost
+            return not self._lease_lost
+        if self.homing is Homing.NONE and cycle > self._since + 200:
+            self.homing = Homing.ASKED
+        if self._went is not None and self._stop_again is not None and cycle == self._went + self._stop_again:
+            self.stop = True
+        if self.stages and self.stages[-1] is not Homing.GOING and cycle > self._since + 200:
+            self.supported = True
+        return True
+
+    def tell_homing(self, stage: Homing) -> None:
+        super().tell_homing(stage)
+        self.stages.append(stage)
+        if stage is Homing.GOING:
+            self._went = self._arm.cycle
+
+
+def led(rig: Rig, **leader: Any) -> Leader:
+    rig.arm.open()
+    controls = Leader(rig.arm, **leader)
+    motion = excitation(rig.model, "identification")
+    run(rig.arm, rig.model, motion, rig.story, controls, latch=rig.latch, hold_seconds=HOLD)
+    return controls
+
+
+def test_a_held_arm_is_led_home_and_held_there() -> None:
+    rig = Rig(loose("hold"))
+    assert led(rig).stages == [Homing.GOING, Homing.ENDED]
+    begin, lowers = rig.told(LEADS), rig.told(LOWERS)
+    speed = np.abs(rig.column("velocity", begin, lowers))
+    assert (speed.max(axis=0) < 0.15 * rig.limits.velocity).all()
+    at_end = rig.column("position", lowers - 100, lowers)
+    assert (np.abs(at_end - rig.limits.home) < 0.02).all(), at_end[-1]
+    assert (np.abs(np.diff(rig.arm.torques[begin - 50 : begin + 50], axis=0)) < 0.02 * rig.limits.torque).all()
+    assert rig.story.states[-5:] == ["stopping", "stopped", "returning", "stopping", "stopped"]
+    assert rig.arm.stops == [StopKind.TORQUE_OFF]
+
+
+def test_the_way_home_of_a_held_arm_can_be_stopped_and_is_held_again() -> None:
+    rig = Rig(loose("hold"))
+    assert led(rig, stop_again=300).stages == [Homing.GOING, Homing.ENDED]
+    assert (np.abs(rig.column("position", rig.told(LOWERS) - 10, rig.told(LOWERS)) - rig.limits.home) > 0.025).any()
+    assert rig.arm.stops == [StopKind.TORQUE_OFF]
+
+
+def test_an_arm_that_was_stopped_for_a_lost_lease_is_led_home_and_the_fault_stays() -> None:
+    rig = Rig(loose("hold"))
+    with pytest.raises(ArmFault, match="lease_lost"):
+        led(rig, lease_lost=True)
+    assert rig.told(LEADS)
+    assert [fault.code for fault in rig.latch.faults] == ["lease_lost"]
+
+
+def test_an_arm_with_a_fault_of_its_own_is_not_led_home() -> None:
+    rig = Rig(loose("hold"), *(Fault(STOP - 200 + 3 * k, FaultKind.LOST_FEEDBACK, 1) for k in range(40)))
+    with pytest.raises(ArmFault, match="repeated_warnings"):
+        led(rig)
+    assert LEADS not in [words for _, _, words in rig.story.events]
+    assert any(words.startswith("not led home: it was stopped by") for _, _, words in rig.story.events)
+
+
+def test_whoever_leads_an_arm_home_keeps_its_lease_and_takes_no_other_stop_back(tmp_path: Path) -> None:
+    """The run's own parent is gone; a stop of a third person counts."""
+    now = 10**9
+    ours, theirs = os.pipe()
+    with ControlFile.take(tmp_path / "controls", 0.5, lambda: now) as controls:
+        lifeline = Lifeline(controls, ours, lock_step=False)
+        person = ControlFile.reach(tmp_path / "controls", lambda: now)
+        with pytest.raises(UsageError, match="not held"):
+            person.ask_home()
+        os.close(theirs)
+        lifeline.wait_for_support()
+        controls.ask_stop()
+        now += 10**10
+        assert not lifeline.lease_ok(now)
+        person.ask_home()
+        assert (lifeline.homing, lifeline.stop) == (Homing.ASKED, False)
+        lifeline.tell_homing(Homing.GOING)
+        assert lifeline.lease_ok(now)
+        with pytest.raises(UsageError, match="nothing to confirm"):
+            person.confirm_support()
+        now += 3 * 10**9
+        assert not lifeline.lease_ok(now)
+        person.renew_home()
+        assert lifeline.lease_ok(now)
+        assert ControlFile.stop_all(tmp_path / "controls", lambda: now) is not None
+        assert lifeline.stop
+        person.close()
+    os.close(ours)
+
+
 def test_a_run_ends_where_it_was_supported() -> None:
     rig = Rig(loose("hold"))
     assert rig.run(stop=10**9).state is State.DONE
@@ -276,6 +391,7 @@ def test_a_run_ends_where_it_was_supported() -> None:
     assert (np.abs(rig.truth[-1].position - rig.truth[LOOKED].position) < 0.05).all()
 
 
+@pytest.mark.slow
 def test_controls_that_fail_do_not_let_a_held_arm_fall() -> None:
     rig = Rig(loose("hold"))
     rig.arm.open()

@@ -7,11 +7,15 @@ import pinocchio as pin
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from motion_bench import PRIOR, bench_limits, bench_model
+from motion_bench import PRIOR, bench_config, bench_limits, bench_model
 
+from drivers.arm import StopKind
+from ident_service.model.arm_model import control_model
+from ident_service.model.expected_friction import ExpectedFriction, FrictionFeedforward
 from ident_service.model.rigid_body import InverseDynamics
 from ident_service.motion.control import ComputedTorque
 from ident_service.motion.reference import Setpoint, rest
+from sim_backend.arm import from_config
 
 Array = np.ndarray
 LIMITS = bench_limits()
@@ -141,3 +145,62 @@ def test_what_the_caller_holds_is_not_written_into() -> None:
     start[:] = 9.0
     control.torque(np.array([0.1, 0.2]), ALL, rest(np.zeros(2)))
     np.testing.assert_allclose(control.velocity, 0.0, atol=1e-12)
+
+
+def friction(share: float = 0.8) -> FrictionFeedforward:
+    expected = ExpectedFriction(np.array([0.5, 0.2]), np.array([0.3, 0.1]), np.array([0.05, -0.02]))
+    return FrictionFeedforward(expected, share, MODEL.chain, LIMITS)
+
+
+@given(VECTORS, VECTORS, VECTORS, VECTORS)
+def test_friction_is_fed_forward_for_the_velocity_of_the_reference_alone(
+    q: Array, moved: Array, q_r: Array, dq_r: Array
+) -> None:
+    """So it closes no loop: whatever a noisy encoder shows, the part of the torque that is friction stays the same."""
+    reference = Setpoint(q_r, dq_r, np.zeros(2))
+    plain = controller(q).torque(q + 1e-3 * moved, ALL, reference)
+    control = ComputedTorque(DYNAMICS, LIMITS, PERIOD, 30.0, q, friction())
+    added = control.torque(q + 1e-3 * moved, ALL, reference) - plain
+    turned = np.tanh(dq_r / (0.02 * LIMITS.velocity))
+    expected = 0.8 * (np.array([0.5, 0.2]) * turned + np.array([0.3, 0.1]) * dq_r) + np.array([0.05, -0.02])
+    np.testing.assert_allclose(added, expected, atol=1e-9)
+    np.testing.assert_allclose(control.feedforward, expected, atol=1e-9)
+
+
+@given(st.floats(-3.0, 3.0), st.floats(-0.1, 0.1))
+def test_friction_fed_forward_has_no_step_where_the_reference_turns_round(speed: float, more: float) -> None:
+    slope = 0.8 * (np.array([0.5, 0.2]) / (0.02 * LIMITS.velocity) + np.array([0.3, 0.1]))
+    one, other = (friction().torque(np.full(2, value)) for value in (speed, speed + more))
+    assert (np.abs(other - one) <= slope * abs(more) + 1e-12).all()
+
+
+def test_an_arm_with_far_less_friction_than_expected_comes_to_rest_without_hunting() -> None:
+    """A limit cycle would keep the held arm moving; overcompensation ends with the reference's motion."""
+    arm = from_config(bench_config(driver={"kind": "simulated", "truth": PRIOR, "encoder_resolution": 1e-4}))
+    control = ComputedTorque(DYNAMICS, LIMITS, PERIOD, 30.0, LIMITS.home, friction(0.99))
+    seen = []
+    with arm:
+        first = arm.exchange(None).position.copy()
+        arm.enable()
+        torque = control.torque(first, ALL, rest(first))
+        for cycle in range(2000):
+            time = min(cycle * PERIOD, 1.0)
+            there = first + 0.1 * np.sin(2.0 * np.pi * time)
+            pace = np.full(2, 0.2 * np.pi * np.cos(2.0 * np.pi * time) * (time < 1.0))
+            sample = arm.exchange(torque)
+            seen.append(sample.position)
+            torque = control.torque(sample.position, ALL, Setpoint(there, pace, np.zeros(2)))
+        arm.stop(StopKind.TORQUE_OFF)
+    assert np.ptp(np.array(seen[-200:]), axis=0).max() <= 2e-4
+
+
+def test_stated_drive_inertia_is_in_the_computed_torque() -> None:
+    joints = {name: joint.model_dump() | {"drive_inertia": 0.3} for name, joint in bench_config().joints.items()}
+    model = control_model(bench_model(joints=joints))
+    assert model.prior is not None
+    stated = InverseDynamics(model.chain, model.layout, model.prior)
+    still, wanted = np.zeros(2), np.array([1.0, -2.0])
+    more = stated.torque(still, still, wanted) - DYNAMICS.torque(still, still, wanted)
+    np.testing.assert_allclose(more, (0.3 - np.array([0.02, 0.01])) * wanted, atol=1e-12)
+    less = {name: joint.model_dump() | {"drive_inertia": 0.001} for name, joint in bench_config().joints.items()}
+    np.testing.assert_array_equal(control_model(bench_model(joints=less)).prior, MODEL.prior)

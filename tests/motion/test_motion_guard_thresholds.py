@@ -180,9 +180,9 @@ def test_a_small_joint_may_go_from_no_torque_to_all_in_ten_milliseconds() -> Non
 class Heard(Owed):
     """An observer that keeps the directions it was told."""
 
-    def update(self, direction: Vector, correction: Vector, answer: Vector, position: Vector) -> Array:
+    def update(self, direction: Vector, *others: Vector) -> Array:
         self.directions = [*getattr(self, "directions", []), direction.tolist()]
-        return super().update(direction, correction, answer, position)
+        return super().update(direction, *others)
 
 
 def test_the_observer_of_owed_ways_is_told_which_way_each_position_went() -> None:

@@ -26,6 +26,7 @@ WAYS = {
     ("resuming", "pausing"),
     ("stopping", "stopped"),
     ("stopped", "done"),
+    ("stopped", "returning"),
     *product(MOVES, ("pausing",)),
     *product(("resuming",), MOVES),
     *product(("armed", *MOVES, "pausing", "paused", "resuming"), ("stopping",)),
@@ -57,9 +58,10 @@ def test_whatever_is_energised_can_stop_and_fault(state: State) -> None:
     assert {State.STOPPING, State.FAULTED} <= set(LAWFUL[state])
 
 
-def test_nothing_moves_on_from_a_stop() -> None:
+def test_nothing_moves_on_from_a_stop_but_a_held_arm_that_is_led_home() -> None:
     for state in (State.STOPPING, State.STOPPED, State.FAULTED, State.DONE):
-        assert not set(LAWFUL[state]) & {*MOVING, State.RESUMING, State.PAUSING, State.ARMED}
+        moves = {*MOVING, State.RESUMING, State.PAUSING, State.ARMED}
+        assert set(LAWFUL[state]) & moves == ({State.RETURNING} if state is State.STOPPED else set())
 
 
 def test_every_state_is_reached_and_left() -> None:

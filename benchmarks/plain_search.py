@@ -1,0 +1,115 @@
+"""A search written in an afternoon: random Fourier motions scaled into the limits, the best improved by Powell.
+
+Torques are pinocchio's, the optimiser is scipy's. The regressor is the traced one of this package, which is many times
+as fast as pinocchio's from Python. It keeps position, velocity, acceleration and torque at its samples, and knows
+neither jerk, clearance nor supply, nor whether the arm can follow. All of that is in its favour.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pinocchio as pin
+from scipy.optimize import minimize
+
+from ident_service.config.design import Design
+from ident_service.config.limits import MotionLimits
+from ident_service.excitation.fourier import FourierSeries
+from ident_service.excitation.path import FourierPath
+from ident_service.model.arm_model import ArmModel, control_model
+from ident_service.model.regressor import joint_regressor
+from ident_service.model.rigid_body import pinocchio_model
+
+_SAMPLES = 100
+_RANDOM_SHARE = 0.5  # of the time
+Array = np.ndarray
+
+
+class _OutOfTime(Exception):
+    pass
+
+
+class PlainSearch:
+    """One search for one arm."""
+
+    def __init__(self, model: ArmModel, design: Design, limits: MotionLimits, columns: Array, noise: Array) -> None:
+        """Take an arm.
+
+        Args:
+            model: with prior parameters and drives that move one joint each.
+            design: the family of motions.
+            limits: margins taken off.
+            columns: of delta, the base parameters.
+            noise: standard deviation of each joint's torque, shape (joints,).
+        """
+        self._model, self._design, self._limits = model, design, limits
+        prior = control_model(model).prior
+        if prior is None:
+            raise ValueError("an arm with a prior")
+        self._columns, self._noise = columns, noise
+        self._pin = pinocchio_model(model.chain, model.layout, prior)
+        self._data = self._pin.createData()
+        self._time = np.arange(_SAMPLES) / _SAMPLES / design.base_frequency
+
+    def run(self, criterion: str, seed: int, seconds: float) -> FourierPath:
+        """Search for the smallest condition number or the largest determinant."""
+        rng, end = np.random.default_rng(seed), time.monotonic() + seconds
+        best, motion = np.inf, None
+        size = self._model.chain.joints * (2 * self._design.harmonics + 1)
+
+        def value(x: Array) -> float:
+            nonlocal best, motion
+            if time.monotonic() > end:
+                raise _OutOfTime
+            path = self._scaled(x)
+            found = self._value(path, criterion)
+            if found < best:
+                best, motion = found, (x.copy(), path)
+            return found
+
+        try:
+            while time.monotonic() < end - (1.0 - _RANDOM_SHARE) * seconds:
+                value(rng.normal(size=size))
+            if motion is not None:
+                minimize(value, motion[0], method="Powell", options={"maxiter": 10**6})
+        except _OutOfTime:
+            pass
+        if motion is None:
+            raise RuntimeError("not one motion in the time given")
+        return motion[1]
+
+    def _scaled(self, x: Array) -> FourierPath:
+        """The motion of variables, scaled about its middle so that the most used limit is just kept."""
+        limits, n = self._limits, self._design.harmonics
+        X = x.reshape(len(limits.lower), 2 * n + 1)
+        half = 0.5 * (limits.upper - limits.lower)
+        middle = 0.5 * (limits.lower + limits.upper) + 0.5 * half * np.tanh(X[:, -1])
+        series = FourierSeries(self._design.base_frequency, X[:, :n].copy(), X[:, n : 2 * n].copy(), middle)
+        q, dq, ddq, _ = FourierPath(series, 1, 0.0).at(self._time)
+        room = np.minimum(limits.upper - middle, middle - limits.lower)
+        shares = [np.abs(q - middle) / room, np.abs(dq) / limits.velocity, np.abs(ddq) / limits.acceleration]
+        used = np.max(shares, axis=(0, 1))
+        factor = (0.98 / used)[:, None]
+        for _ in range(12):
+            series = FourierSeries(self._design.base_frequency, X[:, :n] * factor, X[:, n : 2 * n] * factor, middle)
+            path = FourierPath(series, self._design.periods, self._design.ramp)
+            q, dq, ddq, _ = FourierPath(series, 1, 0.0).at(self._time)
+            torque = np.array([pin.rnea(self._pin, self._data, *row) for row in zip(q, dq, ddq, strict=True)])
+            if (np.abs(torque) <= 0.98 * limits.torque).all():
+                return path
+            factor = 0.8 * factor
+        return path
+
+    def _value(self, path: FourierPath, criterion: str) -> float:
+        rows = self._rows(path)
+        if criterion == "condition_number":
+            return float(np.linalg.cond(rows.reshape(-1, rows.shape[-1])))
+        weighted = (rows / self._noise[:, None]).reshape(-1, rows.shape[-1])
+        return -float(np.linalg.slogdet(weighted.T @ weighted)[1])
+
+    def _rows(self, path: FourierPath) -> Array:
+        """The regressor's rows of the base parameters, shape (samples, joints, base)."""
+        q, dq, ddq, _ = FourierPath(path.series, 1, 0.0).at(self._time)
+        H = joint_regressor(self._model.chain, self._model.layout, q, dq, ddq, self._columns)
+        return np.transpose(H, (2, 0, 1))

@@ -1,0 +1,88 @@
+"""Friction as it is expected before it is identified, and the share of it that the control law feeds forward.
+
+Drives are expected to take `f(w) = F_c s(w) + F_v w + F_o` at their velocity w: the prior's friction, or a guess in
+shares of the torque limits. Where it is felt by joints, `C^T f(C dq)`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ident_service.config.limits import MotionLimits
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.chain import Array, Chain
+
+# Of the velocity limit: over so much of the reference's velocity the Coulomb part fed forward turns round. A sign would
+# step by twice the friction, and chatter where a reference stands.
+_TURNS = 0.02
+
+
+@dataclass(frozen=True)
+class ExpectedFriction:
+    """Friction of the drives.
+
+    Attributes:
+        coulomb: [N m or N], shape (joints,).
+        viscous: [N m s/rad or N s/m], shape (joints,).
+        offset: [N m or N], shape (joints,).
+    """
+
+    coulomb: Array
+    viscous: Array
+    offset: Array
+
+
+def expected_friction(model: ArmModel, limits: MotionLimits, guess: tuple[float, float]) -> ExpectedFriction:
+    """The prior's friction, or, of drives of which it has none, the guess.
+
+    Args:
+        model: of the arm.
+        limits: its full limits.
+        guess: Coulomb friction, and viscous friction at the velocity limit, in shares of the torque limit.
+    """
+    coulomb, viscous = guess[0] * limits.torque, guess[1] * limits.torque / limits.velocity
+    if model.prior is None:
+        return ExpectedFriction(coulomb, viscous, np.zeros_like(coulomb))
+    known = [model.layout.term_values(term, model.prior) for term in ("coulomb", "viscous", "offset")]
+    some = (known[0] > 0.0) | (known[1] > 0.0)
+    return ExpectedFriction(np.where(some, known[0], coulomb), np.where(some, known[1], viscous), known[2])
+
+
+class FrictionFeedforward:
+    """Friction that the control law adds for the velocity of the reference.
+
+    It depends on the reference alone, so that it closes no loop: it can neither chatter on the noise of a measured
+    velocity nor drive a limit cycle, and where the reference stands it is the drives' offset.
+
+    Attributes:
+        friction: expected of the drives.
+        share: of it that is added.
+    """
+
+    def __init__(self, friction: ExpectedFriction, share: float, chain: Chain, limits: MotionLimits) -> None:
+        """Take what is expected.
+
+        Args:
+            friction: of the drives.
+            share: of Coulomb and viscous friction to add; the offset is added whole.
+            chain: for which drives move which joints.
+            limits: for the velocity over which Coulomb friction turns round.
+        """
+        self.friction, self.share = friction, share
+        self._coupling = chain.coupling
+        self._turns = 1.0 / (_TURNS * np.abs(chain.coupling) @ limits.velocity)
+        self._coulomb, self._viscous = share * friction.coulomb, share * friction.viscous
+
+    def torque(self, velocity: Array) -> Array:
+        """Torque to add [N m or N] for a reference's velocity [rad/s or m/s], each of shape (..., joints)."""
+        rate = velocity @ self._coupling.T
+        felt = self._coulomb * np.tanh(self._turns * rate) + self._viscous * rate + self.friction.offset
+        return np.asarray(felt @ self._coupling)
+
+
+def friction_feedforward(model: ArmModel, limits: MotionLimits) -> FrictionFeedforward:
+    """Return the feed-forward of an arm's description."""
+    friction = expected_friction(model, limits, model.config.design.friction_guess)
+    return FrictionFeedforward(friction, model.config.control.friction_feedforward, model.chain, limits)
