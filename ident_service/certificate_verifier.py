@@ -492,17 +492,18 @@ def _symmetry(words: Mapping[str, str], entries: Entries, _: Sequence[int]) -> l
 _G = r"-?[0-9][0-9.e+-]{0,20}"
 _LINK = r"(?P<link>[1-9][0-9]{0,2})"
 Form = Callable[[Mapping[str, str], Entries, Sequence[int]], list[Affine] | None]
-_FORMS: tuple[tuple[re.Pattern[str], Form], ...] = (
-    (re.compile(rf"link {_LINK}: mass within (?P<lower>{_G})\.\.(?P<upper>{_G}) kg"), _mass),
-    (re.compile(rf"total mass at (?P<side>least|most) (?P<bound>{_G}) kg"), _total_mass),
-    (re.compile(rf"link {_LINK}: centre of mass inside its box"), _box),
-    (re.compile(rf"link {_LINK}: centre of mass inside its hull"), _hull),
-    (re.compile(rf"link {_LINK}: all mass inside its ellipsoid"), _ellipsoid),
-    (re.compile(rf"joint {_LINK}: (?P<term>{'|'.join(_POSITIVE)}) positive"), _sign),
-    (re.compile(rf"assumed: link {_LINK} below (?P<bound>{_G}) kg and (?P=bound) kg m\^2"), _assumed),
+# Compiled when a name is looked at: `re` keeps them, and most who load this file read no certificate.
+_FORMS: tuple[tuple[str, Form], ...] = (
+    (rf"link {_LINK}: mass within (?P<lower>{_G})\.\.(?P<upper>{_G}) kg", _mass),
+    (rf"total mass at (?P<side>least|most) (?P<bound>{_G}) kg", _total_mass),
+    (rf"link {_LINK}: centre of mass inside its box", _box),
+    (rf"link {_LINK}: centre of mass inside its hull", _hull),
+    (rf"link {_LINK}: all mass inside its ellipsoid", _ellipsoid),
+    (rf"joint {_LINK}: (?P<term>{'|'.join(_POSITIVE)}) positive", _sign),
+    (rf"assumed: link {_LINK} below (?P<bound>{_G}) kg and (?P=bound) kg m\^2", _assumed),
 )
-_EQUALITY_FORMS: tuple[tuple[re.Pattern[str], Form], ...] = (
-    (re.compile(rf"link {_LINK}: symmetric about its (?P<plane>xy|yz|xz) plane"), _symmetry),
+_EQUALITY_FORMS: tuple[tuple[str, Form], ...] = (
+    (rf"link {_LINK}: symmetric about its (?P<plane>xy|yz|xz) plane", _symmetry),
 )
 
 
@@ -511,14 +512,14 @@ def is_assumed(name: str) -> bool:
     return name.startswith("assumed: ")
 
 
-def _require_form(block: ExactBlock, forms: Sequence[tuple[re.Pattern[str], Form]], links: Sequence[int]) -> None:
+def _require_form(block: ExactBlock, forms: Sequence[tuple[str, Form]], links: Sequence[int]) -> None:
     """Refuse a condition that is not what its name says.
 
     Raises:
         VerificationError: a name that no description gives to a condition, or other numbers than the name asks for.
     """
     for pattern, form in forms:
-        if not (match := pattern.fullmatch(block.name)):
+        if not (match := re.fullmatch(pattern, block.name)):
             continue
         words = match.groupdict()
         if (link := words.get("link")) is not None and int(link) not in links:
@@ -640,7 +641,7 @@ def read_claim(document: dict[str, object], certificate: dict[str, object]) -> C
 def _require_whole_planes(equalities: Sequence[ExactBlock]) -> None:
     zero = {name for block in equalities for entry in block.entries for name in entry.coefficients}
     for block in equalities:
-        match = _EQUALITY_FORMS[0][0].fullmatch(block.name)
+        match = re.fullmatch(_EQUALITY_FORMS[0][0], block.name)
         if match and (missing := {f"{odd}{match['link']}" for odd in _PLANES[match["plane"]]} - zero):
             raise VerificationError(f"{block.name}: is named as something it is not: it lacks {min(missing)}")
 

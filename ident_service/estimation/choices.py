@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import reduce
 
 import numpy as np
 
@@ -64,8 +63,8 @@ def held_out_error(blocks: Sequence[Information], weights: Array) -> float:
     errors = torques = 0.0
     for number, part in enumerate(parts):
         rest = [blocks[index] for other, indices in enumerate(parts) if other != number for index in indices]
-        beta = ordinary_least_squares(reduce(Information.merged, rest), weights).beta
-        unseen = reduce(Information.merged, [blocks[index] for index in part])
+        beta = ordinary_least_squares(Information.sum(rest), weights).beta
+        unseen = Information.sum([blocks[index] for index in part])
         errors += float(np.sum(weights**2 * unseen.squared_residuals(beta)))
         torques += float(np.sum(weights**2 * unseen.squared_torques()))
     return 100.0 * float(np.sqrt(errors / torques)) if torques > 0.0 else np.inf

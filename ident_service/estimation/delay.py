@@ -14,7 +14,7 @@ import numpy as np
 
 from ident_service.config.schema import Reversal
 from ident_service.errors import RecordingError
-from ident_service.estimation.equations import Equations, equation_rows, equations
+from ident_service.estimation.equations import equation_rows, equations
 from ident_service.estimation.least_squares import weighted_least_squares
 from ident_service.estimation.spectra import settled
 from ident_service.model.arm_model import ArmModel
@@ -83,13 +83,7 @@ def estimate_delay(recordings: Sequence[Recording], model: ArmModel, base: BaseP
 
 def _first_order(recordings: Sequence[Recording], model: ArmModel, base: BaseParameters) -> tuple[float, float]:
     """The remaining delay, and its deviation, to first order."""
-    total: Equations | None = None
-    for recording in recordings:
-        part = equations(recording, model, base)
-        total = part if total is None else total.joined(part)
-    if total is None:
-        raise ValueError("a delay needs at least one recording")
-    fit = weighted_least_squares(total.total)
+    fit = weighted_least_squares(equations(recordings, model, base).total)
     joint_supports = supports(model.chain, model.layout, base.base)
     factor: Array | None = None
     count = 0

@@ -5,20 +5,28 @@ Here the variance of the score `W^T (omega - W beta)` is estimated from blocks o
 "sandwich"), each block weighted as if it had been left out (the jackknife, HC3), which is on the careful side when
 blocks are few. What a single block alone tells cannot be left out: nothing says how sure that is.
 
-A deviation from few blocks is itself uncertain. How many degrees of freedom it has follows Satterthwaite's
-approximation for such estimators (Bell and McCaffrey, 2002), and a verdict takes Student's t for them.
+Blocks that show the same motion are one (`repeats.py`): what repeats with the motion is error of the model and does not
+shrink with its periods; only what differs between them is noise (Pintelon and Schoukens 2012, chapter 4).
+
+A variance from few blocks is itself uncertain. How many degrees of freedom it has follows Satterthwaite's approximation
+for such estimators (Bell and McCaffrey, 2002). The deviation that people are told is widened by as much as Student's t
+is wider than the normal distribution, so that two deviations are 95 % whatever the number of blocks. Blocks of two and
+of four times the length are tried, too, and the largest deviation counts: errors of the model last as long as a slow
+joint stays where it is (decision 0063).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from scipy.special import stdtrit
+from numpy.typing import NDArray
 
 from ident_service.estimation.least_squares import LeastSquares
 from ident_service.model.chain import Array
+from ident_service.model.information import Information
 from ident_service.model.threads import one_blas_thread
 
 if TYPE_CHECKING:
@@ -26,14 +34,15 @@ if TYPE_CHECKING:
 
 Verdict = Literal["identified", "weak", "unidentified"]
 
-# Below a reference a parameter is as good as zero, and its share of itself says nothing; from arms of table size.
-REFERENCE = {"kg m^2": 0.01, "kg m": 0.01, "kg": 0.1, "N m s/rad": 0.1, "N m": 0.1, "N s/m": 0.1, "N": 0.1}
-REFERENCE |= {"N m s^2/rad^2": 0.1, "N s^2/m^2": 0.1}
+# Of a joint's torque over the motion, all root mean squares: a parameter that makes less is as good as zero.
+NEGLIGIBLE_TORQUE = 0.10
 IDENTIFIED_BELOW = 0.10
 WEAK_BELOW = 0.50
 _ALONE = 1.0 - 1e-4  # leverage of a direction that one block alone tells about
 _SEEN_ALONE = 1e-3  # share of a parameter's variance along such directions, from which its own is not known
 _MOST_DEGREES = 1e6
+_LONGER = (2, 4)  # blocks that are also taken as one
+_LEAST_CLUSTERS = 5
 _NORMAL = 1.959963984540054  # 97.5 % of the normal distribution
 
 
@@ -43,12 +52,18 @@ class Uncertainty:
 
     Attributes:
         covariance: shape (base, base), SI units; infinite on the diagonal for what the data, or more than one block of
-            them, do not see. No variance is below that of eq. 81.
-        degrees: degrees of freedom of each variance, shape (base,).
+            them, do not see. No variance is below that of eq. 81. For tests, which know the degrees of freedom.
+        deviations: standard deviations on the careful side, shape (base,), SI units: the largest of several lengths of
+            the blocks, widened for its degrees of freedom.
+        degrees: degrees of freedom of those deviations before they were widened, shape (base,).
+        noise: variances [SI^2] by what differs between repetitions of the motion, shape (base,); None where most of the
+            motion is not repeated, so that noise and error of the model cannot be told apart.
     """
 
     covariance: Array
+    deviations: Array
     degrees: Array
+    noise: Array | None = None
 
 
 @one_blas_thread()
@@ -59,15 +74,48 @@ def uncertainty(equations: Equations, fit: LeastSquares) -> Uncertainty:
         equations: in blocks.
         fit: what solves them.
     """
+    clusters = equations.clusters
+    covariance, degrees, blind = jackknife(clusters, fit)
+    deviations = np.sqrt(np.diag(covariance))
+    known = ~blind & (deviations > 0.0)
+    floor = np.where(known, np.maximum(deviations, np.where(known, fit.standard_deviations, 0.0)), deviations)
+    scale = np.where(known, floor / np.where(known, deviations, 1.0), 1.0)
+    covariance = covariance * np.outer(scale, scale)
+    covariance[blind, blind] = np.inf
+    largest = floor * widening(degrees)
+    # Errors of the model last longer than a block where a joint is slow.
+    for count in _LONGER:
+        if len(clusters) < _LEAST_CLUSTERS * count:
+            break
+        longer = [sum(clusters[start : start + count], ()) for start in range(0, len(clusters), count)]
+        other, fewer, _ = jackknife(longer, fit)
+        found = np.sqrt(np.diag(other)) * widening(fewer)
+        degrees = np.where(found > largest, fewer, degrees)
+        largest = np.maximum(largest, found)
+    return Uncertainty(covariance, np.where(blind, np.inf, largest), degrees, _noise(clusters, fit))
+
+
+def jackknife(clusters: Sequence[Sequence[Information]], fit: LeastSquares) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Estimate a covariance by leaving out one cluster after the other (HC3).
+
+    Args:
+        clusters: blocks that count as one.
+        fit: what solves all of them.
+
+    Returns:
+        The covariance, shape (base, base); degrees of freedom of its variances, shape (base,); and of which parameters
+        the data, or all clusters but one, say nothing, shape (base,).
+    """
     size = len(fit.beta)
     meat = np.zeros((size, size))
     bread = fit.inverse @ fit.inverse.T
-    alone = np.zeros(size)  # largest share of a parameter's white variance along a direction of one block alone
-    lengths, images = np.zeros((len(equations.blocks), size)), np.zeros((len(equations.blocks), size, size))
-    for number, block in enumerate(equations.blocks):
+    alone = np.zeros(size)  # largest share of a parameter's white variance along a direction of one cluster alone
+    lengths, images = np.zeros((len(clusters), size)), np.zeros((len(clusters), size, size))
+    for number, cluster in enumerate(clusters):
+        block = Information.sum(cluster)
         score = block.scores(fit.beta, fit.weights)
         W = block.stacked(fit.weights)[:-1, :-1]
-        # Leave-one-block-out: the score times (1 - leverage)^-1, solved in the block's own small space.
+        # Leave-one-out: the score times (1 - leverage)^-1, solved in the cluster's own small space.
         shares, U = np.linalg.eigh(W @ bread @ W.T)
         others = shares < _ALONE
         inverse = (U[:, others] / (1.0 - shares[others])) @ U[:, others].T
@@ -78,14 +126,34 @@ def uncertainty(equations: Equations, fit: LeastSquares) -> Uncertainty:
         alone = np.maximum(alone, np.sum(along**2, axis=1) / np.maximum(np.diag(bread), np.finfo(float).tiny))
         lengths[number] = np.sum(left_out**2, axis=0)
         images[number] = fit.inverse.T @ (W.T @ left_out)
-    covariance = bread @ meat @ bread
-    deviations, white = np.sqrt(np.diag(covariance)), fit.standard_deviations
-    blind = ~np.isfinite(white) | (alone > _SEEN_ALONE)
-    known = ~blind & (deviations > 0.0)
-    scale = np.where(known, np.maximum(1.0, np.where(known, white, 0.0) / np.where(known, deviations, 1.0)), 1.0)
-    covariance = covariance * np.outer(scale, scale)
-    covariance[blind, blind] = np.inf
-    return Uncertainty(covariance, _degrees(lengths, images))
+    blind = ~np.isfinite(fit.standard_deviations) | (alone > _SEEN_ALONE)
+    return bread @ meat @ bread, _degrees(lengths, images), blind
+
+
+def _noise(clusters: Sequence[Sequence[Information]], fit: LeastSquares) -> Array | None:
+    """Give the variances by what differs between blocks of the same motion; None where most blocks have no other."""
+    differing = np.zeros((len(fit.beta), len(fit.beta)))
+    repeated = rows = 0
+    for cluster in clusters:
+        scores = np.array([block.scores(fit.beta, fit.weights) for block in cluster])
+        count = len(cluster)
+        apart = scores if count == 1 else np.sqrt(count / (count - 1)) * (scores - scores.mean(axis=0))
+        differing += apart.T @ apart
+        size = sum(int(block.rows.sum()) for block in cluster)
+        rows, repeated = rows + size, repeated + (size if count > 1 else 0)
+    bread = fit.inverse @ fit.inverse.T
+    return np.diag(bread @ differing @ bread).copy() if repeated > 0.5 * rows else None
+
+
+def widening(degrees: Array) -> Array:
+    """Give what deviations are multiplied by so that 1.96 of them are the 95 % of Student's t.
+
+    Args:
+        degrees: of freedom, shape (base,).
+    """
+    from scipy.special import stdtrit  # loads for 0.2 s, and a run without a target judges nothing
+
+    return np.asarray(stdtrit(np.maximum(degrees, 1.0), 0.975) / _NORMAL)
 
 
 def _degrees(lengths: Array, images: Array) -> Array:
@@ -108,31 +176,37 @@ def block_covariance(equations: Equations, fit: LeastSquares) -> Array:
     return uncertainty(equations, fit).covariance
 
 
-def verdicts(
-    beta: Array,
-    deviations: Array,
-    units: tuple[str, ...],
-    degrees: Array | None = None,
-    as_zero: Array | None = None,
-) -> tuple[Verdict, ...]:
-    """Give a word per parameter: its deviation against the larger of its size and the reference of its unit.
+def negligible(information: Information) -> Array:
+    """Give sizes below which parameters are as good as zero on a motion, shape (base,), SI units.
+
+    A parameter of this size makes a tenth of the torque of some joint that feels it, and no more of any other's. So a
+    deviation of a tenth of it, with which it is called identified, is a hundredth of the joint's torque.
+    """
+    size = np.full(information.base, np.inf)
+    torques = np.sqrt(information.squared_torques())
+    for torque, support, factor in zip(torques, information.supports, information.factors, strict=True):
+        columns = np.linalg.norm(factor[:, :-1], axis=0)
+        felt = columns > 0.0
+        size[support[felt]] = np.minimum(size[support[felt]], NEGLIGIBLE_TORQUE * torque / columns[felt])
+    return size
+
+
+def verdicts(beta: Array, deviations: Array, as_zero: Array) -> tuple[Verdict, ...]:
+    """Give a word per parameter: its deviation against the larger of its size and what is as good as zero.
 
     Args:
         beta: parameters, shape (base,).
         deviations: of them, shape (base,).
-        units: of them.
-        degrees: of freedom of the deviations, shape (base,): one from few blocks counts for as much as Student's t at
-            95 % is wider than the normal distribution. Known deviations when None.
-        as_zero: sizes below which parameters are as good as zero, shape (base,); the references when None.
+        as_zero: sizes below which parameters are as good as zero, shape (base,), see `negligible`.
     """
-    wider = np.ones(len(beta)) if degrees is None else stdtrit(np.maximum(degrees, 1.0), 0.975) / _NORMAL
     return tuple(
         "identified" if share < IDENTIFIED_BELOW else "weak" if share < WEAK_BELOW else "unidentified"
-        for share in shares(beta, deviations * wider, units, as_zero)
+        for share in shares(beta, deviations, as_zero)
     )
 
 
-def shares(beta: Array, deviations: Array, units: tuple[str, ...], as_zero: Array | None = None) -> Array:
-    """Each deviation as a share of the larger of the parameter's size and the reference of its unit, shape (base,)."""
-    least = np.array([REFERENCE.get(unit, 0.0) for unit in units]) if as_zero is None else as_zero
-    return np.asarray(deviations / np.maximum(np.maximum(np.abs(beta), least), np.finfo(float).tiny))
+def shares(beta: Array, deviations: Array, as_zero: Array) -> Array:
+    """Give each deviation as a share of the larger of the parameter's size and what is as good as zero."""
+    sizes = np.maximum(np.maximum(np.abs(beta), as_zero), np.finfo(float).tiny)
+    # What no joint feels has neither size nor deviation.
+    return np.where(np.isfinite(deviations), deviations, np.inf) / np.where(np.isfinite(sizes), sizes, 1.0)

@@ -6,9 +6,9 @@ bounded: when there are too many, neighbours merge in pairs and blocks become lo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import cached_property, reduce
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ident_service.config.schema import Identification
 from ident_service.errors import RecordingError
 from ident_service.estimation.periodic import averaged
+from ident_service.estimation.repeats import Label, Stretches, stretches
 from ident_service.estimation.smoothing import Motion, smoothed, windows
 from ident_service.estimation.spectra import settled
 from ident_service.model.arm_model import ArmModel
@@ -68,21 +69,35 @@ class Equations:
         blocks: information of consecutive stretches of time, rows near standstill apart.
         samples: smoothed samples that went in.
         near: of the same stretches, the rows near standstill; none where they are among the blocks.
+        labels: of the blocks; those with the same label show the same motion. None shows another's where empty.
     """
 
     blocks: tuple[Information, ...]
     samples: int
     near: tuple[Information, ...] = ()
+    labels: tuple[Label, ...] = ()
+
+    @cached_property
+    def clusters(self) -> tuple[tuple[Information, ...], ...]:
+        """Blocks that show the same motion, in the order in which each motion was first seen.
+
+        What the model lacks errs by the same torque in all blocks of a cluster: they are no independent evidence.
+        """
+        found: dict[Label, list[Information]] = {}
+        labels = self.labels or [(0, number) for number in range(len(self.blocks))]
+        for label, block in zip(labels, self.blocks, strict=True):
+            found.setdefault(label, []).append(block)
+        return tuple(tuple(blocks) for blocks in found.values())
 
     @cached_property
     def total(self) -> Information:
         """All blocks together."""
-        return reduce(Information.merged, self.blocks)
+        return Information.sum(self.blocks)
 
     @cached_property
     def left_out(self) -> Information | None:
         """All rows near standstill together, where they are apart."""
-        return reduce(Information.merged, self.near) if self.near else None
+        return Information.sum(self.near) if self.near else None
 
     @cached_property
     def everything(self) -> Information:
@@ -97,55 +112,73 @@ class Equations:
     def with_torques_times(self, scales: Array) -> Equations:
         """The same equations with each joint's torque multiplied, `scales` of shape (joints,)."""
         blocks, near = (tuple(one.with_torques_times(scales) for one in part) for part in (self.blocks, self.near))
-        return Equations(blocks, self.samples, near)
+        return replace(self, blocks=blocks, near=near)
 
     def with_near(self, shares: Array) -> Equations:
         """The same equations with the rows near standstill among the blocks, multiplied by `shares` per joint."""
         if not self.near:
             return self
         pairs = zip(self.blocks, self.near, strict=True)
-        return Equations(tuple(block.merged(near.times(shares)) for block, near in pairs), self.samples)
-
-    def joined(self, other: Equations) -> Equations:
-        """The equations of both.
-
-        Raises:
-            ModelError: the two belong to different models.
-        """
-        near = bounded([*self.near, *other.near])
-        return Equations(bounded([*self.blocks, *other.blocks]), self.samples + other.samples, near)
+        return replace(self, blocks=tuple(block.merged(near.times(shares)) for block, near in pairs), near=())
 
 
 @one_blas_thread()
 def equations(
-    recording: Recording, model: ArmModel, base: BaseParameters, row_weights: RowWeights | None = None
+    recordings: Recording | Sequence[Recording],
+    model: ArmModel,
+    base: BaseParameters,
+    row_weights: RowWeights | None = None,
 ) -> Equations:
-    """Read a recording once and keep what it knows.
+    """Read recordings once and keep what they know.
 
     Args:
-        recording: to read.
+        recordings: to read, one or several.
         model: its configuration says how to smooth.
         base: grouping of the parameters.
         row_weights: what each row is multiplied by, shape (samples, joints); with it, those near standstill are
             among the blocks.
 
     Raises:
-        RecordingError: the recording does not fit the arm, or some joint does not move.
+        RecordingError: a recording does not fit the arm, or some joint does not move in it.
     """
-    model = settled(model, [recording])
+    whole = tuple(recordings) if isinstance(recordings, Sequence) else (recordings,)
+    gathered = Equations((), 0)
+    for recording, cut in zip(whole, cut_into_stretches(whole, model), strict=True):
+        gathered = _gathered(gathered, recording, settled(model, [recording]), base, cut, row_weights)
+    return gathered
+
+
+def cut_into_stretches(recordings: Sequence[Recording], model: ArmModel) -> tuple[Stretches, ...]:
+    """Cut recordings into the stretches of time that blocks are made of.
+
+    Raises:
+        RecordingError: a recording cannot be read.
+    """
+    lengths = [_block_seconds(recording, settled(model, [recording])) for recording in recordings]
+    if model.config.identification.period is not None:
+        return tuple(Stretches(length, recording=index) for index, length in enumerate(lengths))
+    return stretches(recordings, lengths, model.config.recording, phases=LEAST_BLOCKS)
+
+
+def _gathered(
+    before: Equations,
+    recording: Recording,
+    model: ArmModel,
+    base: BaseParameters,
+    cut: Stretches,
+    row_weights: RowWeights | None,
+) -> Equations:
     joint_supports = supports(model.chain, model.layout, base.base)
-    blocks: list[Information] = []
-    near: list[Information] = []
     moved = np.zeros(model.chain.joints, dtype=bool)
-    samples, current, origin = 0, -1.0, 0.0
-    length = _block_seconds(recording, model)
+    samples, current, origin = 0, None, cut.origin
     for rows in equation_rows(recording, model, base):
-        origin = rows.time[0] if samples == 0 else origin
+        origin = float(rows.time[0]) if origin is None else origin
         samples += len(rows.time)
         # Blocks are stretches of time, whatever the rate after decimation and wherever chunks meet.
-        number = np.floor((rows.time - origin) / length + 1e-9)
+        number = np.floor((rows.time - origin) / cut.length + 1e-9).astype(np.intp)
         starts = np.flatnonzero(np.diff(number)) + 1
         weights = None if row_weights is None else row_weights(rows)
+        blocks, near, labels = list(before.blocks), list(before.near), list(before.labels)
         for begin, end in zip([0, *starts], [*starts, len(rows.time)], strict=True):
             part = slice(begin, end)
             kinds: list[tuple[list[Information], NDArray[np.bool_], Array | None]] = [
@@ -160,16 +193,17 @@ def equations(
                     found[-1] = found[-1].merged(block)
                 else:
                     found.append(block)
+            if number[begin] != current:
+                labels.append(cut.label(int(number[begin])))
             current = number[begin]
         moved |= rows.moving.any(axis=0)
-        blocks, near = list(bounded(blocks)), list(bounded(near))
-    result = Equations(tuple(blocks), samples, tuple(near))
+        before = bounded(Equations(tuple(blocks), before.samples, tuple(near), tuple(labels)))
     if still := [name for name, moves in zip(model.chain.names, moved, strict=True) if not moves]:
         raise RecordingError(
             recording.path,
             f"{', '.join(still)}: never faster than identification.reversal.speed, nothing to identify from",
         )
-    return result
+    return replace(before, samples=before.samples + samples)
 
 
 def _block_seconds(recording: Recording, model: ArmModel) -> float:
@@ -252,12 +286,34 @@ def _rows(motion: Motion, H_b: Array, torque: Array, model: ArmModel) -> Rows:
     return Rows(motion.time, H_b, torque, motion.keep, motion.position, motion.velocity, moving)
 
 
-def bounded(blocks: list[Information]) -> tuple[Information, ...]:
-    """At most `MAX_BLOCKS`: when there are more, neighbours merge in pairs."""
-    while len(blocks) > MAX_BLOCKS:
-        pairs = [blocks[i].merged(blocks[i + 1]) for i in range(0, len(blocks) - 1, 2)]
-        blocks = pairs + blocks[2 * len(pairs) :]
-    return tuple(blocks)
+def bounded(gathered: Equations) -> Equations:
+    """Merge blocks in pairs while there are more than `MAX_BLOCKS`: of the same motion, else neighbours."""
+    while len(gathered.blocks) > MAX_BLOCKS:
+        pairs = _pairs(gathered.labels)
+        blocks, near = (
+            tuple(part[one] if other is None else part[one].merged(part[other]) for one, other in pairs) if part else ()
+            for part in (gathered.blocks, gathered.near)
+        )
+        gathered = Equations(blocks, gathered.samples, near, tuple(gathered.labels[one] for one, _ in pairs))
+    return gathered
+
+
+def _pairs(labels: Sequence[Label]) -> list[tuple[int, int | None]]:
+    """Pair blocks that show the same motion, in turn; neighbours, where that pairs hardly any.
+
+    The last one stays the last: it may not be complete.
+    """
+    waiting: dict[Label, int] = {}
+    partner: dict[int, int | None] = {len(labels) - 1: None}
+    for place, label in enumerate(labels[:-1]):
+        if label in waiting:
+            partner[waiting.pop(label)] = place
+        else:
+            waiting[label] = place
+            partner[place] = None
+    if len(partner) > 0.9 * len(labels):
+        return [(place, place + 1 if place + 1 < len(labels) else None) for place in range(0, len(labels), 2)]
+    return sorted(partner.items())
 
 
 def kept_motion(recording: Recording, options: Identification, coupling: Array | None = None) -> Motion:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
 from typing import Literal
 
 import numpy as np
@@ -17,7 +16,7 @@ from ident_service.config.schema import Method
 from ident_service.estimation import instruments, robust
 from ident_service.estimation.choices import Choice, chosen, held_out_error
 from ident_service.estimation.delay import Delay, estimate_delay, with_delay
-from ident_service.estimation.doubt import uncertainty
+from ident_service.estimation.doubt import uncertainty, widening
 from ident_service.estimation.equations import Equations, equations
 from ident_service.estimation.feasible.feasibility import constrained_least_squares
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
@@ -61,7 +60,10 @@ class Fit:
         fit: the least squares whose factors constrained estimates use.
         equations: what it solves, with row weights where the method has them.
         covariance: from blocks of scores, shape (base, base).
-        degrees: degrees of freedom of its diagonal, shape (base,).
+        deviations: standard deviations on the careful side, shape (base,), see `doubt.py`.
+        degrees: degrees of freedom of the deviations, shape (base,).
+        noise: variances by what differs between repetitions of the motion, shape (base,); None where most is not
+            repeated.
         shares: what rows near standstill are multiplied by, shape (joints,).
         method: estimator.
         remarks: what a person should know of how it was found, in words.
@@ -71,7 +73,9 @@ class Fit:
     fit: LeastSquares
     equations: Equations
     covariance: Array
+    deviations: Array
     degrees: Array
+    noise: Array | None
     shares: Array
     method: Method
     remarks: tuple[str, ...] = ()
@@ -150,7 +154,7 @@ def _with_velocity(
 
 def gather(recordings: Sequence[Recording], model: ArmModel, base: BaseParameters) -> Equations:
     """The equations of several recordings."""
-    return reduce(Equations.joined, (equations(recording, model, base) for recording in recordings))
+    return equations(recordings, model, base)
 
 
 def unconstrained(
@@ -189,7 +193,9 @@ def unconstrained(
     moved = replace(fit, beta=refined.beta, rho1=fit.R1 @ refined.beta, standard_deviations=refined.standard_deviations)
     # The instruments' variances come from as many blocks, each of which counts the same.
     remarks = _unsettled("the instrumental estimate", refined.change, instruments.SETTLED)
-    return Fit(moved, gathered, refined.covariance, uncertainty(gathered, fit).degrees, shares, "iv", remarks)
+    degrees = uncertainty(gathered, fit).degrees
+    deviations = np.sqrt(np.diag(refined.covariance)) * widening(degrees)
+    return Fit(moved, gathered, refined.covariance, deviations, degrees, None, shares, "iv", remarks)
 
 
 def _unsettled(what: str, change: float, settled: float) -> tuple[str, ...]:
@@ -203,4 +209,4 @@ def _unsettled(what: str, change: float, settled: float) -> tuple[str, ...]:
 
 def _doubted(method: Method, fit: LeastSquares, equations: Equations, shares: Array) -> Fit:
     found = uncertainty(equations, fit)
-    return Fit(fit, equations, found.covariance, found.degrees, shares, method)
+    return Fit(fit, equations, found.covariance, found.deviations, found.degrees, found.noise, shares, method)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
 from itertools import product
 
 import numpy as np
@@ -175,7 +174,7 @@ def _unpredicted(gathered: Equations, beta: Array, terms: NDArray[np.bool_]) -> 
     thirds = [part for part in np.array_split(np.arange(len(gathered.blocks)), FOLDS) if len(part)]
     if len(thirds) < FOLDS:
         return gathered.total.squared_residuals(beta)
-    merged = [reduce(Information.merged, [gathered.blocks[index] for index in part]) for part in thirds]
+    merged = [Information.sum([gathered.blocks[index] for index in part]) for part in thirds]
     total = np.zeros(gathered.total.joints)
     for joint, support in enumerate(gathered.total.supports):
         own = terms[support]

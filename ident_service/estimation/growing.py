@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 
 from ident_service.config.recording import RecordingFormat
 from ident_service.errors import RecordingError
-from ident_service.estimation.doubt import Verdict, uncertainty, verdicts
-from ident_service.estimation.equations import Equations, Rows, bounded, equation_rows
+from ident_service.estimation.doubt import Verdict, negligible, uncertainty, verdicts
+from ident_service.estimation.equations import LEAST_BLOCKS, Equations, Rows, bounded, equation_rows
 from ident_service.estimation.least_squares import ordinary_least_squares
 from ident_service.estimation.spectra import EDGE, USUAL
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import base_parameters
 from ident_service.model.chain import Array
-from ident_service.model.information import Information, empty_information, information_of, supports
+from ident_service.model.information import empty_information, information_of, supports
 from ident_service.model.threads import one_blas_thread
 from ident_service.record.recording import BLOCK_SAMPLES, Block, Stamps, cut, join
 
@@ -43,14 +43,16 @@ class Doubt:
         beta: least squares, each joint's equations divided by its residual [SI], shape (base,).
         deviations: eq. 81 [SI], or what blocks say where that is more and they are kept; infinite where nothing is
             known yet, shape (base,).
+        negligible: sizes below which parameters are as good as zero on the motion so far [SI], shape (base,).
         verdicts: a word per base parameter.
-        blocks: that were kept.
+        blocks: of different motion that were kept.
         until_ns: stamp of the last sample that went in.
     """
 
     seconds: float
     beta: Array
     deviations: Array
+    negligible: Array
     verdicts: tuple[Verdict, ...]
     blocks: int = 0
     until_ns: int = 0
@@ -63,12 +65,13 @@ class GrowingInformation:
         base: the grouping of the parameters.
     """
 
-    def __init__(self, model: ArmModel, *, in_blocks: bool = False) -> None:
+    def __init__(self, model: ArmModel, *, in_blocks: bool = False, period: float | None = None) -> None:
         """Nothing is known yet.
 
         Args:
             model: of the arm; averaging over periods and trimming, which need a whole recording, are left out.
             in_blocks: whether the information of each block is kept, and deviations are as careful as the result's.
+            period: of the motion [s], if it has one: its repetitions are no independent evidence (`repeats.py`).
         """
         options = model.config.identification
         smoothing = options.smoothing
@@ -81,7 +84,9 @@ class GrowingInformation:
         self.base = base_parameters(model.chain, model.layout)
         self._supports = supports(model.chain, model.layout, self.base.base)
         self._information = empty_information(self._supports, self.base.size)
-        self._blocks: list[Information] | None = [] if in_blocks else None
+        self._blocks = Equations((), 0) if in_blocks else None
+        self._phases = max(LEAST_BLOCKS, round(period / options.block)) if period else 0
+        self._length = period / self._phases if period else options.block
         self._number, self._origin_ns = -1, -1
         self._waiting: list[Block] = []
         self._need, self._done_ns, self._seconds = _FIRST, -1, 0.0
@@ -125,16 +130,17 @@ class GrowingInformation:
             block = information_of(rows.H_b[:, :, new], rows.torque[new], rows.keep[new], self._supports)
             self._information = self._information.merged(block)
             if self._blocks is not None:
-                self._keep(self._blocks, rows, time_ns, new)
+                self._blocks = self._kept(self._blocks, rows, time_ns, new)
             self._seconds += float(rows.time[new][-1] - rows.time[new][0])
             self._done_ns, found = int(time_ns[-1]), True
         return found
 
-    def _keep(self, blocks: list[Information], rows: Rows, time_ns: Stamps, new: NDArray[np.bool_]) -> None:
+    def _kept(self, before: Equations, rows: Rows, time_ns: Stamps, new: NDArray[np.bool_]) -> Equations:
         """The same equations by stretches of time, as `equations.py` has them of a whole recording."""
+        blocks, labels = list(before.blocks), list(before.labels)
         if self._origin_ns < 0:
             self._origin_ns = int(time_ns[new][0])
-        numbers = (time_ns - self._origin_ns) // int(self._model.config.identification.block * 1e9)
+        numbers = (time_ns - self._origin_ns) // int(self._length * 1e9)
         for number in np.unique(numbers[new]).tolist():
             part = new & (numbers == number)
             block = information_of(rows.H_b[:, :, part], rows.torque[part], rows.keep[part], self._supports)
@@ -142,8 +148,9 @@ class GrowingInformation:
                 blocks[-1] = blocks[-1].merged(block)
             else:
                 blocks.append(block)
+                labels.append((0, number % self._phases if self._phases else number))
             self._number = number
-        self._blocks = list(bounded(blocks))
+        return bounded(Equations(tuple(blocks), 0, (), tuple(labels)))
 
     @one_blas_thread()
     def doubt(self) -> Doubt | None:
@@ -155,12 +162,14 @@ class GrowingInformation:
         spread = np.sqrt(information.squared_residuals(fit.beta) / np.maximum(information.rows, 1))
         floor = 1e-9 * np.sqrt(information.squared_torques() / np.maximum(information.rows, 1)) + 1e-300
         fit = ordinary_least_squares(information, np.where(information.rows > 0, 1.0 / np.maximum(spread, floor), 1.0))
-        deviations, blocks, degrees = fit.standard_deviations, self._blocks or [], None
-        if blocks:
-            found = uncertainty(Equations(tuple(blocks), 0), fit)
-            deviations, degrees = np.maximum(deviations, np.sqrt(np.diag(found.covariance))), found.degrees
-        words = verdicts(fit.beta, deviations, self.base.units, degrees)
-        return Doubt(self._seconds, fit.beta, deviations, words, len(blocks), self._done_ns)
+        deviations, clusters = fit.standard_deviations, 0
+        if self._blocks is not None and self._blocks.blocks:
+            clusters = len(self._blocks.clusters)
+            found = uncertainty(self._blocks, fit)
+            deviations = np.maximum(deviations, found.deviations)
+        as_zero = negligible(information)
+        words = verdicts(fit.beta, deviations, as_zero)
+        return Doubt(self._seconds, fit.beta, deviations, as_zero, words, clusters, self._done_ns)
 
 
 class _Window:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
 from typing import get_args
 
 import numpy as np
 
 from ident_service.config.schema import FeasibleSetName, Method
 from ident_service.errors import UsageError
+from ident_service.estimation.bootstrap import constrained_intervals
 from ident_service.estimation.choices import Choice
 from ident_service.estimation.custom import CustomFunction
-from ident_service.estimation.doubt import Verdict, verdicts
+from ident_service.estimation.doubt import Verdict, negligible, verdicts
 from ident_service.estimation.equations import Equations, equations
 from ident_service.estimation.feasible.convex import SOLVER, convex_least_squares, require_solver
 from ident_service.estimation.feasible.feasibility import (
@@ -35,7 +35,7 @@ from ident_service.estimation.least_squares import (
 )
 from ident_service.estimation.second_opinion import SecondOpinion, second_opinion
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.base import BaseParameters, base_parameters
+from ident_service.model.base import BaseParameters, base_parameters, remarks_on_angles
 from ident_service.model.chain import Array
 from ident_service.model.information import Information
 from ident_service.model.threads import one_blas_thread
@@ -111,9 +111,14 @@ class Estimate:
         margin: of delta inside the set, or of the feasibility test when infeasible.
         tight: blocks of the set that the estimate presses against or violates.
         covariance: of the unconstrained estimate, from blocks of scores, shape (base, base).
-        standard_deviations: its diagonal's square root, shape (base,).
+        standard_deviations: on the careful side, shape (base,): at least its diagonal's square root, see `doubt.py`.
         white_standard_deviations: the paper's (eq. 81), shape (base,).
         degrees: degrees of freedom of the standard deviations, shape (base,).
+        negligible: sizes below which parameters are as good as zero on this motion, shape (base,).
+        noise_deviations: by what differs between repetitions of the motion alone, shape (base,); None where it is not
+            repeated.
+        constrained_intervals: 95 % intervals of the constrained estimate, shape (base, 2); None where no condition
+            bends it, or further knowledge does.
         verdicts: one per base parameter.
         fit: the unconstrained least squares.
         samples: smoothed samples used.
@@ -145,6 +150,9 @@ class Estimate:
     standard_deviations: Array
     white_standard_deviations: Array
     degrees: Array
+    negligible: Array
+    noise_deviations: Array | None
+    constrained_intervals: Array | None
     verdicts: tuple[Verdict, ...]
     fit: LeastSquares
     samples: int
@@ -225,7 +233,7 @@ def identify(
         weighed = prepared.equations.with_near(found.shares).total
         errors = (torque_error(weighed, one.beta) for one in (held[kind], without))
         knowledge = CustomKnowledge(custom, by.lower(), *(error.relative_percent for error in errors))
-    deviations = np.sqrt(np.diag(found.covariance))
+    deviations, as_zero = found.deviations, negligible(prepared.equations.everything)
     second = None
     if again:
         second = second_opinion(
@@ -256,6 +264,13 @@ def identify(
     free = set_name == "none"
     chosen = 0 if free else 2 + _SETS.index(kind)
     beta = candidates[chosen].beta
+    intervals = None
+    if not free and held[kind].tight and custom is None:
+        variances = np.diag(found.covariance)
+        told = np.isfinite(deviations) & np.isfinite(variances) & (variances > 0.0)
+        care = np.where(told, deviations, 1.0) / np.sqrt(np.where(told, variances, 1.0))
+        careful = found.covariance * np.outer(care, care)
+        intervals = constrained_intervals(found.fit, careful, held[kind].beta, base, conditions, prior)
     delta, margin, tight = _of_test(test) if free else (held[kind].delta, held[kind].margin, held[kind].tight)
     return Estimate(
         model=prepared.model,
@@ -271,7 +286,10 @@ def identify(
         standard_deviations=deviations,
         white_standard_deviations=found.fit.standard_deviations,
         degrees=found.degrees,
-        verdicts=verdicts(beta, deviations, base.units, found.degrees),
+        negligible=as_zero,
+        noise_deviations=None if found.noise is None else np.sqrt(found.noise),
+        constrained_intervals=intervals,
+        verdicts=verdicts(beta, deviations, as_zero),
         fit=found.fit,
         samples=prepared.equations.samples,
         prepared=prepared,
@@ -283,7 +301,7 @@ def identify(
         chosen=chosen,
         standstill_shares=found.shares,
         choices=(*prepared.choices, *found.choices),
-        remarks=(*found.remarks, *_remarks_on_friction(model, prepared.model)),
+        remarks=(*found.remarks, *_remarks_on_friction(model, prepared.model), *remarks_on_angles(base)),
         custom=None if free else knowledge,
         second=second,
     )
@@ -348,7 +366,7 @@ def _prior(model: ArmModel, found: Fit, base: BaseParameters, conditions: Feasib
     count = len(blocks) - max(1, round(_HELD_OUT * len(blocks)))
     if count < 1:
         raise UsageError("a prior's weight cannot be chosen from so short a recording; give it a number")
-    told, kept_back = (reduce(Information.merged, part) for part in (blocks[:count], blocks[count:]))
+    told, kept_back = (Information.sum(part) for part in (blocks[:count], blocks[count:]))
     fit = ordinary_least_squares(told, found.fit.weights)
     given = Prior(pull.kind, base.names, model.prior, 1.0)
 

@@ -32,15 +32,18 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ident_service.errors import ModelError
-from ident_service.estimation.equations import MAX_BLOCKS, Rows, equation_rows
+from ident_service.config.limits import MotionLimits, motion_limits
+from ident_service.errors import ModelError, MotionRefused
+from ident_service.estimation.equations import MAX_BLOCKS, Rows, cut_into_stretches, equation_rows
 from ident_service.estimation.feasible.feasibility import constrained_least_squares
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.least_squares import LeastSquares
+from ident_service.estimation.repeats import Label, Stretches
 from ident_service.estimation.spectra import settled
-from ident_service.model.arm_model import ArmModel
+from ident_service.model.arm_model import ArmModel, control_model
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
+from ident_service.model.expected_friction import friction_feedforward
 from ident_service.model.information import supports
 from ident_service.model.zero_phase import low_pass
 from ident_service.record.grid import grid
@@ -129,15 +132,16 @@ def instrumental_variables(
     model = settled(model, recordings)
     smoothed = float(model.config.identification.smoothing.cutoff)
     frequency = cutoff or (smoothed if references is not None else max(0.25 * smoothed, _SLOWEST))
+    cut = cut_into_stretches(recordings, model)
     beta = fit.beta
     best: InstrumentalEstimate | None = None
     for number in range(1, _MOST_ROUNDS + 1):
-        sums: list[_Sums] = []
-        for recording, reference in zip(recordings, follow, strict=True):
+        sums: dict[Label, _Sums] = {}
+        for recording, reference, parts in zip(recordings, follow, cut, strict=True):
             instruments = simulated(recording, reference, model, delta, frequency, commanded=references is not None)
-            for block in _blocks(recording, instruments, model, base, fit.weights):
-                sums = _bounded([*sums, block])
-        solved = _solve(sums)
+            for label, block in _blocks(recording, instruments, model, base, fit.weights, parts):
+                sums = _bounded(sums | {label: sums[label] + block if label in sums else block})
+        solved = _solve(list(sums.values()))
         change = float(np.max(np.abs(solved.beta - beta) / np.sqrt(np.diag(solved.covariance))))
         beta = solved.beta
         nearest = constrained_least_squares(replace(fit, beta=beta, rho1=fit.R1 @ beta), base, conditions)
@@ -157,7 +161,7 @@ def instrumental_variables(
 
 @dataclass(frozen=True)
 class _Sums:
-    """One block's Z^T W, shape (base, base), Z^T omega, and the squares of the columns of Z and W, shape (base,)."""
+    """One stretch's Z^T W, shape (base, base), Z^T omega, and the squares of the columns of Z and W, shape (base,)."""
 
     ZW: Array
     Zomega: Array
@@ -176,27 +180,26 @@ class _Solved:
 
 
 def _blocks(
-    recording: Recording, instruments: Recording, model: ArmModel, base: BaseParameters, weights: Array
-) -> Iterator[_Sums]:
+    recording: Recording,
+    instruments: Recording,
+    model: ArmModel,
+    base: BaseParameters,
+    weights: Array,
+    cut: Stretches,
+) -> Iterator[tuple[Label, _Sums]]:
     joint_supports = supports(model.chain, model.layout, base.base)
-    length = model.config.identification.block
-    waiting: _Sums | None = None
-    current, origin = -1.0, None
+    origin = cut.origin
     # The stamps are the same, so the chunks are too.
     pairs = zip(equation_rows(recording, model, base), equation_rows(instruments, model, base), strict=True)
     for measured, made in pairs:
-        origin = measured.time[0] if origin is None else origin
-        number = np.floor((measured.time - origin) / length + 1e-9)
+        origin = float(measured.time[0]) if origin is None else origin
+        number = np.floor((measured.time - origin) / cut.length + 1e-9).astype(np.intp)
         edges = [0, *(np.flatnonzero(np.diff(number)) + 1), len(number)]
         for begin, end in pairwise(edges):
-            part = _sums(measured, made, slice(begin, end), joint_supports, weights)
-            if waiting is not None and number[begin] != current:
-                yield waiting
-                waiting = None
-            waiting = part if waiting is None else waiting + part
-            current = number[begin]
-    if waiting is not None:
-        yield waiting
+            yield (
+                cut.label(int(number[begin])),
+                _sums(measured, made, slice(begin, end), joint_supports, weights),
+            )
 
 
 def _sums(measured: Rows, made: Rows, part: slice, joint_supports: Sequence[NDArray[np.intp]], weights: Array) -> _Sums:
@@ -213,10 +216,13 @@ def _sums(measured: Rows, made: Rows, part: slice, joint_supports: Sequence[NDAr
     return _Sums(ZW, Zomega, ZZ, WW)
 
 
-def _bounded(sums: list[_Sums]) -> list[_Sums]:
+def _bounded(sums: dict[Label, _Sums]) -> dict[Label, _Sums]:
+    """Merge neighbours, but for the last one, which may not be complete."""
     while len(sums) > MAX_BLOCKS:
-        pairs = [sums[i] + sums[i + 1] for i in range(0, len(sums) - 1, 2)]
-        sums = pairs + sums[2 * len(pairs) :]
+        labels = list(sums)
+        pairs = {one: sums[one] + sums[other] for one, other in zip(labels[:-1:2], labels[1:-1:2], strict=False)}
+        kept = labels[2 * len(pairs) :]
+        sums = pairs | {label: sums[label] for label in kept}
     return sums
 
 
@@ -314,15 +320,20 @@ class _Loop:
         self._period = period
         joints = [model.config.joints.get(name) for name in model.chain.names]
         gains = [(joint.kp, joint.kd) for joint in joints if joint and joint.kp and joint.kd]
-        self._known = commanded and model.prior is not None and len(gains) == model.chain.joints
-        if self._known and model.prior is not None:
-            self._controller = ForwardDynamics(model.chain, model.layout, model.prior)
+        prior = control_model(model).prior
+        self._known = commanded and prior is not None and len(gains) == model.chain.joints
+        if self._known and prior is not None:
+            self._controller = ForwardDynamics(model.chain, model.layout, prior)
             self._kp, self._kd = np.array(gains, dtype=float).T
-            self._cutoff = model.config.control.velocity_cutoff
+            self._cutoff = np.asarray(model.config.control.velocity_cutoff, dtype=float)
+            # Without the limits of a joint nothing is guessed of its friction, and nothing is added for it.
+            limits = _limits(model)
+            self._friction = np.zeros_like if limits is None else friction_feedforward(model, limits).torque
         else:
             self._controller = self._plant
             self._kp = np.full(model.chain.joints, _STIFFNESS**2)
             self._kd = np.full(model.chain.joints, 2.0 * _STIFFNESS)
+            self._friction = self._plant.friction
 
     def follow(self, reference: Array) -> Array:
         """Positions that the arm takes, shape (samples, joints), following `reference` of the same shape."""
@@ -331,7 +342,7 @@ class _Loop:
         wanted = np.stack([reference, velocity, acceleration], axis=1)
         steps = max(1, int(np.ceil(self._period * float(self._kd.max()) / _LARGEST_STEP)))
         h = self._period / steps
-        gain = 1.0 - float(np.exp(-2.0 * np.pi * self._cutoff * h)) if self._known else 1.0
+        gain = 1.0 - np.exp(-2.0 * np.pi * self._cutoff * h) if self._known else 1.0
         q, v = reference[0].copy(), velocity[0].copy()
         rate = v
         result = np.empty_like(reference)
@@ -341,9 +352,7 @@ class _Loop:
             for step in range(steps):
                 now = before if step == 0 else before + (step / steps) * (after - before)
                 alpha = now[2] + self._kd * (now[1] - rate) + self._kp * (now[0] - q)
-                torque = self._controller.torque(q, rate, alpha)
-                if not self._known:
-                    torque = torque + self._plant.friction(now[1])
+                torque = self._controller.torque(q, rate, alpha) + self._friction(now[1])
                 next_v = self._plant.next_velocity(q, v, torque, h)
                 change = 0.5 * h * (v + next_v)
                 q, v = q + change, next_v
@@ -353,3 +362,11 @@ class _Loop:
                 raise ModelError(f"the simulated loop runs away after {sample * self._period:.3g} s")
             result[sample] = q
         return result
+
+
+def _limits(model: ArmModel) -> MotionLimits | None:
+    """Return the limits and gains of an arm that can be moved, None for one that is only identified."""
+    try:
+        return motion_limits(model.config)
+    except MotionRefused:
+        return None

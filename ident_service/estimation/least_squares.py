@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from ident_service.errors import ModelError
@@ -76,6 +75,8 @@ def ordinary_least_squares(information: Information, weights: Array | None = Non
         information: the equations.
         weights: per joint, what its equations are multiplied by, shape (joints,); ones when None.
     """
+    import scipy.linalg  # loads for 0.2 s, and a run without a target solves nothing
+
     stacked = information.stacked(weights)
     R1, rho1, rho2 = stacked[:-1, :-1], stacked[:-1, -1], abs(float(stacked[-1, -1]))
     # Columns differ by orders of magnitude in SI units; rank is judged on unit columns.

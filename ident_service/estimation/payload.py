@@ -17,8 +17,7 @@ for another. So does a recording without a payload whose residual is far above t
 is easily lost in it, and the arm does not move as it was identified.
 
 A parameter's verdict compares its deviation with the larger of its size and what is as good as zero: what makes 1 % of
-a joint's torque on this motion, or what a body of this mass has 5 cm from the frame, if that is less; at most the
-reference of its unit, which is made for whole links.
+a joint's torque on this motion, or what a body of this mass, at least 100 g, has 5 cm from the frame, if that is less.
 
 Boundary: pure computation, no I/O.
 """
@@ -31,7 +30,7 @@ from typing import Literal
 import numpy as np
 
 from ident_service.errors import ParameterError, SolverError
-from ident_service.estimation.doubt import REFERENCE, Verdict, uncertainty, verdicts
+from ident_service.estimation.doubt import Verdict, uncertainty, verdicts
 from ident_service.estimation.drift import (
     ALPHA,
     RELEVANT_TORQUE,
@@ -59,6 +58,7 @@ from ident_service.model.threads import one_blas_thread
 Word = Literal["none", "added", "removed", "infeasible"]
 
 _ARM = 0.05  # m
+_LEAST_MASS = 0.1  # kg
 FAR = 4.0  # times the residual of the identification, as in `plausibility.py`
 _NO_VARIANCE = 1e-10  # of an eigenvalue of the correlations, against the largest
 _FELT = 1e-9  # of the arm's doubt in a parameter, below which a payload does not depend on it
@@ -183,6 +183,7 @@ def identify_payload(arm: KnownArm, recorded: Equations, *, refit_offsets: bool 
     noise = from_blocks.covariance
     G = _dependence(recorded.total, T, fit)
     covariance, doubt = _with_doubt(arm, noise, G)
+    deviations = np.sqrt(from_blocks.deviations**2 + np.diag(doubt))
     total = recorded.total
     seen = np.isfinite(np.diag(covariance))
 
@@ -191,7 +192,7 @@ def identify_payload(arm: KnownArm, recorded: Equations, *, refit_offsets: bool 
     motion = Motion(responses.responses, measured, responses.residual)
     leading = tuple(base.names[column] for column in base.base)
     arm_side = Identified(leading, np.zeros(base.size), doubt, arm.blocks)
-    blocks = len(reduced.blocks)
+    blocks = len(reduced.clusters)
     new_side = Identified(leading, fit.beta, noise, blocks, motion)
     test = difference_test(arm_side, new_side, own)
     only = np.zeros(base.size)
@@ -211,7 +212,6 @@ def identify_payload(arm: KnownArm, recorded: Equations, *, refit_offsets: bool 
     body = found.get(word)
     moved = np.zeros(base.size) if word == "none" else fit.beta if body is None else body.b
     everything = recorded.everything
-    deviations = np.sqrt(np.diag(covariance))
     payload = Payload(
         base=base,
         T=T,
@@ -220,7 +220,7 @@ def identify_payload(arm: KnownArm, recorded: Equations, *, refit_offsets: bool 
         G=G,
         covariance=covariance,
         standard_deviations=deviations,
-        verdicts=verdicts(fit.beta, deviations, base.units, from_blocks.degrees, _as_zero(motion, base, fit.beta)),
+        verdicts=verdicts(fit.beta, deviations, _as_zero(motion, base, fit.beta)),
         blocks=blocks,
         test=test,
         torque_share=motion.change(only) / np.maximum(measured, np.finfo(float).tiny),
@@ -274,15 +274,15 @@ def _reduced(recorded: Equations, beta: Array, T: Array) -> Equations:
         return Information(supports, tuple(factors), information.rows.copy(), T.shape[1])
 
     blocks, near = (tuple(one(block) for block in part) for part in (recorded.blocks, recorded.near))
-    return Equations(blocks, recorded.samples, near)
+    return replace(recorded, blocks=blocks, near=near)
 
 
 def _as_zero(motion: Motion, base: BaseParameters, beta: Array) -> Array:
     """Return sizes below which parameters of a payload are as good as zero, shape (payload,): see above."""
     mass = max((abs(beta[k]) for k, unit in enumerate(base.units) if unit == "kg"), default=0.0)
-    mass = max(mass, REFERENCE["kg"])
-    near = {"kg m^2": mass * _ARM**2, "kg m": mass * _ARM}
-    of_units = np.array([min(REFERENCE.get(unit, 0.0), near.get(unit, np.inf)) for unit in base.units])
+    mass = max(mass, _LEAST_MASS)
+    near = {"kg m^2": mass * _ARM**2, "kg m": mass * _ARM, "kg": _LEAST_MASS}
+    of_units = np.array([near.get(unit, np.inf) for unit in base.units])
     changes = np.array([motion.change(one) for one in np.eye(base.size)])
     shares = (changes / np.maximum(motion.torque, np.finfo(float).tiny)).max(axis=1)
     return np.asarray(np.minimum(of_units, RELEVANT_TORQUE / np.maximum(shares, np.finfo(float).tiny)))

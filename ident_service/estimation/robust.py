@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,8 +67,7 @@ def huber(
         residuals = count * (rows.torque * times - np.einsum("jps,p->sj", rows.H_b, beta))
         return np.asarray(count * _weights(residuals, scales))
 
-    gathered = reduce(Equations.joined, (equations(recording, model, base, weights) for recording in recordings))
-    gathered = gathered.with_torques_times(times)
+    gathered = equations(recordings, model, base, weights).with_torques_times(times)
     return ordinary_least_squares(gathered.total), gathered, change
 
 

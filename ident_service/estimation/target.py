@@ -1,7 +1,7 @@
 """When what a run is for has been learned: the target of `ident run --until`.
 
-A parameter is reached when its deviation is at most the target's share of the larger of its size and the reference of
-its unit, as in its verdict (`doubt.py`): a parameter that is as good as zero need not be known to a share of itself.
+A parameter is reached when its deviation is at most the target's share of the larger of its size and what is as good
+as zero, as in its verdict (`doubt.py`): a parameter that is as good as zero need not be known to a share of itself.
 The deviation is the larger of eq. 81 and of what blocks say, as few blocks can err to either side, and nothing counts
 before there are some, nor before the motion has lasted for its first period: before, its design has not been made.
 Every base parameter counts where none is chosen. Not only the essential ones: early on, what is not known yet cannot
@@ -53,9 +53,9 @@ class Target:
         return np.array(chosen, dtype=np.intp)
 
 
-def worst_share(doubt: Doubt, base: BaseParameters, places: NDArray[np.intp]) -> float:
+def worst_share(doubt: Doubt, places: NDArray[np.intp]) -> float:
     """The largest share of the chosen ones; infinite before there are enough blocks to say."""
     if doubt.blocks < LEAST_BLOCKS:
         return np.inf
-    worst = float(shares(doubt.beta, doubt.deviations, base.units)[places].max())
+    worst = float(shares(doubt.beta, doubt.deviations, doubt.negligible)[places].max())
     return worst if np.isfinite(worst) else np.inf

@@ -21,6 +21,7 @@ class KeptRecording:
         self.joint_names = whole.joint_names
         self.joints = whole.joints
         self.torque_held = whole.torque_held
+        self.whole: Recording = whole
         self._whole, self._max_bytes = whole, max_bytes
         self._kept: Block | None = None
 

@@ -157,6 +157,10 @@ def parameters_document(estimate: Estimate, described: ArmConfig | None = None) 
             "units": list(model.layout.units),
             "values": estimate.delta.tolist(),
         }
+    apart = estimate.noise_deviations
+    held = estimate.constrained_intervals
+    intervals = {} if held is None else {"constrained_intervals": [_perhaps(ends) for ends in held]}
+    noise = {} if apart is None else {"noise_standard_deviations": _perhaps(apart)}
     document |= {
         "base_parameters": {
             "expressions": list(base.expressions),
@@ -166,7 +170,10 @@ def parameters_document(estimate: Estimate, described: ArmConfig | None = None) 
             "standard_deviations": _perhaps(estimate.standard_deviations),
             "white_standard_deviations": _perhaps(estimate.white_standard_deviations),
             "degrees_of_freedom": [round(value, 3) for value in estimate.degrees.tolist()],
+            **noise,
             "covariance": [_perhaps(row) for row in estimate.covariance],
+            **intervals,
+            "negligible": _perhaps(estimate.negligible),
             "verdicts": list(estimate.verdicts),
         },
         "feasibility": {
@@ -187,7 +194,7 @@ def parameters_document(estimate: Estimate, described: ArmConfig | None = None) 
         **convex_document(estimate),
         "fit": {
             "samples": estimate.samples,
-            "blocks": len(estimate.fitted.blocks),
+            "blocks": len(estimate.fitted.clusters),
             "condition_number": estimate.fit.condition_number if np.isfinite(estimate.fit.condition_number) else None,
             **_errors(own.identification, model.chain.names),
             "rows_and_filter": list(how_fitted(estimate)),

@@ -14,7 +14,7 @@ import numpy as np
 from ident_service import __version__
 from ident_service.config.schema import ArmConfig, Body, FeasibleSetName, Mass
 from ident_service.errors import ParameterError
-from ident_service.estimation.doubt import verdicts
+from ident_service.estimation.doubt import negligible, verdicts
 from ident_service.estimation.equations import Equations
 from ident_service.estimation.feasible.feasibility import feasibility_test
 from ident_service.estimation.feasible.feasible_set import feasible_set
@@ -40,6 +40,12 @@ _WORDS: Mapping[Word, tuple[str, str]] = {
 }
 _ROUNDING = 1e-12  # of the largest value of a quantity; less is printed as zero
 # What no longer holds for an arm with a load, or is about other recordings.
+_OF_ARM_ALONE = (
+    "white_standard_deviations",
+    "noise_standard_deviations",
+    "constrained_intervals",
+    "unconstrained_values",
+)
 _STALE = ("bootstrap", "essential", "recording_quality", "validation", "fit", "information", "link_parameters")
 
 
@@ -223,17 +229,19 @@ def loaded_parameters(
         beta = base.K @ delta
     proof = certify(beta, base, conditions, delta)
     covariance = loaded_covariance(arm, payload)
-    deviations = np.sqrt(np.diag(covariance))
+    deviations = np.sqrt(np.diag(covariance)) * _care(content)
+    as_zero = negligible(recorded.everything)
     document = {key: deepcopy(value) for key, value in content.items() if key not in _STALE}
     table = document["base_parameters"]
-    for stale in ("white_standard_deviations", "unconstrained_values"):
+    for stale in _OF_ARM_ALONE:
         table.pop(stale, None)
     table |= {
         "values": beta.tolist(),
         "units": list(base.units) if any(base.units) else table.get("units", list(base.units)),
         "standard_deviations": _perhaps(deviations),
         "covariance": [_perhaps(row) for row in covariance],
-        "verdicts": list(verdicts(beta, deviations, tuple(table.get("units", base.units)))),
+        "negligible": _perhaps(as_zero),
+        "verdicts": list(verdicts(beta, deviations, as_zero)),
     }
     condition = ordinary_least_squares(recorded.total).condition_number
     document |= {
@@ -273,6 +281,15 @@ def _moved(content: Mapping[str, Any], arm: KnownArm, payload: Payload) -> Array
     for name, value in zip(payload.base.names, payload.body.delta, strict=True):
         delta[index[name]] += sign * value
     return delta
+
+
+def _care(content: Mapping[str, Any]) -> Array:
+    """Tell by how much the arm's standard deviations are more careful than its covariance, shape (base,)."""
+    table = content["base_parameters"]
+    told = np.array([np.inf if one is None else one for one in table["standard_deviations"]], float)
+    variances = np.array([np.inf if row[k] is None else row[k] for k, row in enumerate(table["covariance"])], float)
+    known = np.isfinite(told) & np.isfinite(variances) & (variances > 0.0)
+    return np.asarray(np.maximum(1.0, np.where(known, told, 1.0) / np.sqrt(np.where(known, variances, 1.0))))
 
 
 def _errors(error: TorqueError, names: tuple[str, ...]) -> dict[str, Any]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterable
 
+import numpy as np
+
 from ident_service.config.schema import Identification
 from ident_service.estimation.identify import Estimate
 
@@ -51,6 +53,20 @@ def how_fitted(estimate: Estimate) -> tuple[str, ...]:
         *rows_and_filter(estimate.model.config.identification),
         f"Rows near standstill: multiplied in the fit by {weighed}, as their own residuals have it.",
         *(f"Chosen: {choice}." for choice in estimate.choices),
+        _noise_and_model(estimate),
+    )
+
+
+def _noise_and_model(estimate: Estimate) -> str:
+    """Say how much of the deviations is noise and how much error of the model, as far as repetitions tell."""
+    if estimate.noise_deviations is None:
+        return "Most of the motion is not repeated, so that noise and error of the model cannot be told apart."
+    variances = np.diag(estimate.covariance)
+    known = np.isfinite(variances) & (variances > 0.0)
+    share = np.clip(estimate.noise_deviations[known] ** 2 / variances[known], 0.0, 1.0)
+    return (
+        f"The motion is repeated: {np.median(share):.0%} of a parameter's variance is noise (median; "
+        f"{share.min():.0%} to {share.max():.0%}), the rest is error of the model, which more periods do not diminish."
     )
 
 

@@ -76,6 +76,7 @@ def write_results(
     more: dict[str, Any] | None = None,
     unusable: Sequence[str] = (),
     described: ArmConfig | None = None,
+    torque: str = "commanded",
 ) -> list[str]:
     """Write an estimate's files into an existing folder, with the program that checks its certificate.
 
@@ -85,18 +86,19 @@ def write_results(
         more: further entries of `parameters.json`.
         unusable: why the estimate must not be used.
         described: the arm's description as it was read, where options or recordings changed it.
+        torque: that the recordings give: `measured` by the drives, `commanded`, or `recorded` by another program.
 
     Returns:
         The names of the files. An estimate that no body has comes without a URDF, because URDF cannot express it.
     """
-    document = parameters_document(estimate, described) | {"unusable": list(unusable)} | (more or {})
+    document = parameters_document(estimate, described) | {"unusable": list(unusable), "torque": torque} | (more or {})
     write_parameters(folder / PARAMETERS, document)
     write_atomically(folder / ARM, estimate.model.config.model_dump_json(indent=1) + "\n")
     names = [PARAMETERS, ARM]
     if estimate.delta is not None:
         write_urdf(folder / URDF, estimate.model, estimate.delta)
         names.append(URDF)
-    write_atomically(folder / REPORT, summary(estimate, unusable) + "\n" + parameter_table(estimate))
+    write_atomically(folder / REPORT, summary(estimate, unusable, torque) + "\n" + parameter_table(estimate))
     write_verifier(folder)
     return [*names, REPORT, VERIFIER]
 

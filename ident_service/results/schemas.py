@@ -6,11 +6,12 @@ Boundary: from content to its mistakes in words; what the content means is each 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
 from typing import Any
 
-import jsonschema
+import jsonschema_rs
 
 from ident_service.errors import ParameterError
 
@@ -29,13 +30,18 @@ def require_schema(content: Any, name: str, where: object, what: str) -> None:
     Raises:
         ParameterError: it does not fit; the first mistakes with their places.
     """
-    mistakes = sorted(_validator(name).iter_errors(content), key=lambda mistake: mistake.json_path)
+    mistakes = [(_place(mistake.instance_path), mistake.message) for mistake in _validator(name).iter_errors(content)]
+    mistakes.sort(key=lambda mistake: mistake[0])
     if mistakes:
-        told = "; ".join(f"{mistake.json_path}: {mistake.message[:200]}" for mistake in mistakes[:_MOST])
+        told = "; ".join(f"{place}: {message[:200]}" for place, message in mistakes[:_MOST])
         raise ParameterError(f"{where}: not {what}: {told}")
 
 
+def _place(path: Sequence[str | int]) -> str:
+    return "$" + "".join(f".{key}" if isinstance(key, str) else f"[{key}]" for key in path)
+
+
 @cache
-def _validator(name: str) -> jsonschema.Draft202012Validator:
+def _validator(name: str) -> jsonschema_rs.Draft202012Validator:
     schema = json.loads(files("ident_service.results").joinpath(f"{name}.schema.json").read_text(encoding="utf-8"))
-    return jsonschema.Draft202012Validator(schema)
+    return jsonschema_rs.Draft202012Validator(schema)

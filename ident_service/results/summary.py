@@ -7,18 +7,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ident_service.estimation.doubt import IDENTIFIED_BELOW, WEAK_BELOW
+from ident_service.estimation.doubt import IDENTIFIED_BELOW, NEGLIGIBLE_TORQUE, WEAK_BELOW
 from ident_service.estimation.identify import Candidate, Estimate
 from ident_service.estimation.least_squares import TorqueError
 from ident_service.results.rows_and_filter import how_fitted, wrapped
 
 
-def summary(estimate: Estimate, unusable: Sequence[str] = ()) -> str:
+def summary(estimate: Estimate, unusable: Sequence[str] = (), torque: str = "commanded") -> str:
     """Describe an estimate in lines no wider than a terminal.
 
     Args:
         estimate: to describe.
         unusable: why it must not be used; that comes first.
+        torque: that the recordings give: `measured`, `commanded`, or `recorded` by another program.
     """
     names = estimate.model.chain.names
     own = estimate.candidates[estimate.chosen]
@@ -26,7 +27,7 @@ def summary(estimate: Estimate, unusable: Sequence[str] = ()) -> str:
     lines = [
         *_refusal(unusable),
         f"{estimate.model.config.name}: {estimate.base.size} base parameters of {len(estimate.base.names)} link "
-        f"parameters, from {estimate.samples} samples",
+        f"parameters, from {estimate.samples} samples of {torque} torque",
         f"condition number of the regressor: {estimate.fit.condition_number:.1f}",
         "",
         _feasibility(estimate),
@@ -53,9 +54,9 @@ def summary(estimate: Estimate, unusable: Sequence[str] = ()) -> str:
     lines += [
         "",
         ", ".join(f"{count} {word}" for word, count in counts.items())
-        + f" (standard deviation below {IDENTIFIED_BELOW:.0%}, below {WEAK_BELOW:.0%}, above)",
-        "  of the larger of the parameter's size and the reference of its unit, below which it is as good as zero;",
-        "  a deviation from few blocks counts for more, by Student's t",
+        + f" (standard deviation below {IDENTIFIED_BELOW:.0%} of the parameter, below {WEAK_BELOW:.0%}, above;",
+        f"  or below {NEGLIGIBLE_TORQUE * IDENTIFIED_BELOW:.0%}, {NEGLIGIBLE_TORQUE * WEAK_BELOW:.0%} of the torque of"
+        " every joint that feels it; widened by Student's t where few stretches of motion tell it)",
     ]
     doubtful = [i for i, verdict in enumerate(estimate.verdicts) if verdict != "identified"]
     for i in doubtful:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cvxpy as cp
 import numpy as np
 import pytest
 from certificate_samples import random_bodies, random_config, table_1
@@ -47,6 +46,8 @@ def _read(text: str) -> tuple[Array, list[int], dict[int, dict[int, Array]]]:
 
 
 def _optimum(text: str, solver: str, **settings: float) -> float:
+    import cvxpy as cp  # loads for a second, which every worker that collects this file would pay
+
     objective, sizes, matrices = _read(text)
     x = cp.Variable(len(objective))
     constraints = []

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from helpers.changed_arms import COARSE, changed, identified_folder
+from helpers.once import made_once
 
 from ident_service.cli import main
 
@@ -24,11 +25,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="session")
 def commissioned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folders `accepted` and `again` of the same small arm, and `dry` with 30 % more friction in its elbow."""
-    folder = tmp_path_factory.mktemp("commissioned")
-    identified_folder(changed("planar2", rate=COARSE, seed=1), folder / "accepted")
-    identified_folder(changed("planar2", rate=COARSE, seed=2), folder / "again")
-    identified_folder(changed("planar2", rate=COARSE, seed=3, factors={"fv2": 1.3, "fc2": 1.3}), folder / "dry")
-    return folder
+
+    def make(folder: Path) -> None:
+        identified_folder(changed("planar2", rate=COARSE, seed=1), folder / "accepted")
+        identified_folder(changed("planar2", rate=COARSE, seed=2), folder / "again")
+        identified_folder(changed("planar2", rate=COARSE, seed=3, factors={"fv2": 1.3, "fc2": 1.3}), folder / "dry")
+
+    return made_once(tmp_path_factory, "compared", make)
 
 
 @pytest.fixture

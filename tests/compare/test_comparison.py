@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from importlib.resources import files
@@ -53,7 +54,7 @@ def test_a_drier_elbow_is_named(commissioned: Path, ident: Ident) -> None:
     lines = out.splitlines()
     at = lines.index("CHANGED")
     assert lines[at + 1].startswith("  friction of joint elbow: ")
-    assert "+30% at 0.81 rad/s" in lines[at + 1]
+    assert re.search(r"\+30% at 0\.8\d rad/s", lines[at + 1])
     assert "lubrication" in lines[at + 2]
     assert lines[at + 3] == ""
 

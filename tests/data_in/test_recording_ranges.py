@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,8 @@ from hypothesis import strategies as st
 from made_recordings import moving, whole
 
 from ident_service.cli import main
-from ident_service.cli.remote import recording as remote_recording
+from ident_service.cli.remote_recordings import recording
+from ident_service.client import IdentClient
 from ident_service.config.load import load_arm
 from ident_service.config.recording import RecordingFormat
 from ident_service.config.schema import ArmConfig
@@ -178,10 +180,16 @@ def test_words_that_cannot_be_meant(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert not (tmp_path / "out").exists()
 
 
+def remote_recording(path: Path) -> dict[str, object]:
+    """Name a recording of a daemon, which is not asked for that."""
+    client = IdentClient("http://127.0.0.1:1", "token")
+    return recording(client, argparse.Namespace(json=True), "planar2", path)
+
+
 def test_a_daemon_is_asked_for_the_same_range() -> None:
     assert remote_recording(Path("run-1/other.mcap@2.5:")) == {"run": "run-1", "name": "other.mcap", "start": 2.5}
     asked = RecordingOf.model_validate(remote_recording(Path("run-1@1:40")))
-    assert (asked.run, asked.name, asked.start, asked.end) == ("run-1", "run.mcap", 1.0, 40.0)
+    assert (asked.run, asked.name, asked.start, asked.end) == ("run-1", None, 1.0, 40.0)
     assert range_words(asked) == "@1.000000000:40.000000000"
     assert split_range(f"run.mcap{range_words(asked)}") == ("run.mcap", (1.0, 40.0))
     assert range_words(RecordingOf(run="run-1")) == ""

@@ -25,6 +25,7 @@ from ident_service.estimation.feasible.feasibility import (
     feasibility_test,
 )
 from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
+from ident_service.estimation.feasible.posing import insets
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares, torque_error
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters, base_from_expressions, base_parameters
@@ -71,14 +72,21 @@ def second_test(beta: np.ndarray, base: BaseParameters, kind: str, solver: str) 
 
 
 def second_nearest(
-    metric: np.ndarray, target: np.ndarray, base: BaseParameters, kind: str, solver: str, *, schur: bool = True
+    metric: np.ndarray,
+    target: np.ndarray,
+    base: BaseParameters,
+    kind: str,
+    solver: str,
+    *,
+    schur: bool = True,
+    inset: float = EPSILON,
 ) -> tuple[np.ndarray, float]:
     """BPFC (eq. 55) and FBPE (eq. 74), the norm bounded by the Schur complement of eqs. 54 and 73 or by a cone."""
     delta = cp.Variable(len(base.names))
     # A column of the metric's own size keeps the matrix well scaled.
     size = np.linalg.norm(metric, ord=2)
     rest = (target - metric @ (base.K @ delta)) / size
-    constraints = second_conditions(kind, base.names, delta, EPSILON, TOTAL_MASS)
+    constraints = second_conditions(kind, base.names, delta, inset, TOTAL_MASS)
     if schur:
         u, column = cp.Variable((1, 1)), cp.reshape(rest, (len(target), 1), order="C")
         matrix = cp.bmat([[u, column.T], [column, np.eye(len(target))]])
@@ -147,12 +155,40 @@ def test_the_wam_s_problems_are_those_of_a_second_formulation(wam7: ArmModel, ki
     corrected = feasibility_correction(fit.beta, base, conditions)
     # A Schur matrix of this size takes the second formulation ten seconds and costs it digits; smaller arms have it.
     theirs, distance = second_nearest(np.eye(base.size), fit.beta, base, kind, "CLARABEL", schur=False)
-    assert corrected.objective == pytest.approx(distance, rel=1e-5)
+    _, without_inset = second_nearest(np.eye(base.size), fit.beta, base, kind, "CLARABEL", schur=False, inset=0.0)
+    # Small links may come nearer to the boundary than the paper's inset.
+    assert without_inset * (1.0 - 1e-5) < corrected.objective < distance * (1.0 + 1e-5)
+    assert distance == pytest.approx(without_inset, rel=1e-4)
     np.testing.assert_allclose(corrected.beta, theirs, rtol=0, atol=1e-4)
     constrained = constrained_least_squares(fit, base, conditions)
     theirs, residual = second_nearest(fit.R1, fit.rho1, base, kind, "CLARABEL", schur=False)
-    assert residual * (1.0 - 1e-4) < constrained.objective < residual * (1.0 + 1e-6)
+    _, without_inset = second_nearest(fit.R1, fit.rho1, base, kind, "CLARABEL", schur=False, inset=0.0)
+    assert without_inset * (1.0 - 1e-4) < constrained.objective < residual * (1.0 + 1e-6)
     assert np.linalg.norm(fit.R1 @ (constrained.beta - theirs)) < 0.01 * residual
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_finger_of_three_grams_keeps_its_torques(wam7: ArmModel, kind: FeasibleSetName) -> None:
+    """The paper's inset of 1e-6 is more than the finger's moments of inertia."""
+    base = base_parameters(wam7.chain, wam7.layout)
+    assert wam7.prior is not None
+    delta = dict(zip(wam7.layout.names, wam7.prior, strict=True))
+    mass, length = 0.003, 0.03
+    for name in delta:
+        if name.endswith("7"):
+            delta[name] = 0.0
+    delta |= {"m7": mass, "lx7": mass * length / 2, "Lxx7": 2e-8}
+    delta |= dict.fromkeys(("Lyy7", "Lzz7"), mass * length**2 / 3 + 1e-8)
+    information = random_information(wam7, base, np.array(list(delta.values())), noise=0.0)
+    fit = ordinary_least_squares(information)
+    conditions = feasible_set(kind, base.names)
+    inside = insets(conditions, base, fit.beta)
+    assert inside.max() == EPSILON
+    assert inside.min() < 1e-9
+    found = constrained_least_squares(fit, base, conditions)
+    assert found.margin > 0.0
+    errors = np.sqrt(information.squared_residuals(found.beta) / information.squared_torques())
+    assert errors[6] < 0.01
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
 import pytest
 from estimation.synthetic import SampledRecording, exact_torque, random_information, stamps, waves
@@ -152,6 +151,8 @@ def test_a_custom_bound_is_the_declared_one(setting: Setting) -> None:
 
 @pytest.mark.parametrize("kind", ["euclidean", "entropic"])
 def test_a_custom_penalty_counts_as_a_prior_does(setting: Setting, kind: Any) -> None:
+    import cvxpy as cp  # loads for a second, which every worker that collects this file would pay
+
     plain = setting.plain
     assert setting.model.prior is not None
     center = setting.model.prior.copy()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import reduce
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from helpers.plain import plain_friction, plain_options, plain_smoothing
 from ident_service.config.schema import Reversal
 from ident_service.errors import RecordingError
 from ident_service.estimation import friction_trials
-from ident_service.estimation.equations import Equations, equations
+from ident_service.estimation.equations import equations
 from ident_service.estimation.friction_fit import with_friction
 from ident_service.estimation.friction_trials import FrictionTrials
 from ident_service.model.arm_model import ArmModel
@@ -37,7 +36,7 @@ def both(model: ArmModel, recordings: list[SampledRecording], x0: np.ndarray, v_
     """Give each joint's Gram matrix of all rows, by exchange and then by reading everything again."""
     base = base_parameters(model.chain, model.layout)
     shape = plain_friction(presliding=tuple(x0.tolist()), stribeck_velocity=tuple(v_s.tolist()))
-    again = reduce(Equations.joined, (equations(one, with_friction(model, shape), base) for one in recordings))
+    again = equations(recordings, with_friction(model, shape), base)
     trials = FrictionTrials(recordings, model, base).equations(x0, v_s)
     np.testing.assert_array_equal(trials.total.rows, again.everything.rows)
     assert len(trials.blocks) == 3

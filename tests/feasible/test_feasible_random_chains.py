@@ -48,7 +48,7 @@ HARD = (22, 25, 42, 54, 61)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [*range(4), *HARD])
+@pytest.mark.parametrize("seed", [0, *HARD])
 def test_random_chains_are_solved(seed: int) -> None:
     check_all_answers(seed)
 

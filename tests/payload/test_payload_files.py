@@ -13,6 +13,7 @@ import pinocchio as pin
 import pytest
 from compare.conftest import Ident
 from helpers.changed_arms import COARSE, changed, identified_folder, recorded_arm
+from helpers.once import made_once
 
 from ident_service.certificate_verifier import verify
 from ident_service.record.cycle import Cycle
@@ -38,12 +39,14 @@ TOOL = {
 @pytest.fixture(scope="session")
 def arms(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folders of results `bare` and `tooled`, recordings `bare.mcap` and `tooled.mcap`."""
-    folder = tmp_path_factory.mktemp("arms")
-    identified_folder(changed("planar2", rate=COARSE, seed=11), folder / "bare")
-    identified_folder(changed("planar2", rate=COARSE, seed=12, added=TOOL), folder / "tooled")
-    recorded_arm(changed("planar2", rate=COARSE, seed=13), folder / "bare.mcap")
-    recorded_arm(changed("planar2", rate=COARSE, seed=14, added=TOOL), folder / "tooled.mcap")
-    return folder
+
+    def make(folder: Path) -> None:
+        identified_folder(changed("planar2", rate=COARSE, seed=11), folder / "bare")
+        identified_folder(changed("planar2", rate=COARSE, seed=12, added=TOOL), folder / "tooled")
+        recorded_arm(changed("planar2", rate=COARSE, seed=13), folder / "bare.mcap")
+        recorded_arm(changed("planar2", rate=COARSE, seed=14, added=TOOL), folder / "tooled.mcap")
+
+    return made_once(tmp_path_factory, "payload", make)
 
 
 def within(document: dict[str, object], truth: dict[str, float], sign: float) -> None:

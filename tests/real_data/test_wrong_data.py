@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from real_data.conftest import Identified
 
 from benchmarks.real_data import CASES, DATA
 from ident_service.cli import main
@@ -46,10 +47,22 @@ class Changed:
         self.sha256 = self.behind.sha256
 
     def blocks(self, samples: int = 1 << 30) -> Iterator[Block]:
-        parts = list(self.behind.blocks())
-        position, torque = (np.concatenate([getattr(one, name) for one in parts]) for name in ("position", "torque"))
+        stamp_ns, position, torque = (part.copy() for part in whole(self.behind))
         self.change(position, torque)
-        yield Block(np.concatenate([one.stamp_ns for one in parts]), position, torque)
+        yield Block(stamp_ns, position, torque)
+
+
+_READ: dict[str, tuple[np.ndarray, ...]] = {}
+
+
+def whole(recording: Recording) -> tuple[np.ndarray, ...]:
+    """Read stamps, positions and torques of a recording, of each file once."""
+    if recording.sha256 not in _READ:
+        parts = list(recording.blocks())
+        _READ[recording.sha256] = tuple(
+            np.concatenate([getattr(one, name) for one in parts]) for name in ("stamp_ns", "position", "torque")
+        )
+    return _READ[recording.sha256]
 
 
 def kuka(**changes: Any) -> ArmConfig:
@@ -100,6 +113,7 @@ def spike(position: np.ndarray, torque: np.ndarray) -> None:
     position[2000:2005, 3] += 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -116,6 +130,7 @@ def test_wrong_columns(change: Change, words: str) -> None:
     assert re.search(words, "\n".join(judged(change)))
 
 
+@pytest.mark.slow
 def test_a_spike_and_wrong_units_of_an_arm_without_limits() -> None:
     bare = kuka(joints={})
     (first, *_) = judged(spike, bare)
@@ -126,6 +141,7 @@ def test_a_spike_and_wrong_units_of_an_arm_without_limits() -> None:
     assert "its torque error is" in first or "are the positions in degrees?" in first
 
 
+@pytest.mark.slow
 def test_gravity_upside_down() -> None:
     (reason,) = judged(nothing, kuka(gravity=(0.0, 0.0, 9.81)))
     assert "without the conditions of a real body: gravity, signs, order or units" in reason
@@ -135,6 +151,7 @@ def test_gravity_upside_down() -> None:
 CRAIG = ((0.0, 0.3105), ("pi/2", 0.0), ("-pi/2", 0.4), ("-pi/2", 0.0), ("pi/2", 0.39), ("pi/2", 0.0), ("-pi/2", 0.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("convention", ["modified", "standard"])
 def test_standard_for_modified_dh(convention: str) -> None:
     rows = {f"lwr_{k}_joint": {"alpha": alpha, "d": d} for k, (alpha, d) in enumerate(CRAIG)}
@@ -148,24 +165,27 @@ def test_standard_for_modified_dh(convention: str) -> None:
         assert "DH convention" in reason
 
 
-def test_sound_recordings_are_not_objected_to() -> None:
+@pytest.mark.slow
+def test_sound_recordings_are_not_objected_to(identified: Identified) -> None:
     for case in CASES:
-        model = arm_model(load_arm(case.arm).model_copy(update={"identification": Identification()}))
+        model = arm_model(load_arm(case.arm))
         config = model.config
+        assert config.identification == Identification()
         paths = [DATA / case.folder / name for name in (case.fitted, case.judged) if name]
         recordings = [
             open_recording(path, model.chain.names, fmt=config.recording, transmission=config.transmission)
             for path in paths
         ]
-        estimate = identify(model, recordings[:1], recordings[1:])
+        estimate = identified(case.arm)
         assert unusable_because(estimate, [(one, recording_quality(one, model)) for one in recordings]) == ()
 
 
+@pytest.mark.slow
 def test_the_command_says_no_where_people_look(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lines = [",".join(["t", *(f"q{k}" for k in range(1, 8)), *(f"tau{k}" for k in range(1, 8))])]
     model = arm_model(load_arm("kuka_lwr4"))
-    whole = Changed(open_recording(DATA / KUKA.folder / KUKA.fitted, model.chain.names), negated)
-    for block in whole.blocks():
+    wrong = Changed(open_recording(DATA / KUKA.folder / KUKA.fitted, model.chain.names), negated)
+    for block in wrong.blocks():
         table = np.column_stack([block.stamp_ns * 1e-9, block.position, block.torque])
         lines += [",".join(f"{value:.9g}" for value in row) for row in table]
     (tmp_path / "run.csv").write_text("\n".join(lines) + "\n")

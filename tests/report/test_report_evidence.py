@@ -111,7 +111,7 @@ Change = Callable[[dict[str, Any]], object]
     [
         (lambda c: c.update(format="other"), "not evidence of an identification"),
         (lambda c: c.update(version=2), "evidence of version 2, but this software reads version 1"),
-        (lambda c: c.pop("timing"), "'timing' is a required property"),
+        (lambda c: c.pop("timing"), '"timing" is a required property'),
         (lambda c: c["timing"].pop(), "not one timing per recording"),
         (lambda c: c["estimates"][0]["values"].pop(), "do not belong together: estimate 'CAD' has"),
         (lambda c: c.update(chosen=99), "chosen is estimate 99 of"),

@@ -131,10 +131,9 @@ def test_the_chosen_estimate_is_marked_where_no_set_holds_it(bare: Made) -> None
 
 def test_the_rule_of_the_verdicts_stands_at_the_table(good: Made) -> None:
     words = sections(good.page)["parameters"].words
-    assert "below 10 % of the larger of the parameter's size and the reference of its unit" in words
-    assert "0.01 for kg m^2 and kg m, 0.1 for kg, N m s/rad, N m, N s/m, N, N m s^2/rad^2 and N s^2/m^2" in words
-    assert "A \u03c3 from few blocks counts for more, by Student's t." in words
-    assert "\u03c3 is that of the unconstrained fit" in words
+    assert "below 10 % of the parameter, or changes no joint's torque by more than 1 %" in words
+    assert "below 50 % of the parameter, or 5 % of the torque" in words
+    assert "widened by Student's t. It is that of the unconstrained fit" in words
 
 
 def test_a_bound_stands_where_it_binds(good: Made) -> None:

@@ -24,7 +24,7 @@ from ident_service.estimation.feasible.conic import triangle_entries
 from ident_service.estimation.feasible.consistency import ConditionsError, contradiction
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.feasible.nearest import FeasibleEstimate
-from ident_service.estimation.feasible.posing import EPSILON, MULTIPLIER, OF_ESTIMATES, check, largest, project, traces
+from ident_service.estimation.feasible.posing import MULTIPLIER, OF_ESTIMATES, check, insets, largest, project, traces
 from ident_service.estimation.feasible.priors import Prior, residual_deviation
 from ident_service.estimation.least_squares import LeastSquares, unit_columns
 from ident_service.model.base import BaseParameters
@@ -196,7 +196,8 @@ class _Posed:
         self._scales = np.array([reference(name) for name in base.names])
         self._x = cp.Variable(len(base.names))
         delta = cp.multiply(self._scales, self._x)
-        self._blocks = [self._block(block) for block in conditions.blocks]
+        inside = insets(conditions, base, fit.beta)
+        self._blocks = [self._block(*pair) for pair in zip(conditions.blocks, inside.tolist(), strict=True)]
         E, e = conditions.equality_rows()
         self._equalities = [(E * self._scales) @ self._x + e == 0.0] if len(e) else []
         self._known: Sequence[cp.Constraint] = ()
@@ -209,11 +210,11 @@ class _Posed:
         self._objective = cp.Minimize(self._cost())
         self._iterations, self._seconds = 0, 0.0
 
-    def _block(self, block: Block) -> cp.Constraint:
+    def _block(self, block: Block, inset: float) -> cp.Constraint:
         """State a condition with the inset of eq. 21."""
         import cvxpy as cp
 
-        entries = (block.F * self._scales) @ self._x + (block.f - EPSILON * block.identity())
+        entries = (block.F * self._scales) @ self._x + (block.f - inset * block.identity())
         if block.size == 0:
             return entries >= 0.0
         places = {pair: k for k, pair in enumerate(triangle_entries(block.size))}

@@ -24,6 +24,7 @@ from ident_service.estimation.feasible.posing import (
     Lift,
     check,
     constrain,
+    insets,
     minimise,
     pressing,
     traces,
@@ -202,6 +203,9 @@ def _unless_feasible(
     except SolverError:
         return found
     size = max(1.0, float(np.max(np.abs(beta), initial=0.0)))
-    if tested.margin < EPSILON or np.max(traces(conditions) @ tested.delta, initial=0.0) > reach * size:
+    if (
+        tested.margin < insets(conditions, base, beta).min()
+        or np.max(traces(conditions) @ tested.delta, initial=0.0) > reach * size
+    ):
         return found
     return replace(found, beta=beta, delta=tested.delta, objective=0.0, margin=tested.margin, tight=())

@@ -13,13 +13,13 @@ from ident_service.estimation.feasible.conic import ConicProblem, Solution
 from ident_service.estimation.feasible.consistency import ConditionsError, contradiction
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.feasible.posing import (
-    EPSILON,
     OF_ESTIMATES,
     Lift,
     constrain,
     minimise,
     pressing,
     project,
+    with_insets,
 )
 from ident_service.estimation.least_squares import unit_columns
 from ident_service.model.base import BaseParameters
@@ -66,9 +66,9 @@ class FeasibleEstimate:
         return replace(self, delta=delta, margin=conditions.margin(delta)[0])
 
 
-def hold(problem: ConicProblem, conditions: FeasibleSet, to_delta: Array, inset: float = EPSILON) -> None:
-    """Every block of the set with the paper's inset (eq. 21), every equality exactly; delta = to_delta x."""
-    for block in conditions.blocks:
+def hold(problem: ConicProblem, conditions: FeasibleSet, to_delta: Array, inside: Array) -> None:
+    """Every block of the set with its inset (eq. 21, `insets`), every equality exactly; delta = to_delta x."""
+    for block, inset in zip(conditions.blocks, inside, strict=True):
         constrain(problem, block, block.times(to_delta), block.f - inset * block.identity())
     E, e = conditions.equality_rows()
     if len(e):
@@ -151,6 +151,21 @@ def nearest(
         ConditionsError: no parameters at all fulfil the conditions.
         SolverError: the solver stopped without an optimum.
     """
+    return with_insets(
+        lambda inside: _nearest(metric, target, beta, base, conditions, name, reaches, inside), conditions, base, beta
+    )
+
+
+def _nearest(
+    metric: Array,
+    target: Array,
+    beta: Array,
+    base: BaseParameters,
+    conditions: FeasibleSet,
+    name: str,
+    reaches: Sequence[float],
+    inside: Array,
+) -> FeasibleEstimate:
     lift = Lift(base)
     n, variables = base.size, len(base.names) + 1
     problem = ConicProblem(variables)
@@ -164,7 +179,7 @@ def nearest(
     distance[1:, :n] = metric * columns / scale
     problem.second_order(distance, np.concatenate([[0.0], -target / scale]))
     to_delta = np.column_stack([lift.of_beta * columns, lift.of_dependent, np.zeros(len(base.names))])
-    hold(problem, conditions, to_delta)
+    hold(problem, conditions, to_delta, inside)
     size = float(np.max(np.abs(beta), initial=0.0))
     best: FeasibleEstimate | None = None
     failure: SolverError | None = None

@@ -10,21 +10,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
 from ident_service.errors import ParameterError, SolverError
+from ident_service.estimation.feasible.blocks import reference
 from ident_service.estimation.feasible.conic import ConicProblem, Solution
 from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 
-EPSILON = 1e-6  # eq. 21, the paper's margin
+EPSILON = 1e-6  # eq. 21, the paper's margin, for links of about the size that the reference scales are of
+_LEAST_INSET = 1e-11  # what a solver can tell from the boundary
 MULTIPLIER = 1e-6  # smaller ones are the interior-point method's own distance from the boundary
 # Bounds of tr(P) to try, in turn: kg and kg m^2, times the largest base parameter or bound if that is above 1.
 OF_TESTS = (np.inf, 1e4, 1e3, 1e2)
 OF_TABLES = (1e4, 1e3, 1e2)  # the nearest feasible table; the paper's table 1 takes masses of thousands of kg to print
 OF_ESTIMATES = (1e2, 1e3, 1e4)
+
+
+Solved = TypeVar("Solved")
 
 
 class Lift:
@@ -42,6 +48,59 @@ class Lift:
     def delta(self, beta: Array, dependent: Array) -> Array:
         """Link parameters, shape (parameters,)."""
         return np.asarray(self.of_beta @ beta + self.of_dependent @ dependent)
+
+
+def insets(conditions: FeasibleSet, base: BaseParameters, beta: Array) -> Array:
+    """Give how far inside each block the estimates stay: eq. 21 for links of usual size, less for smaller ones.
+
+    A millionth of a kg m^2 is what the finger of a hand has. How small a link is shows in the base parameters that its
+    own parameters lead.
+
+    Args:
+        conditions: the set.
+        base: grouping of the parameters.
+        beta: unconstrained base parameters, shape (base,).
+
+    Returns:
+        One inset per block, shape (blocks,).
+    """
+    sizes: dict[str, float] = {}
+    for column, value in zip(base.base, beta, strict=True):
+        name = base.names[column]
+        if name.startswith(("L", "l", "m")):
+            size = abs(float(value)) / reference(name)
+            sizes[_link(name)] = max(sizes.get(_link(name), 0.0), size)
+    found = []
+    for block in conditions.blocks:
+        felt = {_link(base.names[column]) for column in np.flatnonzero(np.any(block.F != 0.0, axis=0))}
+        size = max((sizes.get(link, 1.0) for link in felt), default=1.0)
+        found.append(max(EPSILON * min(1.0, size), _LEAST_INSET))
+    return np.array(found)
+
+
+def with_insets(solve: Callable[[Array], Solved], conditions: FeasibleSet, base: BaseParameters, beta: Array) -> Solved:
+    """Solve with insets for the links' sizes, and with the paper's where those are too small for the solver.
+
+    Args:
+        solve: from one inset per block to the solution.
+        conditions: the set.
+        base: grouping of the parameters.
+        beta: unconstrained base parameters, shape (base,).
+
+    Raises:
+        SolverError: neither can be solved.
+    """
+    inside = insets(conditions, base, beta)
+    try:
+        return solve(inside)
+    except SolverError:
+        if (inside == EPSILON).all():
+            raise
+        return solve(np.full_like(inside, EPSILON))
+
+
+def _link(name: str) -> str:
+    return name[len(name.rstrip("0123456789")) :]
 
 
 def constrain(problem: ConicProblem, block: Block, F: Array, f: Array) -> None:

@@ -26,7 +26,7 @@ from ident_service.estimation.feasible.blocks import reference, symmetric
 from ident_service.estimation.feasible.conic import ConicProblem, triangle_entries
 from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet, feasible_set
 from ident_service.estimation.feasible.nearest import FeasibleEstimate, hold, solve_inside
-from ident_service.estimation.feasible.posing import OF_TESTS, pressing
+from ident_service.estimation.feasible.posing import OF_TESTS, pressing, with_insets
 from ident_service.estimation.least_squares import LeastSquares
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
@@ -137,6 +137,12 @@ def towards_prior(fit: LeastSquares, base: BaseParameters, conditions: FeasibleS
     """
     if prior.names != conditions.names:
         raise ParameterError("the prior and the feasible set are about different link parameters")
+    return with_insets(lambda inside: _towards_prior(fit, base, conditions, prior, inside), conditions, base, fit.beta)
+
+
+def _towards_prior(
+    fit: LeastSquares, base: BaseParameters, conditions: FeasibleSet, prior: Prior, inside: Array
+) -> FeasibleEstimate:
     sigma = residual_deviation(fit) if prior.sigma is None else prior.sigma
     n, links = len(prior.names), prior.whitened if prior.kind == "entropic" else ()
     rows = len(fit.rho1)
@@ -145,7 +151,7 @@ def towards_prior(fit: LeastSquares, base: BaseParameters, conditions: FeasibleS
     problem = ConicProblem(variables)
     to_delta = np.zeros((n, variables))
     to_delta[:, :n] = np.diag(prior.scales)
-    hold(problem, conditions, to_delta)
+    hold(problem, conditions, to_delta, inside)
     residual = np.zeros((rows, variables))
     residual[:, :n] = fit.R1 @ base.K * prior.scales / sigma
     residual[:, n : n + rows] = -np.eye(rows)

@@ -17,7 +17,7 @@ from ident_service.errors import ParameterError
 from ident_service.estimation.feasible.conic import ConicProblem
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.feasible.nearest import FeasibleEstimate, hold, solve_inside
-from ident_service.estimation.feasible.posing import Lift, check, pressing
+from ident_service.estimation.feasible.posing import Lift, check, insets, pressing
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.information import Information, triangle
@@ -93,7 +93,8 @@ def constrained_least_squares_with_scales(
     to_delta = np.zeros((len(base.names), variables))
     to_delta[:, :n] = lift.of_beta
     to_delta[:, n : factors.start] = lift.of_dependent
-    hold(problem, conditions, to_delta)
+    guess = np.linalg.lstsq(R[:, :n], -R[:, n:].sum(axis=1), rcond=None)[0]
+    hold(problem, conditions, to_delta, insets(conditions, base, guess))
     if free:
         pick = np.zeros((len(free), variables))
         pick[:, factors] = np.eye(len(free))
@@ -101,7 +102,6 @@ def constrained_least_squares_with_scales(
         problem.nonnegative(np.vstack([pick, -pick]), np.concatenate([-lower, upper]))
     objective = np.append(np.zeros(variables - 1), 1.0)
     name = "constrained least squares with torque scales"
-    guess = np.linalg.lstsq(R[:, :n], -R[:, n:].sum(axis=1), rcond=None)[0]
     size = float(np.max(np.abs(guess), initial=0.0))
     delta, solution = solve_inside(problem, objective, name, to_delta, conditions, size)
     beta = base.K @ delta

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ident_service.estimation.doubt import IDENTIFIED_BELOW, REFERENCE, WEAK_BELOW
+from ident_service.estimation.doubt import IDENTIFIED_BELOW, WEAK_BELOW
 from ident_service.results.drawing import Array, Axes, Canvas, number
 from ident_service.results.drawing_chart import FONT, draw_frame, draw_key
 from ident_service.results.parameter_file import ParameterFile
@@ -19,14 +19,13 @@ _PAIRS = 5
 
 
 def relative_deviations(parameters: ParameterFile) -> Array:
-    """Each standard deviation over the larger of the parameter's size and its unit's reference; NaN where unknown."""
+    """Each standard deviation over the parameter's size, or over what is as good as zero; NaN where unknown."""
     table = parameters.content["base_parameters"]
     deviations = np.array([np.nan if one is None else one for one in table.get("standard_deviations", [])], float)
     if len(deviations) != len(parameters.values):
         return np.full(len(parameters.values), np.nan)
-    units = table.get("units", [""] * len(deviations))
-    floor = np.array([REFERENCE.get(unit, 0.0) for unit in units])
-    return np.asarray(deviations / np.maximum(np.maximum(np.abs(parameters.values), floor), np.finfo(float).tiny))
+    as_zero = np.array([0.0 if one is None else one for one in table.get("negligible", [0.0] * len(deviations))])
+    return np.asarray(deviations / np.maximum(np.maximum(np.abs(parameters.values), as_zero), np.finfo(float).tiny))
 
 
 def correlations(parameters: ParameterFile) -> Array | None:

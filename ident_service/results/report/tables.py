@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ident_service.estimation.doubt import IDENTIFIED_BELOW, REFERENCE, WEAK_BELOW, Verdict
+from ident_service.estimation.doubt import IDENTIFIED_BELOW, NEGLIGIBLE_TORQUE, WEAK_BELOW, Verdict
 from ident_service.results.drawing import number
 from ident_service.results.evidence.evidence import Array, Condition, Evidence
 from ident_service.results.evidence.making import CAD
@@ -36,7 +36,8 @@ def parameter_table(evidence: Evidence, parameters: ParameterFile) -> str:
         "\u03c3",
         "verdict",
     ]
-    heads += [*(name for name, _ in others), "bound"]
+    intervals = content.get("constrained_intervals")
+    heads += [*(name for name, _ in others), *(["95 % inside the set"] if intervals else []), "bound"]
     rows = []
     for k, expression in enumerate(content["expressions"]):
         cells = [Cell(str(k + 1)), Cell(expression, kind="expression"), Cell(units[k], kind="unit")]
@@ -44,6 +45,9 @@ def parameter_table(evidence: Evidence, parameters: ParameterFile) -> str:
         cells.append(Cell("not seen", kind="bad") if deviations[k] is None else _number(deviations[k], 2))
         cells.append(Cell(verdicts[k], kind=_MARKS.get(verdicts[k], "")))
         cells += [_NOTHING if values is None else _number(float(values[k])) for _, values in others]
+        if intervals:
+            ends = [end for end in intervals[k] if end is not None]
+            cells.append(Cell(f"{number(ends[0], 3)} to {number(ends[1], 3)}") if len(ends) == 2 else _NOTHING)
         bounds = "; ".join(evidence.bounds[k])
         cells.append(Cell(bounds) if bounds else _NOTHING)
         rows.append(cells)
@@ -62,21 +66,14 @@ def _others(evidence: Evidence) -> list[tuple[str, Array | None]]:
 
 def verdict_rule() -> str:
     """What the words of the verdict column stand for, and what the deviation beside them is of."""
-    units: dict[float, list[str]] = {}
-    for unit, reference in REFERENCE.items():
-        units.setdefault(reference, []).append(unit)
-    references = ", ".join(f"{number(value)} for {_and(names)}" for value, names in units.items())
+    known, weak, share = 100 * IDENTIFIED_BELOW, 100 * WEAK_BELOW, NEGLIGIBLE_TORQUE
     return (
-        f"Identified: \u03c3 is below {100 * IDENTIFIED_BELOW:g} % of the larger of the parameter's size and the "
-        f"reference of its unit, below which it is as good as zero ({references}); weak: below {100 * WEAK_BELOW:g} %; "
-        "unidentified: above. A \u03c3 from few blocks counts for more, by Student's t. "
-        "\u03c3 is that of the unconstrained fit, also beside a value that a feasible set holds: "
+        f"Identified: \u03c3 is below {known:g} % of the parameter, or changes no joint's torque by more than "
+        f"{share * known:g} % of its root mean square over the motion; weak: below {weak:g} % of the parameter, or "
+        f"{share * weak:g} % of the torque; unidentified: above. A \u03c3 from few stretches of motion is "
+        "widened by Student's t. It is that of the unconstrained fit, also beside a value that a feasible set holds: "
         "it says how far the recordings alone tell the parameter, not how far the value may be off inside the set."
     )
-
-
-def _and(names: list[str]) -> str:
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
 def error_table(evidence: Evidence) -> str:

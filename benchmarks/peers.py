@@ -1,0 +1,110 @@
+"""Whole processes beside each other: our command, and the script that a researcher would write instead.
+
+`python -m benchmarks.peers`, about a minute. An independent plant (pinocchio's inverse dynamics with friction along the
+published motions of the WAM, noise on positions and torques) is written as CSV, 62,500 rows of seven joints. Compared
+are CPU seconds of whole processes, in turns, and torque errors on the other published motion.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+
+from benchmarks.harness import Row, table, write
+from ident_service.config.load import load_arm
+from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.model.rigid_body import pinocchio_model
+from ident_service.model.urdf import urdf_text
+from ident_service.service.score import true_parameters
+
+TURNS = int(os.environ.get("IDENT_BENCH_TURNS", "3"))
+ROWS, RATE = 62_500, 1000.0
+TORQUE_NOISE, POSITION_NOISE = 0.1, 1e-5  # N m, rad
+_DATA = Path(__file__).parents[2] / "shared" / "data" / "wam7"
+_SCRIPT = Path(__file__).with_name("plain_script.py")
+_ARM = "wam7_sim"
+
+
+def measure(folder: Path) -> list[Row]:
+    """All figures."""
+    model = arm_model(load_arm(_ARM))
+    truth = true_parameters(model.config, model)
+    if truth is None:
+        raise ValueError(f"{_ARM} has no simulated plant")
+    for seed, (motion, name) in enumerate((("traj1", "fit"), ("traj2", "unseen"))):
+        _record(model, truth, motion, folder / f"{name}.csv", seed)
+    (folder / "arm.urdf").write_text(urdf_text(model, model.prior), encoding="utf-8")
+    fit, unseen = str(folder / "fit.csv"), str(folder / "unseen.csv")
+    plain = [sys.executable, str(_SCRIPT), str(folder / "arm.urdf"), fit, unseen]
+    ours = [sys.executable, "-m", "ident_service", "identify", fit, "--arm", _ARM, "--json"]
+    seconds: dict[str, list[float]] = {"ours": [], "plain": []}
+    for turn in range(TURNS + 1):
+        for name, words in (("ours", [*ours, "--out", str(folder / f"result{turn}")]), ("plain", plain)):
+            spent, said = _cpu_seconds(words)
+            if turn:  # once for warm files and compiled modules
+                seconds[name].append(spent)
+            if name == "plain":
+                error = json.loads(said)["error_percent"]
+    judged = [*ours, "--validate", unseen, "--out", str(folder / "judged")]
+    _cpu_seconds(judged)
+    own = json.loads((folder / "judged" / "parameters.json").read_text())["validation"][0]["relative_error_percent"]
+    mine, theirs = (statistics.median(seconds[name]) for name in ("ours", "plain"))
+    label = f"{ROWS} rows of seven joints, CSV, CPU of the whole process"
+    return [
+        Row(f"{label}: ident identify", mine, "s", "<= 1.2"),
+        Row(f"{label}: pinocchio + cvxpy, every tenth row", theirs, "s"),
+        Row("ours over the plain script's", mine / theirs, "", "<= 0.8"),
+        Row("torque error on the unseen motion: ident identify", own, "%"),
+        Row("torque error on the unseen motion: pinocchio + cvxpy", error, "%"),
+    ]
+
+
+def _record(model: ArmModel, truth: np.ndarray, motion: str, path: Path, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    series = json.loads((_DATA / f"{motion}_fourier.json").read_text())
+    a, b, q0 = (np.array(series[key]) for key in ("a", "b", "q0"))
+    w = series["wf_rad_s"] * np.arange(1, series["L"] + 1)
+    time = np.arange(ROWS) / RATE
+    sine, cosine = np.sin(time[:, None] * w), np.cos(time[:, None] * w)
+    q = (sine / w) @ a.T - (cosine / w) @ b.T + q0
+    dq, ddq = cosine @ a.T + sine @ b.T, -(sine * w) @ a.T + (cosine * w) @ b.T
+    plant = pinocchio_model(model.chain, model.layout, truth)
+    data = plant.createData()
+    torque = np.array([pin.rnea(plant, data, *state) for state in zip(q, dq, ddq, strict=True)])
+    terms = (model.layout.term_values(term, truth) for term in ("viscous", "coulomb", "offset"))
+    viscous, coulomb, offset = terms
+    torque += viscous * dq + coulomb * np.sign(dq) + offset + TORQUE_NOISE * rng.normal(size=q.shape)
+    q += POSITION_NOISE * rng.normal(size=q.shape)
+    names = [f"{kind}{joint + 1}" for kind in ("q", "tau") for joint in range(q.shape[1])]
+    head = ",".join(["t", *names])
+    np.savetxt(path, np.column_stack([time, q, torque]), delimiter=",", fmt="%.9g", header=head, comments="")
+
+
+def _cpu_seconds(words: Sequence[str]) -> tuple[float, str]:
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(words, check=True, capture_output=True, text=True, env=environment)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, done.stdout
+
+
+def main() -> None:
+    """Measure, print and write."""
+    with tempfile.TemporaryDirectory() as folder:
+        rows = measure(Path(folder))
+    print(table(rows))
+    print(f"written to {write(rows, Path(__file__).parent / 'results', 'peers')}")
+
+
+if __name__ == "__main__":
+    main()
