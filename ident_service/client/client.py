@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Any, Final, Self
 from urllib.parse import quote, urlencode
 
-from ident_service.client.connection import NOTHING, Connection
-from ident_service.errors import IdentError, MotionRefused, UsageError
+from ident_service.client.connection import NOTHING, Connection, job_error
+from ident_service.client.upload import upload
+from ident_service.errors import ArmError, IdentError, MotionRefused, UsageError
 
 _API: Final = "/api/v1"
 _RENEWED: Final = 0.5  # s between renewals of a lease, which lasts four times as long
 _LOOK = 0.3  # s between looks at a job
+_AGAIN, _TRIES = 1.0, 30  # s between tries to take up a stream, and how many
 _LIVE: Final = ("queued", "running")
 
 
@@ -70,6 +73,21 @@ class LiveSample:
     following_error: tuple[float | None, ...]
 
 
+@dataclass(frozen=True)
+class Event:
+    """Something that a daemon tells of its arms and jobs.
+
+    Attributes:
+        kind: `happened` (a line of the audit trail), `job` or `arm` (how one stands), `samples` or `doubt` of a run.
+        number: of what has happened, to go on after it; None for all else.
+        value: `AuditLine`, `JobAnswer`, or as the OpenAPI description says of the stream.
+    """
+
+    kind: str
+    number: int | None
+    value: Mapping[str, Any]
+
+
 class IdentClient(Connection):
     """A daemon, asked over HTTP; used from any thread."""
 
@@ -105,6 +123,35 @@ class IdentClient(Connection):
         """Look at a job."""
         return _job(self.get(f"{_API}/jobs/{_word(job)}"))
 
+    def events(self, *, after: int | None = None, samples: bool = False) -> Iterator[Event]:
+        """Yield what happens to all arms and jobs, for as long as it is asked for.
+
+        A line that is cut is taken up again where it broke off, so nothing that happens is missed or told twice.
+
+        Args:
+            after: number of the last event that was seen, by this program or an earlier one; from now on if None.
+            samples: whether to tell samples and deviations of runs that are recorded.
+
+        Raises:
+            UsageError: the token does not count.
+            ArmError: the daemon cannot be reached for a while.
+        """
+        failed = 0
+        while True:
+            try:
+                headers = {} if after is None else {"Last-Event-ID": str(after)}
+                for kind, number, value in self.stream(
+                    f"{_API}/events" + ("?samples=true" if samples else ""), headers
+                ):
+                    failed, after = 0, after if number is None else number
+                    if kind:
+                        yield Event(kind, number, MappingProxyType(value))
+            except ArmError:
+                failed += 1
+                if failed == _TRIES:
+                    raise
+            time.sleep(_AGAIN)
+
     def jobs(self, *, arm: str | None = None) -> Iterator[Job]:
         """List jobs, or those of an arm, the newest first."""
         return map(_job, self.pages(_listed("jobs", arm)))
@@ -112,6 +159,26 @@ class IdentClient(Connection):
     def runs(self, *, arm: str | None = None) -> Iterator[dict[str, Any]]:
         """List runs, or those of an arm, the newest first (`RunLine`)."""
         return self.pages(_listed("runs", arm))
+
+    def upload(
+        self, arm: str, file: Path, *, columns: str = "", tell: Callable[[float], None] = lambda _: None
+    ) -> dict[str, str]:
+        """Upload a recording of one's own in pieces; what is there already, of an earlier try, is not sent again.
+
+        Args:
+            arm: name of the arm that it is of.
+            file: MCAP or CSV.
+            columns: YAML that says how a CSV is laid out, where the arm's description does not.
+            tell: called with the share that has arrived.
+
+        Returns:
+            The recording as jobs name it: `client.compute("identify", arm=..., recordings=[client.upload(...)])`.
+
+        Raises:
+            UsageError: the file cannot be read, or is no recording by its name.
+            ArmError: the daemon cannot be reached, or has no room for it.
+        """
+        return upload(self, arm, file, columns, tell)
 
     def begin(self, kind: str, *, key: str | None = None, **asked: Any) -> Job:
         """Queue a computation and return at once.
@@ -125,8 +192,19 @@ class IdentClient(Connection):
         return _job(self.post(f"{_API}/jobs", body, {} if key is None else {"Idempotency-Key": key}))
 
     def compute(self, kind: str, *, key: str | None = None, **asked: Any) -> Job:
-        """Queue a computation and wait for its end, which `state` tells; as `begin`."""
-        return self.wait(self.begin(kind, key=key, **asked).id)
+        """Queue a computation and wait for its end; as `begin`.
+
+        Returns:
+            The job: `done`, or `refused` where the verdict is no (not feasible, must not be used).
+
+        Raises:
+            IdentError: it failed, with the error of the command that did it; or somebody cancelled it.
+        """
+        ended = self.wait(self.begin(kind, key=key, **asked).id)
+        if ended.state not in ("done", "refused"):
+            said = self.answer(ended.id).get("error") or {}
+            raise job_error(str(said.get("kind", "")), f"{ended.detail or ended.state} (job {ended.id})")
+        return ended
 
     def wait(self, job: str) -> Job:
         """Wait until a job has ended."""
@@ -231,7 +309,7 @@ class RemoteMotion:
 
     def live(self) -> Iterator[LiveSample]:
         """Yield samples while the run is recorded, until it ends; `uncertainty` has the deviations so far."""
-        for kind, value in self.client.events(f"{_API}/jobs/{self.id}/live"):
+        for kind, _, value in self.client.stream(f"{_API}/jobs/{self.id}/live"):
             if kind == "doubt":
                 self.uncertainty = value
             elif kind == "samples":

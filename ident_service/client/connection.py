@@ -15,7 +15,11 @@ from ident_service.errors import (
     AlreadyThere,
     ArmError,
     ConfigError,
+    Dependent,
+    DriverError,
     IdentError,
+    InUse,
+    ModelError,
     MotionRefused,
     ParameterError,
     RecordingError,
@@ -29,6 +33,8 @@ NOTHING: Final[Mapping[str, Any]] = MappingProxyType({})
 _KINDS: Final[dict[str, type[IdentError]]] = {
     kind.__name__: kind for kind in (UsageError, UnknownId, AlreadyThere, MotionRefused, ParameterError, ArmError)
 }
+
+_OF_JOBS: Final[dict[str, type[IdentError]]] = {kind.__name__: kind for kind in (ModelError, InUse, DriverError)}
 
 
 class Connection:
@@ -74,13 +80,32 @@ class Connection:
         """Have something done; raises as `ask`."""
         return self.ask("POST", path, {} if body is None else body, headers)
 
-    def ask(self, method: str, path: str, body: Any = None, headers: Mapping[str, str] = NOTHING) -> Any:
+    def delete(self, path: str) -> Any:
+        """Delete what stands at a path; raises as `ask`."""
+        return self.ask("DELETE", path)
+
+    def ask(
+        self,
+        method: str,
+        path: str,
+        body: Any = None,
+        headers: Mapping[str, str] = NOTHING,
+        *,
+        patience: float | None = None,
+    ) -> Any:
         """Send one request and return its answer as JSON values.
+
+        Args:
+            method: of HTTP.
+            path: on the daemon.
+            body: JSON values, or bytes that are sent as they are.
+            headers: besides those of the body.
+            patience: how long to wait for the answer [s]; as for every other request if None.
 
         Raises:
             IdentError: the daemon refused, with its own error; or it cannot be reached.
         """
-        return self._document(*self._exchange(method, path, body, headers)[:2])
+        return self._document(*self._exchange(method, path, body, headers, patience)[:2])
 
     def pages(self, path: str) -> Iterator[Any]:
         """Read a list to its end, page by page; raises as `ask`."""
@@ -116,33 +141,45 @@ class Connection:
         """Close."""
         self.close()
 
-    def events(self, path: str) -> Iterator[tuple[str, Any]]:
-        """Read server-sent events until the daemon ends them: kind and JSON value.
+    def stream(self, path: str, headers: Mapping[str, str] = NOTHING) -> Iterator[tuple[str, int | None, Any]]:
+        """Read server-sent events until the daemon ends them: kind, number and JSON value.
+
+        An event without a number has None, one without a value is told for its number alone.
 
         Raises:
             IdentError: as `ask`; or the line was cut.
         """
         try:
-            with self._http.stream("GET", path) as answer:
+            with self._http.stream("GET", path, headers=dict(headers)) as answer:
                 if answer.status_code >= 400:
                     self._document(answer.status_code, answer.read())
-                kind = ""
+                kind, number, data = "", None, None
                 for line in answer.iter_lines():
-                    if line.startswith("event: "):
-                        kind = line.removeprefix("event: ")
-                    elif line.startswith("data: "):
-                        yield kind, json.loads(line.removeprefix("data: "))
+                    name, _, value = line.partition(": ")
+                    if name == "event":
+                        kind = value
+                    elif name == "id":
+                        number = int(value)
+                    elif name == "data":
+                        data = json.loads(value)
+                    elif not line and (data is not None or number is not None):
+                        yield kind, number, data
+                        kind, number, data = "", None, None
         except (httpx.HTTPError, ValueError) as error:
             raise self._unreachable(error) from None
 
-    def _exchange(self, method: str, path: str, body: Any, headers: Mapping[str, str]) -> tuple[int, bytes, str | None]:
+    def _exchange(
+        self, method: str, path: str, body: Any, headers: Mapping[str, str], patience: float | None = None
+    ) -> tuple[int, bytes, str | None]:
         """Return status, body (as far as it is taken) and the path of the next page."""
-        content = None if body is None else json.dumps(body).encode()
-        sent = dict(headers) if content is None else {**headers, "Content-Type": "application/json"}
+        raw = isinstance(body, bytes)
+        content = body if raw or body is None else json.dumps(body).encode()
+        kind = {} if body is None else {"Content-Type": f"application/{'octet-stream' if raw else 'json'}"}
+        sent, timeout = {**headers, **kind}, httpx.USE_CLIENT_DEFAULT if patience is None else patience
         # A connection that lay idle may have been closed meanwhile: what only reads is asked again.
         for last in (False, True) if method == "GET" else (True,):
             try:
-                with self._http.stream(method, path, content=content, headers=sent) as answer:
+                with self._http.stream(method, path, content=content, headers=sent, timeout=timeout) as answer:
                     taken = bytearray()
                     for piece in answer.iter_bytes():
                         taken += piece
@@ -168,9 +205,25 @@ class Connection:
         return document
 
 
+def job_error(kind: str, message: str) -> IdentError:
+    """Return the error with which a job's command ended; `IdentError` itself where it had none.
+
+    Args:
+        kind: name of the error.
+        message: its words.
+    """
+    if kind == RecordingError.__name__:
+        path, _, words = message.partition(": ")
+        return RecordingError(path, words)
+    kinds: dict[str, type[IdentError]] = {ConfigError.__name__: UsageError, **_KINDS, **_OF_JOBS}
+    return kinds.get(kind, IdentError)(message)
+
+
 def _error(url: str, status: int, document: Any) -> IdentError:
     said = document.get("error", {}) if isinstance(document, dict) else {}
     kind, message = str(said.get("kind", "")), str(said.get("message", f"answered {status}"))
+    if kind == InUse.__name__:
+        return InUse(message, [Dependent(**one) for one in said.get("dependents") or ()])
     if kind == ConfigError.__name__:
         return UsageError(message)
     if kind == RecordingError.__name__ or kind not in _KINDS:

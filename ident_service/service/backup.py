@@ -50,7 +50,7 @@ _STEP = 2**20
 REPLACED: Final = "replaced-"
 _ELSEWHERE = frozenset({LOCK, URL_FILE, TOKEN_FILE, FILE, f"{FILE}-wal", f"{FILE}-shm"})
 _OF_THE_MOMENT = frozenset({CONTROLS, "ticket.json"})  # of an arm
-_RECORDINGS = (".mcap", ".mcap.partial")
+_HALF = (".mcap", ".mcap.partial")  # of a run that the registry does not know
 
 
 @dataclass(frozen=True)
@@ -172,9 +172,12 @@ def _copy_registry(registry: Path, snapshot: Path, *, recordings: bool) -> None:
 
 
 def _add_files(tar: tarfile.TarFile, state: Path, snapshot: Path, *, recordings: bool) -> tuple[dict[str, str], int]:
-    hashes, total = dict[str, str](), 0
+    hashes, total, left = dict[str, str](), 0, frozenset[str]()
+    if not recordings:
+        with closing(sqlite3.connect(snapshot)) as registry:
+            left = frozenset(f"runs/{run}/{name}" for run, name in registry.execute("SELECT run, name FROM recordings"))
     for name, path in (FILE, snapshot), *_documents(state):
-        if not recordings and name.startswith("runs/") and name.endswith(_RECORDINGS):
+        if not recordings and (name in left or (name.startswith("runs/") and name.endswith(_HALF))):
             continue
         try:
             fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)

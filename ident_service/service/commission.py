@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 from drivers.arm import Arm
@@ -191,13 +190,3 @@ def score_document(scored: Score) -> dict[str, object]:
         "validation_residual_ratio": scored.residual_ratio,
         "deviations_sigma": scored.deviations.tolist(),
     }
-
-
-def new_run_folder(state: Path, arm: str, kind: str = "runs") -> Path:
-    """A folder name under the state folder that no earlier run, or other thing of the `kind`, has."""
-    stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-    folder, count = state / kind / f"{stamp}-{arm}", 1
-    while folder.exists():
-        count += 1
-        folder = state / kind / f"{stamp}-{arm}-{count}"
-    return folder

@@ -14,6 +14,7 @@ from ident_service.config.limits import motion_limits
 from ident_service.config.load import load_arm
 from ident_service.errors import MotionRefused
 from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.model.base import base_parameters, remarks_on_angles
 from ident_service.motion.after_stop import AfterStop, after_stop
 from ident_service.motion.preflight.stability import StabilityReport, delay_of, stability
 from ident_service.service.bus import bus_lines, require_budget
@@ -28,12 +29,14 @@ class CheckedDescription:
         budget: of its buses; None for an arm without CANopen drives.
         gains: how stable they are; None for an arm that can be identified but not moved.
         after_stop: what follows a stop, or why nothing may move; None likewise.
+        warnings: what is allowed and probably not meant, in words.
     """
 
     model: ArmModel
     budget: Budget | None
     gains: StabilityReport | None
     after_stop: AfterStop | str | None
+    warnings: tuple[str, ...] = ()
 
     @property
     def good(self) -> bool:
@@ -54,15 +57,16 @@ def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescri
     """
     model = arm_model(load_arm(arm, upload=upload))
     budget = require_budget(arm, model.config)
+    warnings = remarks_on_angles(base_parameters(model.chain, model.layout))
     try:
         limits = motion_limits(model.config)
     except MotionRefused:  # an arm that is only identified needs none
-        return CheckedDescription(model, budget, None, None)
+        return CheckedDescription(model, budget, None, None, warnings)
     try:
         follows: AfterStop | str | None = None if model.prior is None else after_stop(model, limits)
     except MotionRefused as refusal:
         follows = str(refusal)
-    return CheckedDescription(model, budget, stability(model, limits, delay_of(model.config)), follows)
+    return CheckedDescription(model, budget, stability(model, limits, delay_of(model.config)), follows, warnings)
 
 
 def description_document(checked: CheckedDescription) -> dict[str, Any]:
@@ -73,6 +77,7 @@ def description_document(checked: CheckedDescription) -> dict[str, Any]:
         "arm": config.name,
         "sha256": config.sha256,
         "problems": [],
+        "warnings": list(checked.warnings),
         "stability": None if report is None or gains is None else asdict(report) | gains,
         "after_stop": checked.after_stop.value if isinstance(checked.after_stop, AfterStop) else None,
         "objection": checked.after_stop if isinstance(checked.after_stop, str) else None,
@@ -83,6 +88,7 @@ def description_text(arm: str, checked: CheckedDescription) -> str:
     """For a person; `arm` as they named it."""
     model = checked.model
     head = f"{arm}: {model.config.name}, {model.chain.joints} joints, {model.layout.size} parameters: good\n"
+    head += "".join(f"WARNING: {line}\n" for line in checked.warnings)
     head += "" if checked.budget is None else bus_lines(checked.budget)
     if checked.gains is None:
         return (

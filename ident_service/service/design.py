@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +33,7 @@ from ident_service.results.parameter_file import read_parameters
 from ident_service.service.motion_drawings import DRAWINGS, drawings
 from ident_service.service.preview import Preview, preview, preview_document, recorded_noise
 from ident_service.service.preview_text import preview_text
-from ident_service.service.recordings import open_for
+from ident_service.service.recordings import open_together
 
 MOTION, SEARCH, PREVIEW, DOCUMENT = "motion.json", "search.json", "preview.txt", "preview.json"
 FILES = (MOTION, SEARCH, PREVIEW, DOCUMENT, *DRAWINGS)
@@ -66,6 +65,7 @@ class DesignRequest:
         seed: of the random starts.
         budget: of the search.
         resume: a search to go on from.
+        length: of the motion [s]; what the description's frequency and periods make of it when None.
     """
 
     arm: str
@@ -74,6 +74,7 @@ class DesignRequest:
     seed: int = 0
     budget: Budget = field(default_factory=Budget)
     resume: Path | None = None
+    length: float | None = None
 
 
 def design_files(
@@ -100,6 +101,8 @@ def design_files(
         raise UsageError(f"{folder / MOTION}: exists already; give another folder")
     model = known_model(request.arm, request.knowledge)
     design = _changed(model.config.design, request.changes)
+    if request.length is not None:
+        design = _of_length(design, request.length, frozenset(request.changes))
     noise = known_noise(model, request.knowledge)
     basis, base = family(design, model)
     limits = motion_limits(model.config)
@@ -186,12 +189,12 @@ def known_information(model: ArmModel, base: BaseParameters, knowledge: Knowledg
     """Information of the recordings, whitened by `noise` of shape (joints,), shape (base, base); None without any."""
     if not knowledge.recordings:
         return None
-    opened = [open_for(path, model) for path in knowledge.recordings]
+    opened = open_together(knowledge.recordings, model).recordings
     for index, recording in enumerate(opened):
         if any(overlap(recording, other) for other in opened[:index]):
             raise UsageError(f"{recording.path}: the same recording twice would count as twice as much")
     parts = [equations(recording, model, base).total for recording in opened]
-    R = reduce(Information.merged, parts).stacked(1.0 / noise)[:-1, :-1]
+    R = Information.sum(parts).stacked(1.0 / noise)[:-1, :-1]
     return np.asarray(R.T @ R)
 
 
@@ -208,3 +211,20 @@ def _changed(design: Design, changes: dict[str, Any]) -> Design:
     except ValidationError as error:
         wrong = "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors())
         raise UsageError(f"design: {wrong}") from None
+
+
+def _of_length(design: Design, length: float, given: frozenset[str]) -> Design:
+    """Return a design whose Fourier motion lasts a time [s]: as many periods as come nearest to the base frequency.
+
+    Raises:
+        UsageError: nothing is left between the ramps, or the length follows from what else was given.
+    """
+    if design.motion != "fourier":
+        raise UsageError("--length is for Fourier motions; a motion through postures has --postures")
+    if {"base_frequency", "periods"} <= given:
+        raise UsageError("--length follows from --base-frequency, --periods and --ramp; leave one of them out")
+    whole = length - 2.0 * design.ramp
+    if not whole > 0.0:
+        raise UsageError(f"--length {length:g}: the ramps alone take {2.0 * design.ramp:g} s; see --ramp")
+    periods = design.periods if "periods" in given else max(1, round(whole * design.base_frequency))
+    return _changed(design, {"base_frequency": periods / whole, "periods": periods})

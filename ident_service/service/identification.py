@@ -26,9 +26,16 @@ from ident_service.model.chain import Array
 from ident_service.record.quality import Quality
 from ident_service.record.recording import Recording
 from ident_service.results.files import appearing_folder, write_atomically
+from ident_service.results.manifest import named_files, remove_stale
 from ident_service.results.report_files import write_report
 from ident_service.results.run_folder import MANIFEST, write_manifest, write_results
-from ident_service.service.recordings import open_for, own_formats, recording_quality, standstill_left_out
+from ident_service.service.recordings import (
+    open_together,
+    own_formats,
+    recording_quality,
+    standstill_left_out,
+    torque_in,
+)
 
 
 @dataclass(frozen=True)
@@ -81,12 +88,14 @@ class Identified:
         files: names of the files in the folder.
         warnings: what is wrong with the recordings, in words.
         unusable: why the estimate must not be used; empty where nothing says so.
+        torque: it was identified from (`Opened.torque`).
     """
 
     estimate: Estimate
     files: tuple[str, ...]
     warnings: tuple[str, ...]
     unusable: tuple[str, ...]
+    torque: str
 
 
 def identify_files(request: Request, folder: Path, tell: Callable[[str], None] = lambda _: None) -> Identified:
@@ -108,14 +117,16 @@ def identify_files(request: Request, folder: Path, tell: Callable[[str], None] =
     model = arm_model(_config(described, request))
     custom = custom_of(request.arm, described)
     forms = own_formats(request.columns_of, [*request.recordings, *request.validation], model)
-    recordings = [open_for(path, model, forms.get(path)) for path in request.recordings]
-    validation = [open_for(path, model, forms.get(path)) for path in request.validation]
+    opened = open_together([*request.recordings, *request.validation], model, forms)
+    recordings = opened.recordings[: len(request.recordings)]
+    validation = opened.recordings[len(request.recordings) :]
     for recording in (*recordings, *validation):
         start, end = standstill_left_out(recording)
         if start or end:
             tell(f"{recording.path.name}: standstill left out, {start:.2f} s at the start and {end:.2f} s at the end")
-    found = [(recording, recording_quality(recording, model)) for recording in [*recordings, *validation]]
-    warnings = tuple(f"{recording.path}: {line}" for recording, seen in found for line in seen.warnings())
+    found = [(recording, recording_quality(recording, model)) for recording in opened.recordings]
+    warnings = opened.remarks
+    warnings += tuple(f"{recording.path}: {line}" for recording, seen in found for line in seen.warnings())
     try:
         estimate = identify(
             model,
@@ -146,13 +157,15 @@ def identify_files(request: Request, folder: Path, tell: Callable[[str], None] =
     if request.essential:
         tell("essential parameters")
         more["essential"] = _essential(estimate)
+    earlier = named_files(folder) if (folder / MANIFEST).is_file() else {}
     with appearing_folder(folder) as staging:
-        files = write_results(staging, estimate, more, unusable, described)
+        files = write_results(staging, estimate, more, unusable, described, opened.torque)
         if request.sdpa:
             files += _write_sdpa(staging, estimate)
         files += write_report(staging, estimate, recordings, validation, warnings)
         write_manifest(staging)
-    return Identified(estimate, (*files, MANIFEST), warnings, unusable)
+    remove_stale(folder, earlier)
+    return Identified(estimate, (*files, MANIFEST), warnings, unusable, opened.torque)
 
 
 CUSTOM = ("constraints", "custom")
@@ -214,6 +227,7 @@ def _quality_document(recording: Recording, seen: Quality) -> dict[str, Any]:
         "gaps": len(seen.gaps),
         "repeats": seen.repeats,
         "skipped": seen.skipped,
+        "torque": torque_in(recording),
         "standstill_left_out_seconds": list(standstill_left_out(recording)),
         "torn": seen.torn,
         "per_joint": [

@@ -215,7 +215,7 @@ def _told(doubt: Doubt, expressions: tuple[str, ...], units: tuple[str, ...]) ->
                 units,
                 doubt.beta,
                 doubt.deviations,
-                shares(doubt.beta, doubt.deviations, units),
+                shares(doubt.beta, doubt.deviations, doubt.negligible),
                 doubt.verdicts,
                 strict=True,
             )

@@ -29,7 +29,7 @@ from ident_service.results.payload_document import (
 )
 from ident_service.results.run_folder import ARM, MANIFEST, PARAMETERS, URDF, VERIFIER, write_manifest, write_verifier
 from ident_service.service.comparison import write_comparison_files
-from ident_service.service.recordings import open_for, require_no_fault
+from ident_service.service.recordings import open_together, require_no_fault
 
 DOCUMENT, TEXT = "payload.json", "payload.txt"
 
@@ -76,7 +76,10 @@ def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_off
         raise UsageError(f"{out}: would replace the arm's own parameters; give another folder")
     side = read_side(run)
     arm = known_arm(side)
-    opened = [open_for(path, arm.model) for path in recordings]
+    known = side.content.get("torque")  # the difference of two torques is the load's only where both are of one kind
+    opened = open_together(
+        recordings, arm.model, torque=known if known in ("measured", "commanded") else None
+    ).recordings
     _require_new(side, opened)
     for path, recording in zip(recordings, opened, strict=True):
         require_no_fault(path, recording)

@@ -10,6 +10,7 @@ import numpy as np
 
 from ident_service.config.limits import MotionLimits, motion_limits
 from ident_service.errors import MotionRefused, UsageError
+from ident_service.estimation.doubt import negligible
 from ident_service.excitation.criteria import condition_number
 from ident_service.excitation.excitation import Excitation
 from ident_service.excitation.expectation import (
@@ -18,12 +19,16 @@ from ident_service.excitation.expectation import (
     expected_deviations,
     information,
 )
-from ident_service.excitation.following import expected_friction, forecast
+from ident_service.excitation.following import forecast
+from ident_service.excitation.path import FourierPath, PosturePath
 from ident_service.excitation.proof import Proof, objections, proof_of
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters, base_parameters
 from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel
+from ident_service.model.expected_friction import expected_friction
+from ident_service.model.information import information_of, supports
+from ident_service.model.regressor import joint_regressor
 from ident_service.model.scene import scene
 from ident_service.motion.reference import Setpoint, rest
 from ident_service.motion.stop import stop_extent
@@ -32,6 +37,7 @@ from ident_service.motion.way import calm_way
 from ident_service.results.parameter_file import read_parameters
 
 _LOOKED_AT = 2000  # samples of every part of a motion that the following error is forecast at
+_USED = 0.25  # of the torque limits, by an arm of which nothing is known
 KINDS = ("velocity", "acceleration", "jerk", "torque")
 
 
@@ -47,11 +53,13 @@ class Preview:
         objections: every limit that is not kept, in words; empty for a motion that may run.
         stops: lowest and highest positions that a stop from anywhere on the motion reaches, each of shape (joints,).
         stop_clearance: the smallest distance on stops out of the motion.
-        following: forecast of the following error [rad or m], shape (joints,).
+        following: following error of the simulated arm, or its forecast where the reference leaves limits and
+            nothing was simulated [rad or m], shape (joints,).
         approach: how long the way from home to its beginning takes [s], and back from its end.
         base: the parameters.
         noise: of the torques, as far as known.
         deviations: to be expected, shape (base,).
+        negligible: sizes below which parameters are as good as zero on this motion, shape (base,).
         condition_number: of the stacked regressor.
         warnings: what nobody can prove or forbid, in words.
     """
@@ -68,6 +76,7 @@ class Preview:
     base: BaseParameters
     noise: NoiseModel
     deviations: Array
+    negligible: Array
     condition_number: float
     warnings: tuple[str, ...]
 
@@ -95,7 +104,8 @@ def preview(
         raise MotionRefused(f"a motion of {excitation.path.joints} joints for an arm of {model.chain.joints}")
     limits = motion_limits(model.config)
     path = excitation.path
-    proof = proof_of(path, model, limits, CollisionModel(model))
+    margin = excitation.made.get("torque_margin")  # a designed motion's own
+    proof = proof_of(path, model, limits, CollisionModel(model), margin if isinstance(margin, float) else None)
     lowest, highest = stop_extent(path, limits)
     found = objections(proof, model, limits)
     for k, name in enumerate(model.chain.names):
@@ -118,7 +128,7 @@ def preview(
             found.append(str(error))
     base = base_parameters(model.chain, model.layout)
     noise = described_noise(model, limits) if noise is None else noise
-    following = _following(model, excitation, limits)
+    following = _following(model, excitation, limits) if proof.tracking is None else proof.tracking.error
     return Preview(
         model=model,
         excitation=excitation,
@@ -132,14 +142,31 @@ def preview(
         base=base,
         noise=noise,
         deviations=expected_deviations(path, model, base, noise, added),
+        negligible=_negligible(path, model, base, limits),
         condition_number=condition_number(information(path, model, base, np.ones(model.chain.joints))),
-        warnings=tuple(_warnings(model, limits, following)),
+        warnings=tuple(_warnings(model, limits, None if proof.tracking is not None else following)),
     )
 
 
-def _warnings(model: ArmModel, limits: MotionLimits, following: Array) -> list[str]:
+def _negligible(path: FourierPath | PosturePath, model: ArmModel, base: BaseParameters, limits: MotionLimits) -> Array:
+    """Give sizes below which parameters are as good as zero, shape (base,).
+
+    The torques are those of the arm's prior; without one, a quarter of what the joints may have.
+    """
+    time = np.concatenate([np.linspace(begin, end, _LOOKED_AT) for begin, end in path.distinct])
+    H = joint_regressor(model.chain, model.layout, *path.at(time)[:3], base.base)
+    torque = np.tile(_USED * limits.torque, (len(time), 1))
+    if model.prior is not None:
+        torque = np.einsum("jps,p->sj", H, base.K @ model.prior)
+    felt = supports(model.chain, model.layout, base.base)
+    return negligible(information_of(H, torque, np.ones(torque.shape, dtype=bool), felt))
+
+
+def _warnings(model: ArmModel, limits: MotionLimits, forecast_error: Array | None) -> list[str]:
+    """Return what nobody can prove or forbid; of a forecast only where no arm was simulated."""
     names, found = model.chain.names, []
-    if late := [name for k, name in enumerate(names) if following[k] > limits.following_error[k]]:
+    ahead = np.zeros_like(limits.following_error) if forecast_error is None else forecast_error
+    if late := [name for k, name in enumerate(names) if ahead[k] > limits.following_error[k]]:
         found.append(
             f"{', '.join(late)} may fall behind by more than the following error allows, if friction is as guessed "
             "(design.friction_guess); the guard would stop the motion"

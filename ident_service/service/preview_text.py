@@ -68,7 +68,7 @@ def _teaching(seen: Preview) -> list[str]:
     """The table of what is to be expected."""
     prior = np.zeros(len(seen.base.names)) if seen.model.prior is None else seen.model.prior
     values = seen.base.K @ prior
-    words = verdicts(values, seen.deviations, seen.base.units)
+    words = verdicts(values, seen.deviations, seen.negligible)
     width = max(len(expression) for expression in seen.base.expressions)
     counts = ", ".join(f"{words.count(word)} {word}" for word in ("identified", "weak", "unidentified"))
     head = [

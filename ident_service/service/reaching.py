@@ -47,6 +47,7 @@ class Reaching:
 
     Attributes:
         said: what the process said then, `seconds` of the motion and the largest `share`; None before.
+        period: of the motion [s], zero where it has none.
     """
 
     def __init__(self, folder: Path, target: Target, least: float, tell: Callable[[str], None]) -> None:
@@ -55,10 +56,11 @@ class Reaching:
         Args:
             folder: of the run.
             target: to be reached.
-            least: seconds of the motion, before which nothing counts.
+            least: seconds of the motion, before which nothing counts: its period, zero where it has none.
             tell: is told once when it is reached, or when nobody looks any more.
         """
         self._request = {"folder": str(folder), "share": target.share, "parameters": target.parameters, "least": least}
+        self.period = least
         self._tell, self._over, self._heard = tell, False, b""
         self.said: dict[str, Any] | None = None
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
+from typing import Final, Literal
 
 import numpy as np
 
@@ -16,6 +19,7 @@ from ident_service.record.files import split_range
 from ident_service.record.kept import KeptRecording
 from ident_service.record.mcap_file import McapRecording
 from ident_service.record.mcap_records import MAGIC
+from ident_service.record.measured import MeasuredRecording
 from ident_service.record.open import open_recording
 from ident_service.record.part import RangeRecording, first_stamp, time_range, without_standstill
 from ident_service.record.quality import Quality, quality
@@ -36,13 +40,81 @@ def file_and_range(path: Path) -> tuple[Path, tuple[float, float] | None]:
     return Path(named), seconds
 
 
-def open_for(path: Path, model: ArmModel, form: RecordingFormat | None = None) -> Recording:
+Torque = Literal["measured", "commanded"]
+RECORDED: Final = "recorded"  # the one torque of another program's file, which does not say where it comes from
+
+
+@dataclass(frozen=True)
+class Opened:
+    """Hold recordings that are read for one estimate.
+
+    Attributes:
+        recordings: in the order in which they were named.
+        torque: that they give: `measured` by the drives, `commanded`, `recorded` by other programs, or those in a row.
+        remarks: what was left out to have one torque in all of them.
+    """
+
+    recordings: tuple[Recording, ...]
+    torque: str
+    remarks: tuple[str, ...]
+
+
+def open_together(
+    paths: Sequence[Path],
+    model: ArmModel,
+    forms: Mapping[Path, RecordingFormat] = MappingProxyType({}),
+    torque: Torque | None = None,
+) -> Opened:
+    """Open recordings for one estimate, so that all of ours give the same torque.
+
+    Torques that drives measured and ones that they were only told differ by what current loops leave, and each has its
+    own delay. So measured ones are used where all recordings have them, and commanded ones otherwise.
+
+    Args:
+        paths: as for `open_for`.
+        model: the arm, whose `identification.torque` may demand one of them.
+        forms: how each file is laid out, where not as the description says.
+        torque: that must be used, in place of the description's.
+
+    Raises:
+        UsageError, RecordingError: as `open_for`; a recording lacks the torque that is demanded.
+    """
+    asked = torque or model.config.identification.torque
+    found = [open_for(path, model, forms.get(path), asked) for path in paths]
+    kinds = [torque_in(recording) for recording in found]
+    remarks: tuple[str, ...] = ()
+    if {"measured", "commanded"} <= set(kinds):
+        without = ", ".join(path.name for path, kind in zip(paths, kinds, strict=True) if kind == "commanded")
+        remarks = (
+            f"identified from commanded torques: drives measured none in {without}, and the two are not mixed; leave "
+            "these recordings out to use measured ones",
+        )
+        for place, kind in enumerate(kinds):
+            if kind == "measured":
+                found[place] = open_for(paths[place], model, forms.get(paths[place]), "commanded")
+        kinds = ["commanded" if kind == "measured" else kind for kind in kinds]
+    return Opened(tuple(found), " and ".join(dict.fromkeys(kinds)), remarks)
+
+
+def torque_in(recording: Recording) -> str:
+    """Say which torque a recording gives: `measured`, `commanded`, or `recorded` for a file of another program."""
+    if isinstance(recording, KeptRecording | RangeRecording):
+        return torque_in(recording.whole)
+    if isinstance(recording, MeasuredRecording):
+        return "measured"
+    return "commanded" if isinstance(recording, McapRecording) and recording.own else RECORDED
+
+
+def open_for(
+    path: Path, model: ArmModel, form: RecordingFormat | None = None, torque: Torque | None = None
+) -> Recording:
     """Open a recording, or a range of one, as it is to be read for an arm.
 
     Args:
         path: the file, or `FILE@START:END`.
         model: the arm.
         form: how this file is laid out; as the arm's description says when None.
+        torque: that is to be read, in place of the description's.
 
     Raises:
         UsageError: no such file, or no such range.
@@ -51,7 +123,7 @@ def open_for(path: Path, model: ArmModel, form: RecordingFormat | None = None) -
     file, seconds = file_and_range(path)
     form, gears = form or model.config.recording, model.config.transmission
     # Quality, friction, equations and evidence each read it.
-    torque = model.config.identification.torque
+    torque = torque or model.config.identification.torque
     whole = open_recording(file, model.chain.names, fmt=form, transmission=gears, torque=torque)
     recording: Recording = KeptRecording(whole)
     if seconds is not None:

@@ -166,17 +166,17 @@ def run_motion(
     if reaching is None or until is None:
         return Ran(folder, ending.report)
     wanted = {"share": until.share, "parameters": list(until.parameters), "reached": reaching.said}
-    wanted["missed"] = [] if reaching.said is not None else _missed(folder, until, tell)
+    wanted["missed"] = [] if reaching.said is not None else _missed(folder, until, reaching.period, tell)
     return Ran(folder, {**ending.report, "until": wanted})
 
 
-def _missed(folder: Path, until: Target, tell: Callable[[str], None]) -> list[dict[str, Any]] | None:
+def _missed(folder: Path, until: Target, period: float, tell: Callable[[str], None]) -> list[dict[str, Any]] | None:
     """Say what a run that went on to its end has not taught; None where its recording cannot be judged."""
     # Loads the estimator, which nobody waits for while the arm moves.
     from ident_service.service.target_process import missed
 
     try:
-        return missed(folder, until)
+        return missed(folder, until, period)
     except IdentError as error:
         tell(f"which parameters missed the target is not known: {error}")
         return None

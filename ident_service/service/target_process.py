@@ -43,13 +43,13 @@ def watch(folder: Path, target: Target, least: float) -> dict[str, Any] | None:
     Args:
         folder: of the run.
         target: to be reached.
-        least: seconds of the motion itself, before which nothing counts.
+        least: seconds of the motion itself, before which nothing counts: its period, zero where it has none.
 
     Raises:
         IdentError: the recording or the description cannot be read.
     """
     model = arm_model(arm_from_json(folder / "arm.json"))
-    growing = GrowingInformation(model, in_blocks=True)
+    growing = GrowingInformation(model, in_blocks=True, period=least)
     places = target.places(growing.base, model.config.name)
     if (tail := _opened(folder)) is None:
         return None
@@ -63,18 +63,19 @@ def watch(folder: Path, target: Target, least: float) -> dict[str, Any] | None:
         if not growing.step() or tail.exciting_ns is None or (doubt := growing.doubt()) is None:
             continue
         seconds = (doubt.until_ns - tail.exciting_ns) * 1e-9
-        worst = worst_share(doubt, growing.base, places)
+        worst = worst_share(doubt, places)
         row = row + 1 if seconds >= least and worst <= target.share else 0
         if row >= _IN_A_ROW:
             return {"seconds": round(seconds, 3), "share": worst}
 
 
-def missed(folder: Path, target: Target) -> list[dict[str, Any]]:
+def missed(folder: Path, target: Target, period: float) -> list[dict[str, Any]]:
     """Judge by the whole recording of a run which of the chosen parameters are not known as well as was asked.
 
     Args:
         folder: of the run, which is over.
         target: that was not reached on the way.
+        period: of the motion [s]; zero where it has none.
 
     Returns:
         Expression and share of each, the least known first; the share is None where the recording says nothing of it.
@@ -83,7 +84,7 @@ def missed(folder: Path, target: Target) -> list[dict[str, Any]]:
         IdentError: the recording or the description cannot be read.
     """
     model = arm_model(arm_from_json(folder / "arm.json"))
-    growing = GrowingInformation(model, in_blocks=True)
+    growing = GrowingInformation(model, in_blocks=True, period=period)
     for block in open_recording(folder / "run.mcap", model.chain.names).blocks():
         growing.add(block)
         while growing.step():
@@ -92,7 +93,7 @@ def missed(folder: Path, target: Target) -> list[dict[str, Any]]:
     if doubt is None or doubt.blocks < LEAST_BLOCKS:
         known = np.full(len(places), np.inf)
     else:
-        known = shares(doubt.beta, doubt.deviations, growing.base.units)[places]
+        known = shares(doubt.beta, doubt.deviations, doubt.negligible)[places]
     found = [
         (growing.base.expressions[place], float(share))
         for place, share in zip(places.tolist(), known, strict=True)

@@ -14,6 +14,7 @@ from typing import Any, Self
 import httpx
 import pytest
 from fastapi import FastAPI
+from helpers.once import made_once
 from helpers.tickets import write_checked_ticket
 
 from ident_service.config.load import load_arm, shipped_arms
@@ -177,17 +178,13 @@ def checked_before(state: Path, text: str) -> None:
     write_checked_ticket(load_arm(path), state)
 
 
-# Each place that imports the fixture has a session of its own of it; the arm is commissioned once for all of them.
-_COMMISSIONED: list[Path] = []
-
-
 @pytest.fixture(scope="session")
 def commissioned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a whole job on the small arm `quick`; not to be changed."""
-    if not _COMMISSIONED:
-        folder = tmp_path_factory.mktemp("commissioned")
+
+    def make(folder: Path) -> None:
         path = folder / "quick.yaml"
         path.write_text(quick_text())
         simulate(load_arm(path), folder / "first-run")
-        _COMMISSIONED.append(folder / "first-run")
-    return _COMMISSIONED[0]
+
+    return made_once(tmp_path_factory, "served", make) / "first-run"

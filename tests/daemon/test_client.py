@@ -12,7 +12,7 @@ from daemon.conftest import checked_before, patient_text, quick_text
 from daemon.served import daemon_process
 
 from ident_service.client import IdentClient
-from ident_service.errors import AlreadyThere, ArmError, MotionRefused, UnknownId, UsageError
+from ident_service.errors import AlreadyThere, ArmError, MotionRefused, RecordingError, UnknownId, UsageError
 from ident_service.motion.control_file import in_use
 from ident_service.service.arm_state import control_path
 from ident_service.service.registry.audit import note
@@ -75,6 +75,19 @@ def test_a_computation_is_waited_for_and_its_key_is_kept(client: IdentClient) ->
     assert client.answer(ended.id)["exit_code"] == 0
     assert client.begin("base", arm="planar2", key="one").id == ended.id
     assert [job.id for job in client.jobs(arm="planar2")] == [ended.id]
+
+
+def test_a_computation_that_fails_is_an_error_of_the_tree(client: IdentClient, tmp_path: Path) -> None:
+    (tmp_path / "torn.csv").write_text("t,q1,q2,tau1,tau2\n0,0,0,0\n")
+    torn = client.upload("planar2", tmp_path / "torn.csv")
+    with pytest.raises(RecordingError, match=r"torn.csv: .*\(job ") as caught:
+        client.compute("identify", arm="planar2", recordings=[torn])
+    assert caught.value.path.name == "torn.csv"
+    with pytest.raises(UsageError, match="no simulated driver"):
+        client.compute("simulate", arm="wam7")
+    begun = client.begin("design", arm="planar2", seconds=600.0)
+    threading.Timer(1.0, lambda: client.post(f"/api/v1/jobs/{begun.id}/cancel")).start()
+    assert client.wait(begun.id).state == "cancelled"
 
 
 @pytest.mark.timeout(300)

@@ -12,7 +12,7 @@ import pytest
 from daemon.conftest import Asked, checked_before, patient_text, quick_text, serving
 from daemon.verbs_bench import with_run
 
-from ident_service.motion.control_file import in_use
+from ident_service.motion.control_file import ControlFile, in_use
 from ident_service.service.arm_state import control_path
 from ident_service.service.jobs.asked import Run
 from ident_service.service.registry import jobs as rows
@@ -72,15 +72,26 @@ def test_a_run_ends_early(daemon: Asked, patient: str, state: Path, asked: str) 
 
 
 def test_only_operators_finish_and_nobody_is_reached_where_nothing_moves(daemon: Asked, arm: str, viewer: str) -> None:
-    for what in ("finish", "supported"):
-        answer = daemon.post(f"/api/v1/arms/{ARM}/{what}")
+    for what, body in (("finish", None), ("supported", {"confirm": ARM})):
+        answer = daemon.post(f"/api/v1/arms/{ARM}/{what}", body)
         assert (answer.status_code, answer.json()["reached"]) == (200, False)
     for until in ({"share": 1.0}, {"share": 0}, {"share": 0.1, "parameters": [""]}, {"share": 0.1, "more": 1}):
         body = {"job": {"kind": "run", "arm": ARM, "until": until}}
         assert daemon.post("/api/v1/jobs", body).status_code == 422
     daemon.as_token(viewer)
     assert daemon.post(f"/api/v1/arms/{ARM}/finish").status_code == 403
-    assert daemon.post(f"/api/v1/arms/{ARM}/supported").status_code == 403
+    assert daemon.post(f"/api/v1/arms/{ARM}/supported", {"confirm": ARM}).status_code == 403
+
+
+def test_a_held_arm_is_let_down_by_its_typed_name_only(daemon: Asked, arm: str, state: Path) -> None:
+    with ControlFile.take(control_path(state, ARM), None) as holder:
+        holder.wait_for_support()
+        assert daemon.post(f"/api/v1/arms/{ARM}/supported").status_code == 422
+        refused = daemon.post(f"/api/v1/arms/{ARM}/supported", {"confirm": "another"})
+        assert (refused.status_code, holder.supported) == (409, False)
+        assert "typed by a person" in refused.json()["error"]["message"]
+        answer = daemon.post(f"/api/v1/arms/{ARM}/supported", {"confirm": ARM})
+        assert (answer.status_code, answer.json()["reached"], holder.supported) == (200, True, True)
 
 
 @pytest.mark.timeout(300)

@@ -34,6 +34,7 @@ FILLED = {
     "number": 1,
     "export": "e",
     "token": "t",
+    "upload": "u",
 }
 MOTION = {"kind": "run", "arm": "planar2"}
 FAR = "203.0.113.9"
@@ -88,6 +89,7 @@ def test_a_viewer_changes_nothing(daemon: Asked, viewer: str) -> None:
         "/api/v1/alarms/{number}/ack": {"note": "n"},
         "/api/v1/descriptions/check": {"description": "x"},
         "/api/v1/recordings/prune": {"keep": 1},
+        "/api/v1/uploads": {"arm": "planar2", "name": "x.csv", "bytes": 1, "sha256": 64 * "0"},
     }
     tried = 0
     for method, path in routes(daemon):

@@ -91,6 +91,9 @@ def test_the_command_drives_a_daemon(state: Path, tmp_path: Path, capsys: pytest
             assert not mover.pause
             assert ident(capsys, "stop", "quick", *server)[1]["arms"] == ["quick"]
             assert mover.stop
+        # Nobody moves it now, which is what was wanted; a name that was mistyped has stopped nothing.
+        assert ident(capsys, "stop", "quick", *server)[0] == 0
+        assert ident(capsys, "stop", "quik", *server)[0] == 2
         # The same acts at a terminal are in the same trail.
         assert ident(capsys, "accept", state / "runs" / run, "--note", "at the terminal", "--state", state)[0] == 0
         assert client.get("/api/v1/arms/quick")["accepted"]["who"].startswith("terminal:")

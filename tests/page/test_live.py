@@ -206,8 +206,8 @@ def test_deviations_from_blocks_are_those_that_blocks_of_the_whole_give() -> Non
     assert plain.blocks == 0
     assert 35 <= careful.blocks <= 41  # of a second
     assert (careful.deviations >= plain.deviations).all()
-    # The noise is white, so that both know the same; blocks are few, and err.
-    assert (careful.deviations < 3.0 * plain.deviations).all()
+    # The noise is white, so that both know the same; blocks are few, err, and are widened for that (decision 0063).
+    assert (careful.deviations < 4.0 * plain.deviations).all()
     assert (careful.deviations > plain.deviations).any()
     assert 38_000_000_000 < careful.until_ns < 40_000_000_000
 

@@ -10,11 +10,27 @@ from typing import Any, Literal
 from pydantic import BaseModel
 
 
+class DependentAnswer(BaseModel):
+    """Something that refers to what is to be deleted, and what becomes of it then."""
+
+    kind: str
+    id: str
+    becomes: Literal["deleted", "kept"]
+
+
+class DeletionAnswer(BaseModel):
+    """Name what was deleted, and what referred to it."""
+
+    deleted: str
+    dependents: list[DependentAnswer]
+
+
 class Mistake(BaseModel):
-    """What went wrong: the name of an error, and words for a person."""
+    """What went wrong: the name of an error, and words for a person; for `InUse` what refers to it, too."""
 
     kind: str
     message: str
+    dependents: list[DependentAnswer] | None = None
 
 
 class Failure(BaseModel):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import sqlite3
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -18,13 +19,16 @@ from ident_service.service.api import (
     about,
     access,
     arms,
+    deletion,
     descriptions,
+    events,
     exports,
     jobs,
     live_routes,
     maintenance,
     pruning,
     runs,
+    uploads,
 )
 from ident_service.service.api.asking import Service
 from ident_service.service.api.checks import Checks
@@ -34,18 +38,22 @@ from ident_service.service.api.doors import Doors
 from ident_service.service.api.gate import Gate
 from ident_service.service.api.mistakes import answer_mistakes
 from ident_service.service.api.settings import Settings
+from ident_service.service.deletion import remove_deleted
 from ident_service.service.jobs.engine import Engine
 from ident_service.service.live import LiveRuns
-from ident_service.service.maintenance.keeper import Keeper, note_gave_up
+from ident_service.service.maintenance.keeper import Keeper
 from ident_service.service.maintenance.webhook import Webhook, read_secret
 from ident_service.service.metrics import Metrics
+from ident_service.service.news import Watch
 from ident_service.service.pages.routes import PAGES
 from ident_service.service.registry.arms import know_shipped
 from ident_service.service.registry.database import Database
 from ident_service.service.registry.runs import rebuild_runs
 from ident_service.service.registry.tokens import first_token
+from ident_service.service.uploads import delete_half_uploads
 
 _REFRESH = 1.0  # s between looks for tokens that were made or revoked at a terminal
+_CLEAN = 600.0  # s between looks for uploads that nobody goes on with
 _LOG = logging.getLogger("ident.serve")
 ROUTERS = (
     *(
@@ -58,7 +66,7 @@ ROUTERS = (
         runs.router,
         pruning.router,
     ),
-    *(exports.router, maintenance.router, *PAGES),
+    *(exports.router, uploads.router, events.router, deletion.router, maintenance.router, *PAGES),
 )
 """In this order."""
 
@@ -90,6 +98,7 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         settle(db, settings.state)
+        remove_deleted(settings.state)
         engine.start(lambda: rebuild_runs(db, settings.state))
         keeper.start()
         refreshing = asyncio.create_task(_refresh(service))
@@ -115,6 +124,7 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
     )
     app.state.service = service
     app.state.live = LiveRuns()
+    app.state.watch = Watch(db, settings.state, lambda row: jobs.answer_of(service, row).model_dump(mode="json"))
     for router in ROUTERS:
         app.include_router(router)
     describe(app)
@@ -125,9 +135,14 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
 
 
 async def _refresh(service: Service) -> None:
+    clean = 0.0
     while True:
         await asyncio.sleep(_REFRESH)
         try:
+            if time.monotonic() >= clean:
+                clean = time.monotonic() + _CLEAN
+                for upload in await run_in_threadpool(delete_half_uploads, service.state):
+                    _LOG.info("an upload was left alone for a day and is deleted", extra={"upload": upload})
             await run_in_threadpool(service.gate.refresh)
             await run_in_threadpool(service.db.rest)
         except sqlite3.Error as error:
@@ -137,7 +152,7 @@ async def _refresh(service: Service) -> None:
 def _webhook(settings: Settings, db: Database) -> Webhook | None:
     if settings.webhook is None or settings.webhook_secret is None:
         return None
-    return Webhook(settings.webhook, read_secret(settings.webhook_secret), lambda *said: note_gave_up(db, *said))
+    return Webhook(db, settings.webhook, read_secret(settings.webhook_secret))
 
 
 def _operation(route: APIRoute) -> str:

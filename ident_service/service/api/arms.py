@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.config.source import MOST_BYTES
+from ident_service.errors import MotionRefused
 from ident_service.motion.control_file import mover
 from ident_service.service.acceptance import LONGEST_NOTE, accept, acceptances, rollback
 from ident_service.service.api.answers import (
@@ -26,6 +27,7 @@ from ident_service.service.api.gate import CHALLENGE_SECONDS
 from ident_service.service.api.mistakes import failures
 from ident_service.service.api.paging import PAGES, BeforeId, Most, Page
 from ident_service.service.arm_state import control_path, fault_file
+from ident_service.service.description_process import judge_apart
 from ident_service.service.jobs.asked import ArmName, FileName, Id
 from ident_service.service.registry import arms as known
 from ident_service.service.registry import motions
@@ -46,6 +48,12 @@ class Description(_Body):
 
     description: Annotated[str, Field(max_length=MOST_BYTES)]
     files: Annotated[dict[FileName, Text], Field(max_length=16)] = {}
+
+
+class Support(_Body):
+    """The arm's name, as a person types it who sees the arm supported or home."""
+
+    confirm: Annotated[str, Field(max_length=200)]
 
 
 class NewArm(Description):
@@ -89,7 +97,9 @@ def add_arm(service: Serving, who: Operator, body: NewArm) -> ArmAnswer:
     """Add an arm by its description; sending the same one again changes nothing."""
     text, files = body.description, body.files
     with service.checks.place():
-        added = known.add_arm(service.db, service.state, text, files, who.name, replace=body.replace)
+        added = known.add_arm(
+            *(service.db, service.state, text, files, who.name), replace=body.replace, judge=judge_apart
+        )
     return _arm(service, added.name)
 
 
@@ -143,9 +153,11 @@ def finish(service: Serving, who: Operator, arm: ArmName) -> AskedAnswer:
 
 
 @router.post("/arms/{arm}/supported")
-def supported(service: Serving, who: Operator, arm: ArmName) -> AskedAnswer:
+def supported(service: Serving, who: Operator, arm: ArmName, body: Support) -> AskedAnswer:
     """Confirm that the arm, which is held after a stop, is supported or home: it is then let down."""
     name = known.known_arm(service.db, service.state, arm).name
+    if body.confirm != name:
+        raise MotionRefused(f"that {name} is supported is confirmed by its name, typed by a person who sees it")
     return AskedAnswer(arm=name, asked="supported", reached=service.engine.confirm_support(name, who.name))
 
 

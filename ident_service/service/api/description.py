@@ -44,8 +44,19 @@ EXAMPLES: Final[dict[str, dict[str, Any]]] = {
         "After 500 operating hours": {"arm": "wam7_sim", "hours": 500.0},
         "After each maintenance": {"arm": "wam7_sim", "maintenance": True},
     },
+    "NewUpload": {
+        "A CSV of 90 MB": {"arm": "wam7_sim", "name": "monday.csv", "bytes": 94371840, "sha256": 64 * "3"},
+        "With its columns": {
+            "arm": "planar2",
+            "name": "bench.csv",
+            "bytes": 73400,
+            "sha256": 64 * "a",
+            "columns": "columns: {t: {column: stamp, unit: ms}, q1: pos_1, q2: pos_2, tau1: tq_1, tau2: tq_2}\n",
+        },
+    },
     "Pruning": {"What would go": {"keep": 20}, "Delete it": {"keep": 20, "yes": True}},
     "Remark": {"Why": {"note": "seal ordered"}},
+    "Support": {"By a person who sees it": {"confirm": "wam7_sim"}},
     "Rollback": {"The set before": {"note": "the new one oscillates"}, "The second": {"note": "the best", "to": 2}},
 }
 """By the name of a request's model: title and value of its examples."""

@@ -30,7 +30,9 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 MOST_BODY: Final = 64 * 1024
 MOST_UPLOAD: Final = 16 * 2**20
+MOST_PIECE: Final = 8 * 2**20  # of a recording
 UPLOADS: Final = ("/api/v1/arms", "/api/v1/motions", "/api/v1/descriptions/check")
+_PIECES: Final = "/api/v1/uploads/"
 _URGENT: Final = ("/stop", "/lease")  # ends of paths that are answered however busy the service is
 _SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
 _LOG = logging.getLogger("ident.http")
@@ -131,8 +133,7 @@ class Doors:
         return None
 
     def _counted(self, scope: Scope, receive: Receive) -> Receive:
-        upload = scope["method"] == "POST" and scope["path"] in UPLOADS
-        most, seen = MOST_UPLOAD if upload else MOST_BODY, 0
+        most, seen = _most_body(scope["method"], scope["path"]), 0
 
         async def counted() -> Message:
             nonlocal seen
@@ -146,6 +147,12 @@ class Doors:
             return message
 
         return counted
+
+
+def _most_body(method: str, path: str) -> int:
+    if method == "PATCH" and path.startswith(_PIECES):
+        return MOST_PIECE
+    return MOST_UPLOAD if method == "POST" and path in UPLOADS else MOST_BODY
 
 
 def _has_body(scope: Scope) -> bool:

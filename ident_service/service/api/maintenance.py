@@ -15,6 +15,7 @@ from ident_service.service.api.asking import LeaseKeeper, Operator, Service, Ser
 from ident_service.service.api.jobs import Confirmation, require_confirmed, without_paths
 from ident_service.service.api.maintenance_answers import (
     AlarmAnswer,
+    DeliveryAnswer,
     DueAnswer,
     EventAnswer,
     ReidentificationAnswer,
@@ -26,6 +27,7 @@ from ident_service.service.jobs.asked import ArmName, Id
 from ident_service.service.maintenance import alarms as raised
 from ident_service.service.maintenance import schedules as planned
 from ident_service.service.maintenance.reidentification import Wanted, known_reidentification, reidentifications
+from ident_service.service.maintenance.webhook import deliveries
 from ident_service.service.registry.arms import known_arm
 from ident_service.service.registry.database import Row
 
@@ -193,6 +195,15 @@ def list_alarms(
 def acknowledge_alarm(service: Serving, who: Operator, number: Number, body: Remark) -> AlarmAnswer:
     """Acknowledge a drift alarm, by a person's word; the accepted set stays as it is."""
     return AlarmAnswer(**raised.acknowledge_alarm(service.db, number, body.note, who.name, time.time()))
+
+
+@router.get("/deliveries", responses=PAGES)
+def list_deliveries(
+    page: Page, service: Serving, _: Viewer, before: BeforeNumber = None, most: Most = 100
+) -> list[DeliveryAnswer]:
+    """List notices to the webhook and what became of them, the newest first."""
+    found = page(most, lambda n: deliveries(service.db, before=before, most=n), "number")
+    return [DeliveryAnswer(**row) for row in found]
 
 
 def _arm(service: Service, arm: str) -> str:

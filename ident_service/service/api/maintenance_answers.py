@@ -26,6 +26,22 @@ class ScheduleAnswer(BaseModel):
     created_by: str
 
 
+class DeliveryAnswer(BaseModel):
+    """A notice to the webhook.
+
+    `next` is when it is tried; without it and without `delivered` it was given up. `why` says what the last try met.
+    """
+
+    number: int
+    id: str
+    arm: str
+    created: float
+    tries: int
+    next: float | None
+    delivered: float | None
+    why: str
+
+
 class EventAnswer(BaseModel):
     """Maintenance that was done."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import logging
 import sqlite3
+from dataclasses import asdict
 from http import HTTPStatus
 from typing import Any, Final
 
@@ -18,6 +19,7 @@ from ident_service.errors import (
     ArmError,
     ConfigError,
     IdentError,
+    InUse,
     ModelError,
     MotionRefused,
     ParameterError,
@@ -31,6 +33,7 @@ from ident_service.service.registry.database import RegistryBusy
 _STATUS: Final[tuple[tuple[type[IdentError], int], ...]] = (
     (UnknownId, 404),
     (AlreadyThere, 409),
+    (InUse, 409),
     (UsageError, 400),
     (ConfigError, 422),
     (ModelError, 422),
@@ -46,7 +49,7 @@ _WORDS: Final = {
     403: "Not with this role, or not from this page.",
     404: "No such thing is known.",
     405: "Not with this method.",
-    409: "Not now: a fault, a lease, another motion, or a name that is taken stands against it.",
+    409: "Not now: a fault, a lease, another motion, a name that is taken, or what refers to it stands against it.",
     413: "Too large.",
     421: "The service is not called that.",
     422: "The request has mistakes; the message names them.",
@@ -95,7 +98,8 @@ def answer_mistakes(app: FastAPI) -> None:
         status = status_of(error)
         if status == HTTPStatus.INTERNAL_SERVER_ERROR:
             _LOG.error("an answer failed", exc_info=error)
-        return _answer(status, type(error).__name__, str(error))
+        more = {"dependents": [asdict(one) for one in error.dependents]} if isinstance(error, InUse) else {}
+        return _answer(status, type(error).__name__, str(error), more=more)
 
     @app.exception_handler(RequestValidationError)
     async def _invalid(_: Request, error: RequestValidationError) -> JSONResponse:
@@ -123,7 +127,9 @@ def _short_of(error: BaseException) -> tuple[int, str, str, dict[str, str]] | No
     return None
 
 
-def _answer(status: int, kind: str, message: str, headers: dict[str, str] | None = None) -> JSONResponse:
+def _answer(
+    status: int, kind: str, message: str, headers: dict[str, str] | None = None, more: dict[str, Any] | None = None
+) -> JSONResponse:
     # What was sent may hold what is no text; it must not keep us from answering.
     message = message.encode("utf-8", "replace").decode("utf-8")
-    return JSONResponse({"error": {"kind": kind, "message": message}}, status, headers=headers)
+    return JSONResponse({"error": {"kind": kind, "message": message, **(more or {})}}, status, headers=headers)

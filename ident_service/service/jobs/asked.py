@@ -25,10 +25,13 @@ class Ask(BaseModel):
 
 
 class RecordingOf(Ask):
-    """A recording, by the run that it is of and its name in the manifest; whole, or from `start` to `end` [s]."""
+    """A recording, by the run that it is of; whole, or from `start` to `end` [s].
+
+    `name` is that of the file in the run's manifest; left out, it is the run's only recording, or `run.mcap`.
+    """
 
     run: Id
-    name: FileName = "run.mcap"
+    name: FileName | None = None
     start: Second | None = None
     end: Second | None = None
 

@@ -44,7 +44,7 @@ from ident_service.service.jobs.asked import (
 from ident_service.service.registry.arms import KnownArm, known_arm, resources
 from ident_service.service.registry.database import Database
 from ident_service.service.registry.motions import MOTIONS, motion_path, new_id
-from ident_service.service.registry.runs import RUNS, known_run, run_file, run_folder
+from ident_service.service.registry.runs import COLUMNS, RUNS, known_run, recording_name, run_file, run_folder
 
 JOBS, REPORTS, EXPORTS = "jobs", "reports", "exports"
 _LOOKS = (Check, Watch, Recover, Base, Preview, Zero, BusLoad, BusScan, ConfigCheck)  # that make no folder
@@ -138,6 +138,7 @@ def _words(db: Database, state: Path, asked: Asked, arm: KnownArm) -> list[str]:
     if isinstance(asked, Identify):
         recordings = _recordings(db, state, asked.recordings)
         judged = [f"--validate={one}" for one in _recordings(db, state, asked.validate_on)]
+        judged += _columns(db, state, (*asked.recordings, *asked.validate_on))
         chosen = {"method": asked.method, "feasible-set": asked.feasible_set, "prior": asked.prior}
         if asked.as_accepted is not None:
             path = str(accepted_description(state, arm.name, asked.as_accepted))
@@ -173,8 +174,8 @@ def _until(asked: Run) -> list[str]:
 def _design(db: Database, state: Path, asked: Design) -> list[str]:
     if asked.seconds is None and asked.starts is None:
         raise UsageError("a search ends: give seconds, or starts, or both")
-    after = [f"--after={path}" for path in _recordings(db, state, asked.after)]
-    chosen = {"seconds": asked.seconds, "starts": asked.starts, "seed": asked.seed, "criterion": asked.criterion}
+    after = [f"--after={path}" for path in _as_described(db, state, asked.after)]
+    chosen = {"search-time": asked.seconds, "starts": asked.starts, "seed": asked.seed, "criterion": asked.criterion}
     parameters = [f"--parameter={expression}" for expression in asked.parameters]
     return [*after, *parameters, *_given({**chosen, "motion": asked.motion})]
 
@@ -201,7 +202,7 @@ def _about_a_run(
     elif isinstance(asked, Report):
         words = ["report", str(folder), "--out", str(place / f"{asked.run}.html")]
     elif isinstance(asked, Payload):
-        words = ["payload", str(folder), *_recordings(db, state, asked.recordings), "--out", str(place / str(made))]
+        words = ["payload", str(folder), *_as_described(db, state, asked.recordings), "--out", str(place / str(made))]
         words += ["--refit-offsets"] if asked.refit_offsets else []
     else:
         formats = asked.format if isinstance(asked, Figures) else ",".join(asked.formats)
@@ -222,7 +223,31 @@ def _judgement(db: Database, state: Path, asked: Judge) -> Command:
 
 
 def _recordings(db: Database, state: Path, asked: Sequence[RecordingOf]) -> list[str]:
-    return [f"{run_file(db, state, one.run, one.name)}{range_words(one)}" for one in asked]
+    return [f"{_recording(db, state, one)}{range_words(one)}" for one in asked]
+
+
+def _recording(db: Database, state: Path, one: RecordingOf) -> Path:
+    return run_file(db, state, one.run, one.name or recording_name(db, one.run))
+
+
+def _as_described(db: Database, state: Path, asked: Sequence[RecordingOf]) -> list[str]:
+    """Return paths as `_recordings` does, for commands that take no columns file.
+
+    Raises:
+        UsageError: a recording came with one.
+    """
+    if _columns(db, state, asked):
+        raise UsageError(
+            "a recording that came with a columns file can be identified from only; for this, say how its "
+            "columns are laid out in the arm's description, and upload it without"
+        )
+    return _recordings(db, state, asked)
+
+
+def _columns(db: Database, state: Path, asked: Sequence[RecordingOf]) -> list[str]:
+    """Say of each uploaded recording that came with a columns file how it is laid out."""
+    files = {_recording(db, state, one): run_folder(db, state, one.run) / COLUMNS for one in asked}
+    return [f"--columns={recording}={columns}" for recording, columns in files.items() if columns.is_file()]
 
 
 def range_words(one: RecordingOf) -> str:

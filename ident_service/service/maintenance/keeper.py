@@ -11,7 +11,7 @@ import logging
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 from ident_service.errors import IdentError
@@ -24,7 +24,7 @@ from ident_service.service.maintenance.schedules import LATE, dues, fall_due, sc
 from ident_service.service.maintenance.webhook import Webhook
 from ident_service.service.registry.arms import known_arm
 from ident_service.service.registry.audit import note
-from ident_service.service.registry.database import Database, Row
+from ident_service.service.registry.database import Row
 from ident_service.service.registry.jobs import LIVE, jobs
 
 _TICK = 0.5  # s between looks
@@ -120,27 +120,18 @@ class Keeper:
         return ""
 
     def _tell(self) -> None:
-        """Each notice once; one for which there is no room waits for the next look."""
+        """Tell of each once; a notice is kept in the same transaction that says so."""
         for table, rows in (("dues", dues(self._db)), ("alarms", alarms(self._db))):
             for row in rows:
-                if not row["told"] and (self._webhook is None or self._webhook.send(_notice(table, row))):
+                if row["told"]:
+                    continue
+                with self._db.transaction():
+                    if self._webhook is not None:
+                        self._webhook.send(*_notice(table, row))
                     self._db.write(f"UPDATE {table} SET told = 1 WHERE id = ?", row["id"])  # noqa: S608 - ours
 
 
-def note_gave_up(db: Database, notice: Mapping[str, Any], why: str) -> None:
-    """Enter a notice that nobody took."""
-    about = {"kind": notice["kind"], "id": notice["id"], "why": why[:500]}
-    note(db, SERVICE, "webhook failed", str(notice["arm"]), **about)
-
-
-def _notice(table: str, row: Row) -> dict[str, Any]:
+def _notice(table: str, row: Row) -> tuple[str, float, dict[str, Any]]:
     due = table == "dues"
-    return {
-        "format": "ident-notice",
-        "version": 1,
-        "kind": "due" if due else "drift alarm",
-        "id": row["id"],
-        "arm": row["arm"],
-        "what": row["cause"] if due else row["what"],
-        "at": row["at"],
-    }
+    data = {"id": row["id"], "arm": row["arm"], "what": row["cause"] if due else row["what"]}
+    return "arm.due" if due else "arm.drift_alarm", row["at"], data

@@ -1,38 +1,47 @@
-"""Notices to a program elsewhere: what is due, and drift alarms, by HTTP POST, signed.
+"""Notices to a program elsewhere, by the convention of standardwebhooks.com: what is due, and drift alarms.
 
-A failure harms nothing: a thread of its own sends, what waits is bounded, each notice is tried a few times and then
-given up with a line in the audit trail. What is due and which alarms stand is the registry's to say; a notice is only
-that. Only https, or http to this machine; redirections are not followed.
+Each notice is a row of the registry before anybody is told that it was sent. It is tried again, later and later, for
+three days, also after a restart; then it is given up with a line in the audit trail. A failure harms nothing: a thread
+of its own sends. Only https, or http to this machine; redirections are not followed.
 
-The receiver checks `X-Ident-Signature: sha256=HEX`, which is the HMAC-SHA256 (RFC 2104) of `X-Ident-Timestamp`, a dot
-and the body under the shared secret, and refuses old timestamps. `X-Ident-Delivery` is the same for all attempts.
+The receiver verifies `webhook-signature` with a library of the convention and the shared secret, refuses old
+timestamps, and tells repetitions by `webhook-id`, which is the same for all attempts.
 """
 
 from __future__ import annotations
 
-import hashlib
-import hmac
+import base64
 import http.client
 import ipaddress
 import json
 import logging
 import os
-import queue
 import secrets
+import sqlite3
 import ssl
 import threading
 import time
 from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from http import HTTPStatus
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from ident_service.errors import UsageError
+from standardwebhooks.webhooks import Webhook as Signer
 
-MOST_WAITING: Final = 64
-WAITS: Final = (1.0, 5.0, 30.0, 120.0)  # s after each attempt that failed
+from ident_service.errors import UsageError
+from ident_service.service.registry.audit import note
+from ident_service.service.registry.database import Database, Row
+
+WAITS: Final = (5.0, 300.0, 1800.0, 7200.0, 18_000.0, 36_000.0, 50_400.0, 72_000.0, 86_400.0)
+"""After each attempt that failed [s]: the schedule that the convention recommends, about three days in all."""
+KEPT: Final = 30 * 24 * 3600.0  # s that what became of a notice is remembered
 _PATIENCE = 5.0  # s for connecting, and for each answer
+_LOOK = 0.5  # s between looks at what is to be sent
 _LEAST_SECRET, _MOST_SECRET = 16, 1024  # bytes
+_PREFIX: Final = "whsec_"
+SERVICE: Final = "service"
 LOG = logging.getLogger("ident.webhook")
 
 
@@ -41,19 +50,19 @@ class Webhook:
 
     def __init__(
         self,
+        db: Database,
         url: str,
         secret: bytes,
-        gave_up: Callable[[Mapping[str, Any], str], None] = lambda *_: None,
         *,
         waits: tuple[float, ...] = WAITS,
         now: Callable[[], float] = time.time,
     ) -> None:
-        """Begin to wait for notices.
+        """Begin to send what waits in the registry, of an earlier process, too.
 
         Args:
+            db: the registry.
             url: https, or http to a loopback address.
             secret: shared with the receiver, 16 bytes or more.
-            gave_up: called with a notice that could not be delivered, and why.
             waits: after each attempt that failed but the last [s].
             now: s since 1970 in UTC.
 
@@ -63,58 +72,80 @@ class Webhook:
         require_address(url)
         if len(secret) < _LEAST_SECRET:
             raise UsageError(f"a webhook's secret has {_LEAST_SECRET} bytes at least")
-        self._url, self._secret, self._gave_up = url, secret, gave_up
+        self._db, self._url, self._signer = db, url, Signer(secret)
         self._waits, self._now = waits, now
-        self._waiting: queue.Queue[Mapping[str, Any]] = queue.Queue(MOST_WAITING)
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._work, name="webhook", daemon=True)
         self._thread.start()
 
-    def send(self, notice: Mapping[str, Any]) -> bool:
-        """Have a notice sent; False where too many wait already. Returns at once."""
-        try:
-            self._waiting.put_nowait(dict(notice))
-        except queue.Full:
-            return False
-        return True
+    def send(self, kind: str, at: float, data: Mapping[str, Any]) -> str:
+        """Have a notice sent; it is there when the caller's transaction is. Returns at once.
+
+        Args:
+            kind: `arm.due` and so on.
+            at: when it happened [s since 1970 in UTC].
+            data: JSON values.
+
+        Returns:
+            Its id.
+        """
+        when = datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        body = json.dumps({"type": kind, "timestamp": when, "data": dict(data)}, allow_nan=False)
+        name = f"msg_{secrets.token_hex(12)}"
+        self._db.write(
+            "INSERT INTO deliveries (id, arm, body, created, next) VALUES (?, ?, ?, ?, ?)",
+            *(name, str(data.get("arm", "")), body, self._now(), self._now()),
+        )
+        return name
 
     def close(self) -> None:
-        """Send nothing more; what waits is given up."""
+        """Send nothing more; what waits is sent after the next start."""
         self._ending.set()
         self._thread.join(3 * _PATIENCE)
 
     def _work(self) -> None:
-        while not self._ending.is_set():
+        while not self._ending.wait(_LOOK):
             try:
-                notice = self._waiting.get(timeout=0.2)
-            except queue.Empty:
-                continue
-            try:
-                if why := self._deliver(notice):
-                    LOG.warning("a notice could not be delivered: %s", why)
-                    self._gave_up(notice, why)
+                while not self._ending.is_set() and (row := self._due()) is not None:
+                    self._attempt(row)
+            except sqlite3.Error as error:
+                LOG.error("notices wait for the registry: %s", error)
             except Exception:  # the next notice is sent all the same
                 LOG.exception("the webhook stumbled")
 
-    def _deliver(self, notice: Mapping[str, Any]) -> str:
-        """Empty when it was taken, else why it was not."""
-        delivery, body = secrets.token_hex(8), json.dumps(notice, allow_nan=False).encode()
-        why = ""
-        for wait in (0.0, *self._waits):
-            if self._ending.wait(wait):
-                return f"the service ended; {why}"
-            try:
-                status = self._post(delivery, body)
-            except (OSError, http.client.HTTPException, ValueError) as error:
-                why = f"{type(error).__name__}: {error}"
-                continue
-            if 200 <= status < 300:
-                return ""
-            why = f"answered {status}"
-        return why
+    def _due(self) -> Row | None:
+        return self._db.row("SELECT * FROM deliveries WHERE next <= ? ORDER BY next, number LIMIT 1", self._now())
 
-    def _post(self, delivery: str, body: bytes) -> int:
-        parts, at = urlsplit(self._url), f"{self._now():.0f}"
+    def _attempt(self, row: Row) -> None:
+        """Try once; what became of it is written before anything else is tried."""
+        tries, why, status = row["tries"] + 1, "", 0
+        try:
+            status = self._post(row["id"], row["body"])
+        except (OSError, http.client.HTTPException, ValueError) as error:
+            why = f"{type(error).__name__}: {error}"[:500]
+        now = self._now()
+        if 200 <= status < 300:
+            self._write(row, tries, None, now, "")
+            self._db.write("DELETE FROM deliveries WHERE next IS NULL AND created < ?", now - KEPT)
+            return
+        why = why or f"answered {status}"
+        # By the convention, 410 says that nothing is wanted there any more.
+        if status != HTTPStatus.GONE and tries <= len(self._waits):
+            self._write(row, tries, now + self._waits[tries - 1], None, why)
+            return
+        LOG.warning("a notice could not be delivered: %s", why)
+        with self._db.transaction():
+            self._write(row, tries, None, None, why)
+            note(self._db, SERVICE, "webhook failed", row["arm"], delivery=row["id"], tries=tries, why=why)
+
+    def _write(self, row: Row, tries: int, following: float | None, delivered: float | None, why: str) -> None:
+        self._db.write(
+            "UPDATE deliveries SET tries = ?, next = ?, delivered = ?, why = ? WHERE number = ?",
+            *(tries, following, delivered, why, row["number"]),
+        )
+
+    def _post(self, name: str, body: str) -> int:
+        parts, at = urlsplit(self._url), datetime.fromtimestamp(int(self._now()), UTC)
         host = parts.hostname or ""
         connection = (
             http.client.HTTPSConnection(host, parts.port, timeout=_PATIENCE, context=ssl.create_default_context())
@@ -123,20 +154,24 @@ class Webhook:
         )
         headers = {
             "Content-Type": "application/json",
-            "X-Ident-Delivery": delivery,
-            "X-Ident-Timestamp": at,
-            "X-Ident-Signature": f"sha256={signature(self._secret, at, body)}",
+            "webhook-id": name,
+            "webhook-timestamp": str(int(at.timestamp())),
+            "webhook-signature": self._signer.sign(name, at, body),
         }
+        path = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
         try:
-            connection.request("POST", (parts.path or "/") + (f"?{parts.query}" if parts.query else ""), body, headers)
+            connection.request("POST", path, body.encode(), headers)
             return connection.getresponse().status
         finally:
             connection.close()
 
 
-def signature(secret: bytes, at: str, body: bytes) -> str:
-    """What the header says, in hexadecimal digits."""
-    return hmac.new(secret, at.encode("ascii") + b"." + body, hashlib.sha256).hexdigest()
+def deliveries(db: Database, *, before: int | None = None, most: int = 100) -> list[Row]:
+    """Notices and what became of them, the newest first, from the one before the number `before`."""
+    return db.rows(
+        "SELECT * FROM deliveries WHERE number < ? ORDER BY number DESC LIMIT ?",
+        *(2**62 if before is None else before, most),
+    )
 
 
 def require_address(url: str) -> None:
@@ -158,7 +193,10 @@ def require_address(url: str) -> None:
 
 
 def read_secret(path: Path) -> bytes:
-    """The secret in a file that only its owner can read, without white space around it.
+    """Read the secret in a file that only its owner can read.
+
+    Args:
+        path: of the file: `whsec_` and the key in base 64, as the convention has it, or the key itself.
 
     Raises:
         UsageError: others can read it, or it is not there, or too short or long.
@@ -171,6 +209,11 @@ def read_secret(path: Path) -> bytes:
         if os.fstat(fd).st_mode & 0o077:
             raise UsageError(f"{path}: others can read it; chmod 600, and a new secret")
         secret = stream.read(_MOST_SECRET + 1).strip()
+    if secret.startswith(_PREFIX.encode()):
+        try:
+            secret = base64.b64decode(secret[len(_PREFIX) :], validate=True)
+        except ValueError:
+            raise UsageError(f"{path}: after {_PREFIX} stands a key in base 64, and this is none") from None
     if not _LEAST_SECRET <= len(secret) <= _MOST_SECRET:
         raise UsageError(f"{path}: a webhook's secret has {_LEAST_SECRET} to {_MOST_SECRET} bytes")
     return secret

@@ -174,7 +174,7 @@ def finish(service: Serving, who: Operator, arm: ArmName, form: Form) -> Respons
 @router.post("/arms/{arm}/supported")
 def supported(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
     """Take a person's word that an arm that is held is supported."""
-    arms.supported(service, who, arm)
+    arms.supported(service, who, arm, arms.Support(confirm=form.get("name", "").strip()))
     job = form.get("job", "")
     return seen(f"/jobs/{rows.known_job(service.db, job)['id']}?attended=1" if job else f"/arms/{arm}")
 

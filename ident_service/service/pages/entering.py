@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Final
 from urllib.parse import urlsplit
 
 from fastapi import APIRouter, HTTPException, Query, Request, Response
@@ -11,9 +11,19 @@ from ident_service.service.api import about
 from ident_service.service.api.asking import Cookie, Near, Serving
 from ident_service.service.api.jobs import stop_all
 from ident_service.service.pages.asking import Form, PageRoute, inside, seen
-from ident_service.service.pages.render import STATIC, mark, page, static
+from ident_service.service.pages.render import (
+    STATIC,
+    VIEWER,
+    mark,
+    page,
+    static,
+    viewer_file,
+    viewer_page,
+    viewer_version,
+)
 
 router = APIRouter(include_in_schema=False, route_class=PageRoute)
+_KEPT: Final = {"Cache-Control": "public, max-age=31536000, immutable"}
 Next = Annotated[str, Query(alias="next", max_length=500)]
 
 
@@ -44,13 +54,20 @@ def log_out(service: Serving, form: Form, cookie: Cookie = None) -> Response:
     return answer
 
 
+@router.get("/api/docs")
+def show_api() -> Response:
+    """Show the description of the API, which anybody may read."""
+    return viewer_page()
+
+
 @router.get("/static/{version}/{name}")
 def load(version: str, name: str) -> Response:
     """A style sheet or script."""
+    if (version, name) == (viewer_version(), VIEWER):
+        return Response(viewer_file(), media_type="text/javascript", headers=_KEPT)
     if name not in STATIC or version != mark():
         raise HTTPException(404, "no such file; load the page again")
-    kept = {"Cache-Control": "public, max-age=31536000, immutable"}
-    return Response(static()[name], media_type=STATIC[name], headers=kept)
+    return Response(static()[name], media_type=STATIC[name], headers=_KEPT)
 
 
 @router.post("/stop")

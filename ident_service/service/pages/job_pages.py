@@ -5,13 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Query, Response
 from fastapi.responses import FileResponse
 
 from ident_service.errors import UnknownId
 from ident_service.service.api import jobs
 from ident_service.service.api.asking import Operator, Service, Serving, Viewer
-from ident_service.service.api.live_routes import watch_live
 from ident_service.service.api.live_stream import RECORDED, log_of
 from ident_service.service.jobs.asked import FileName, Id
 from ident_service.service.jobs.commands import EXPORTS
@@ -48,12 +47,6 @@ def show_job(service: Serving, who: Viewer, job: Id, attended: bool = False) -> 
         entered=row["run"] is not None and service.db.row("SELECT 1 FROM runs WHERE id = ?", row["run"]) is not None,
         exports=_exported(service, row),
     )
-
-
-@router.get("/jobs/{job}/live")
-async def watch(service: Serving, who: Viewer, request: Request, job: Id) -> Response:
-    """Watch a job and the run that it records, as over the API."""
-    return await watch_live(service, who, request, job)
 
 
 @router.post("/jobs/{job}/cancel")

@@ -42,6 +42,9 @@ TITLES: Final = {
 }
 
 
+_MAKE_RUNS: Final = ("rehearse", "run", "identify")
+
+
 @dataclass(frozen=True)
 class Step:
     """One step.
@@ -97,7 +100,12 @@ def ladder(db: Database, state: Path, config: ArmConfig) -> Ladder:
     again = reidentifications(db, arm, most=500)
     made = {one[key] for one in again for key in ("recorded", "run")} - {None}
     under_way = next((one for one in again if one["state"] == "running"), None)
-    jobs = [one for one in rows.jobs(db, arm=arm, most=500) if one["created"] >= since and one["run"] not in made]
+    there = {one["id"] for one in db.rows("SELECT id FROM runs WHERE arm = ?", arm)}
+    jobs = [
+        one
+        for one in rows.jobs(db, arm=arm, most=500)
+        if one["created"] >= since and one["run"] not in made and not _deleted(one, there)
+    ]
     run = _newest(jobs, "run")
     identification = next((job for job in jobs if _identifies(job, run)), None)
     run_id, identified = _made(run), _made(identification)
@@ -174,6 +182,11 @@ def _last(again: list[Row]) -> str:
 
 def _newest(jobs: list[Row], kind: str) -> Row | None:
     return next((job for job in jobs if job["kind"] == kind and job["state"] == "done"), None)
+
+
+def _deleted(job: Row, there: set[str]) -> bool:
+    """Tell whether the run that a job has made is gone."""
+    return job["kind"] in _MAKE_RUNS and job["state"] == "done" and job["run"] not in there
 
 
 def _made(job: Row | None) -> str | None:

@@ -7,9 +7,11 @@ origin, because a browser that is to say nothing sends `Origin: null` with a for
 from __future__ import annotations
 
 import hashlib
+import json
 from datetime import UTC, datetime
 from functools import lru_cache
 from importlib.resources import files
+from importlib.resources.abc import Traversable
 from typing import Any, Final
 
 from fastapi.responses import HTMLResponse
@@ -23,12 +25,22 @@ STATIC: Final = {
     "page.js": "text/javascript",
     "live.js": "text/javascript",
     "again.js": "text/javascript",
+    "upload.js": "text/javascript",
+    "news.js": "text/javascript",
 }
 _HEADERS: Final = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
     "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'",
     "Referrer-Policy": "same-origin",
 }
+
+
+VIEWER: Final = "rapidoc-min.js"
+# Of the page with the viewer, whose own styles stand in its elements; it sends nothing anywhere.
+_VIEWER_POLICY: Final = (
+    "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
+    "connect-src 'self'; form-action 'none'; base-uri 'none'; frame-ancestors 'none'"
+)
 
 
 def page(name: str, who: Access | None, status: int = 200, **values: Any) -> HTMLResponse:
@@ -42,6 +54,28 @@ def page(name: str, who: Access | None, status: int = 200, **values: Any) -> HTM
     """
     text = _environment().get_template(f"{name}.html").render(who=who, version=__version__, mark=mark(), **values)
     return HTMLResponse(text, status, headers=_HEADERS)
+
+
+def viewer_page() -> HTMLResponse:
+    """Show the description of the API in the viewer that came along; nothing is loaded from elsewhere."""
+    text = _environment().get_template("api.html").render(mark=mark(), viewer=viewer_version())
+    return HTMLResponse(text, headers={**_HEADERS, "Content-Security-Policy": _VIEWER_POLICY})
+
+
+def viewer_file() -> bytes:
+    """Read the viewer's script."""
+    return _vendored().joinpath(VIEWER).read_bytes()
+
+
+@lru_cache(maxsize=1)
+def viewer_version() -> str:
+    """Return what changes in the address of the viewer when it does."""
+    told = json.loads(_vendored().joinpath("vendored.json").read_text(encoding="utf-8"))
+    return f"{told['package']}-{told['version']}"
+
+
+def _vendored() -> Traversable:
+    return files(__package__).joinpath("vendored")
 
 
 @lru_cache(maxsize=1)

@@ -39,7 +39,13 @@ def show_run(service: Serving, who: Viewer, run: Id) -> Response:
     answer = runs.get_run(service, who, run)
     sets = service.db.rows("SELECT run FROM parameter_sets WHERE arm = ? AND run <> ?", answer.arm, answer.id)
     reported = (service.state / REPORTS / f"{answer.id}.html").is_file()
-    return page("run", who, run=answer, reported=reported, others=[row["run"] for row in sets])
+    recorded = service.db.rows(
+        "SELECT id FROM runs WHERE arm = ? AND id <> ? AND kind IN ('motion', 'recording') "
+        "ORDER BY created DESC LIMIT 50",
+        *(answer.arm, answer.id),
+    )
+    others = [row["run"] for row in sets]
+    return page("run", who, run=answer, reported=reported, others=others, recorded=recorded)
 
 
 @router.get("/compare")

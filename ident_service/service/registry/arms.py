@@ -11,7 +11,7 @@ import re
 import secrets
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -98,7 +98,14 @@ def known_arm(db: Database, state: Path, name: str) -> KnownArm:
 
 
 def add_arm(
-    db: Database, state: Path, text: str, files: Mapping[str, str], by: str, *, replace: bool = False
+    db: Database,
+    state: Path,
+    text: str,
+    files: Mapping[str, str],
+    by: str,
+    *,
+    replace: bool = False,
+    judge: Callable[[Path], object] = lambda _: None,
 ) -> KnownArm:
     """Take an uploaded description; the one that had its name stays on the disk.
 
@@ -109,6 +116,7 @@ def add_arm(
         files: name to content of the files that it names.
         by: who.
         replace: whether it may take the place of another of its name, a shipped one included.
+        judge: raises where something is wrong with the arm of a description that was not known; it takes seconds.
 
     Raises:
         AlreadyThere: its name is taken by another description.
@@ -120,6 +128,7 @@ def add_arm(
         _require_free(db, config, replace=replace)
         folder = state / DESCRIPTIONS / f"{config.name}-{config.sha256[:16]}"
         if not folder.exists():
+            judge(path)
             with appearing_folder(folder) as built:
                 for part in path.parent.iterdir():
                     shutil.copyfile(part, built / part.name)

@@ -98,3 +98,15 @@ def trail(db: Database, *, before: int | None = None, most: int = 100) -> list[R
         "SELECT * FROM audit WHERE id < ? ORDER BY id DESC LIMIT ?", 2**62 if before is None else before, most
     )
     return [{**row, "detail": json.loads(row["detail"])} for row in rows]
+
+
+def trail_after(db: Database, line: int, most: int = 500) -> list[Row]:
+    """Lines after the one of this id, the earliest first."""
+    rows = db.rows("SELECT * FROM audit WHERE id > ? ORDER BY id LIMIT ?", line, most)
+    return [{**row, "detail": json.loads(row["detail"])} for row in rows]
+
+
+def last_line(db: Database) -> int:
+    """Return the id of the newest line; 0 where there is none."""
+    row = db.row("SELECT MAX(id) AS id FROM audit")
+    return int(row["id"] or 0) if row is not None else 0

@@ -206,4 +206,19 @@ CREATE TABLE idempotency_keys (
 ) STRICT;
 """
 
-MIGRATIONS: Final[tuple[str, ...]] = (_FIRST, _MAINTENANCE, _SESSIONS, _KEYS)
+_DELIVERIES = """
+CREATE TABLE deliveries (
+    number INTEGER PRIMARY KEY AUTOINCREMENT,
+    id TEXT NOT NULL UNIQUE,           -- webhook-id
+    arm TEXT NOT NULL,
+    body TEXT NOT NULL,                -- JSON, as it is signed and sent
+    created REAL NOT NULL,
+    tries INTEGER NOT NULL DEFAULT 0,
+    next REAL,                         -- when it is tried; NULL: delivered, or given up
+    delivered REAL,
+    why TEXT NOT NULL DEFAULT ''       -- the last try failed
+) STRICT;
+CREATE INDEX deliveries_by_next ON deliveries (next);
+"""
+
+MIGRATIONS: Final[tuple[str, ...]] = (_FIRST, _MAINTENANCE, _SESSIONS, _KEYS, _DELIVERIES)

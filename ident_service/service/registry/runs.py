@@ -16,6 +16,8 @@ from ident_service.results.manifest import MANIFEST, file_sha256, named_files, v
 from ident_service.service.registry.database import Database, Row
 
 RUNS: Final = "runs"
+UPLOAD, COLUMNS = "upload.json", "columns.yaml"
+"""Files of a run that is an uploaded recording: what was announced, and how its columns are laid out."""
 KILLED: Final = "killed"
 _ARM, _PARAMETERS, _SCORE = "arm.json", "parameters.json", "score.json"
 _MOST_BYTES = 64 * 2**20
@@ -36,7 +38,12 @@ def index_run(db: Database, state: Path, run: str) -> Row:
     files = dict(verified_files(folder, but=gone)) if whole else {}
     arm = _document(folder / _ARM)
     ended = _document(folder / ENDED) if (folder / ENDED).is_file() else None
-    sizes = {name: (folder / name).stat().st_size for name in files if name.endswith(_RECORDING) and name not in gone}
+    own = str(_document(folder / UPLOAD).get("name")) if UPLOAD in files else ""
+    sizes = {
+        name: (folder / name).stat().st_size
+        for name in files
+        if (name.endswith(_RECORDING) or name == own) and name not in gone
+    }
     table = _document(folder / _PARAMETERS) if _PARAMETERS in files else None
     name = str(arm.get("name", ""))
     if not name:
@@ -109,6 +116,16 @@ def recordings(db: Database, run: str) -> list[Row]:
     return db.rows("SELECT name, sha256, bytes, deleted FROM recordings WHERE run = ? ORDER BY name", run)
 
 
+def recording_name(db: Database, run: str) -> str:
+    """Return the name of the only recording of a run; `run.mcap` where it has several, or none.
+
+    Raises:
+        UnknownId: no such run.
+    """
+    names = [row["name"] for row in recordings(db, str(known_run(db, run)["id"]))]
+    return str(names[0]) if len(names) == 1 else "run.mcap"
+
+
 def parameter_set(db: Database, run: str) -> Row | None:
     """What is known of the parameters that a run holds."""
     return db.row("SELECT * FROM parameter_sets WHERE run = ?", run)
@@ -157,6 +174,8 @@ def _document(path: Path) -> dict[str, Any]:
 
 
 def _kind(files: dict[str, str]) -> str:
+    if UPLOAD in files:
+        return "recording"
     if _SCORE in files:
         return "simulation"
     return "identification" if _PARAMETERS in files else "motion"
@@ -165,7 +184,7 @@ def _kind(files: dict[str, str]) -> str:
 def _ending(files: dict[str, str], ended: dict[str, Any] | None) -> str:
     if ended is not None:
         return str(ended.get("error") or ended.get("state") or "unknown")
-    return "done" if _PARAMETERS in files else KILLED
+    return "uploaded" if UPLOAD in files else "done" if _PARAMETERS in files else KILLED
 
 
 def _driven(arm: dict[str, Any], ended: dict[str, Any] | None) -> float | None:

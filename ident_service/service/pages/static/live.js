@@ -345,7 +345,7 @@ function listen() {
   Object.assign(series, { joints: [], time: [] });
   Object.assign(doubt, { time: [], shares: [], first: [] });
   play = null;
-  const stream = new EventSource(`/jobs/${id}/live`);
+  const stream = new EventSource(`/api/v1/jobs/${id}/live`);
   streams.add(stream);
   stream.addEventListener("job", (event) => showJob(event.data));
   stream.addEventListener("samples", (event) => {

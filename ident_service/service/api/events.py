@@ -1,0 +1,110 @@
+"""The route of the one stream: what happens to all arms and jobs, and what runs that are recorded show."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Header, Query, Request
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import StreamingResponse
+
+from ident_service.service.api.asking import Service, Serving, Viewer
+from ident_service.service.api.live_stream import RECORDED
+from ident_service.service.api.mistakes import failures, failures_of_files
+from ident_service.service.live import LiveRuns
+from ident_service.service.news import News, Seen, Watch
+from ident_service.service.registry import jobs as rows
+from ident_service.service.registry.runs import RUNS
+
+router = APIRouter(prefix="/api/v1", tags=["events"], responses=failures())
+_LOOK = 0.1  # s between news
+_STATE = 0.5  # s between looks for runs that are recorded
+_BREATH = 10.0  # s without news, after which a comment shows that the line is up
+_AGAIN = 1000  # ms after which a browser comes again
+_STREAM: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"text/event-stream": {}}, "description": "Events."},
+    **failures_of_files(),
+}
+LastEvent = Annotated[
+    int | None,
+    Header(
+        alias="Last-Event-ID",
+        ge=0,
+        lt=2**62,
+        description="the last `id` that was seen; everything that has happened since is told first",
+    ),
+]
+Samples = Annotated[bool, Query(description="also `samples` and `doubt` of runs that are recorded")]
+
+
+@router.get("/events", response_class=StreamingResponse, responses=_STREAM)
+async def watch_all(
+    service: Serving, _: Viewer, request: Request, last_event_id: LastEvent = None, samples: Samples = False
+) -> StreamingResponse:
+    """Watch all arms and jobs by server-sent events.
+
+    `happened` is a line of the audit trail, with its number as `id`; `job` and `arm` say how one stands, first as it is
+    and then whenever that changes. With `samples`, there are `samples` and `doubt` as in the live stream of a job, each
+    with its `job`.
+    """
+    watch: Watch = request.app.state.watch
+    seen = await run_in_threadpool(watch.begin, last_event_id)
+    live = request.app.state.live if samples else None
+    return StreamingResponse(_events(service, watch, seen, live), media_type="text/event-stream")
+
+
+async def _events(service: Service, watch: Watch, seen: Seen, live: LiveRuns | None) -> AsyncIterator[str]:
+    # A number without data: whoever comes again before anything has happened is told what has meanwhile.
+    yield f"retry: {_AGAIN}\nid: {seen.line}\n\n"
+    silent, recorded = 0.0, _Recorded(service, live)
+    while not service.engine.closing:
+        if watch.due:
+            await run_in_threadpool(watch.look)
+        while watch.behind(seen):
+            for one in await run_in_threadpool(watch.earlier, seen):
+                yield _event(one)
+        news = [_event(one) for one in watch.since(seen)]
+        if live is not None:
+            news += await run_in_threadpool(recorded.news)
+        for text in news:
+            yield text
+        silent = 0.0 if news else silent + _LOOK
+        if silent > _BREATH:
+            silent = 0.0
+            yield ": still here\n\n"
+        await asyncio.sleep(_LOOK)
+
+
+class _Recorded:
+    """Follow the runs that are recorded, for one viewer."""
+
+    def __init__(self, service: Service, live: LiveRuns | None) -> None:
+        self._service, self._live = service, live
+        self._jobs, self._looked = dict[str, tuple[str, int]](), 0.0
+
+    def news(self) -> list[str]:
+        """Read on in the file of each run; by one viewer for all."""
+        assert self._live is not None  # noqa: S101 - asked for with samples only
+        now = time.monotonic()
+        if now - self._looked >= _STATE:
+            self._looked = now
+            found = rows.jobs(self._service.db, states=("running",), most=100)
+            runs = {row["id"]: row["run"] for row in found if row["kind"] in RECORDED and row["run"] is not None}
+            for ended in self._jobs.keys() - runs.keys():
+                self._live.forget(ended)
+            self._jobs = {job: self._jobs.get(job, (run, 0)) for job, run in runs.items()}
+        told = []
+        for job, (run, number) in self._jobs.items():
+            for frame in self._live.run(job, self._service.state / RUNS / run).since(number):
+                self._jobs[job] = (run, frame.number)
+                told.append(f'event: {frame.kind}\ndata: {{"job": {json.dumps(job)}, {frame.data[1:]}\n\n')
+        return told
+
+
+def _event(one: News) -> str:
+    number = "" if one.number is None else f"id: {one.number}\n"
+    return f"{number}event: {one.kind}\ndata: {one.data}\n\n"

@@ -1,0 +1,217 @@
+"""Delete runs, motions and arms; what refers to one is named first, and nothing that is in use goes.
+
+A folder is renamed to a hidden name before the registry forgets it: a kill in between leaves a row without a folder,
+and whoever deletes again completes it. What was renamed is removed at the next start, too. The audit trail stays.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Iterable
+from contextlib import ExitStack
+from dataclasses import asdict
+from pathlib import Path
+from typing import Final, Literal
+
+from ident_service.errors import Dependent, DriverError, InUse, UnknownId, UsageError
+from ident_service.motion.control_file import ControlFile
+from ident_service.service.arm_state import arm_folder, control_path, fault_file
+from ident_service.service.jobs.commands import REPORTS
+from ident_service.service.maintenance.schedules import remove_schedule
+from ident_service.service.registry.arms import DESCRIPTIONS, know_shipped
+from ident_service.service.registry.audit import note
+from ident_service.service.registry.database import Database, Row
+from ident_service.service.registry.jobs import LIVE
+from ident_service.service.registry.motions import MOTIONS, known_motion
+from ident_service.service.registry.runs import RUNS, known_run
+
+_GONE: Final = ".deleted"
+_PLACES: Final = (RUNS, MOTIONS, DESCRIPTIONS, "arms")
+
+
+def delete_run(db: Database, state: Path, run: str, who: str, *, anyway: bool = False) -> list[Dependent]:
+    """Delete a run: its folder with all recordings, and its report.
+
+    Acceptances keep their copy of its parameters, and operating hours still count it.
+
+    Args:
+        db: the registry.
+        state: the state folder.
+        run: id.
+        who: deletes it.
+        anyway: whether to delete it although something refers to it.
+
+    Returns:
+        What refers to it.
+
+    Raises:
+        UnknownId: no such run.
+        InUse: a job that waits or runs is about it; or something refers to it, and it is not deleted anyway.
+    """
+    row = known_run(db, run)
+    found = _of_run(db, row)
+    _require_idle(db, f"the run {run}", _jobs_about(db, row["arm"], run))
+    _require_none(f"the run {run}", found, anyway=anyway)
+    _delete_run(db, state, row, who)
+    return found
+
+
+def delete_motion(db: Database, state: Path, motion: str, who: str, *, anyway: bool = False) -> list[Dependent]:
+    """Delete a motion, and the schedules that are to begin it; runs keep their copy of it. As `delete_run`."""
+    row = known_motion(db, motion)
+    found = _of_motion(db, row)
+    _require_idle(db, f"the motion {motion}", _jobs_about(db, row["arm"], motion))
+    _require_none(f"the motion {motion}", found, anyway=anyway)
+    _delete_motion(db, state, row, who)
+    return found
+
+
+def delete_arm(db: Database, state: Path, arm: str, who: str, *, anyway: bool = False) -> list[Dependent]:
+    """Delete an arm that was uploaded, with its motions, runs, schedules and acceptances; as `delete_run`.
+
+    A shipped arm of the same name is there again afterwards.
+
+    Raises:
+        UsageError: it is a shipped one.
+        InUse: as above; or it is being moved, or has a fault that nobody has acknowledged.
+    """
+    row = db.row("SELECT * FROM arms WHERE name = ?", arm)
+    if row is None:
+        raise UnknownId(f"no arm {arm!r} is known; the list of arms names them")
+    if row["source"] == "shipped":
+        raise UsageError(f"{arm} comes with this software; it cannot be deleted")
+    live = db.rows(f"SELECT id FROM jobs WHERE arm = ? AND state IN {LIVE}", arm)  # noqa: S608 - ours
+    live += db.rows("SELECT id FROM reidentifications WHERE arm = ? AND state = 'running'", arm)
+    _require_idle(db, f"the arm {arm}", [one["id"] for one in live])
+    if faults := fault_file(state, arm).latched():
+        raise InUse(f"the arm {arm} has faults that nobody has acknowledged: {', '.join(faults)}")
+    runs = db.rows("SELECT * FROM runs WHERE arm = ? ORDER BY id", arm)
+    motions = db.rows("SELECT * FROM motions WHERE arm = ? ORDER BY id", arm)
+    found = [
+        *(Dependent("run", one["id"], "deleted") for one in runs),
+        *(Dependent("motion", one["id"], "deleted") for one in motions),
+        *_numbered(db, "schedule", "SELECT id FROM schedules WHERE arm = ? ORDER BY id", arm),
+        *_numbered(db, "acceptance", "SELECT number AS id FROM acceptances WHERE arm = ? ORDER BY number", arm),
+    ]
+    _require_none(f"the arm {arm}", found, anyway=anyway)
+    with ExitStack() as held:
+        try:  # from now on nobody at a terminal moves it
+            held.enter_context(ControlFile.take(control_path(state, arm), None))
+        except DriverError as error:
+            raise InUse(f"the arm {arm} is being moved: {error}") from None
+        for one in runs:
+            _delete_run(db, state, one, who)
+        for one in motions:
+            _delete_motion(db, state, one, who)
+        gone = [_hide(arm_folder(state, arm))]
+        with db.transaction():
+            for table in ("schedules", "dues", "alarms", "acceptances", "reidentifications", "maintenance_events"):
+                db.write(f"DELETE FROM {table} WHERE arm = ?", arm)  # noqa: S608 - ours
+            db.write("DELETE FROM arms WHERE name = ?", arm)
+            note(db, who, "arm deleted", arm, with_it=[asdict(one) for one in found[:100]])
+            know_shipped(db)
+    place = state / DESCRIPTIONS
+    own = re.compile(re.escape(arm) + r"-[0-9a-f]{16}")
+    gone += [_hide(path) for path in (place.iterdir() if place.is_dir() else ()) if own.fullmatch(path.name)]
+    _remove(gone)
+    return found
+
+
+def remove_deleted(state: Path) -> None:
+    """Remove what was being deleted when a process died."""
+    for place in (state / name for name in _PLACES):
+        _remove(path for path in (place.iterdir() if place.is_dir() else ()) if path.name.endswith(_GONE))
+
+
+def _of_run(db: Database, row: Row) -> list[Dependent]:
+    run, arm = row["id"], row["arm"]
+    again = "SELECT id FROM reidentifications WHERE ? IN (recorded, run) ORDER BY id"
+    return [
+        *_numbered(db, "acceptance", "SELECT number AS id FROM acceptances WHERE run = ? ORDER BY number", run, "kept"),
+        *(Dependent("identification", one, "kept") for one in _made_from(db, arm, run)),
+        *_numbered(db, "re-identification", again, run, "kept"),
+        *_numbered(db, "alarm", "SELECT id FROM alarms WHERE run = ? AND closed IS NULL", run, "kept"),
+    ]
+
+
+def _of_motion(db: Database, row: Row) -> list[Dependent]:
+    return [Dependent("schedule", str(one), "deleted") for one in _schedules_of(db, row)]
+
+
+def _schedules_of(db: Database, row: Row) -> list[int]:
+    rows = db.rows("SELECT id, request FROM schedules WHERE arm = ? ORDER BY id", row["arm"])
+    return [one["id"] for one in rows if json.loads(one["request"]).get("motion") == row["id"]]
+
+
+def _numbered(
+    db: Database, kind: str, sql: str, about: str, becomes: Literal["deleted", "kept"] = "deleted"
+) -> list[Dependent]:
+    return [Dependent(kind, str(one["id"]), becomes) for one in db.rows(sql, about)]
+
+
+def _made_from(db: Database, arm: str, run: str) -> list[str]:
+    """Return runs and exports that were made from the recordings of a run."""
+    return [
+        job["run"]
+        for job in db.rows("SELECT * FROM jobs WHERE arm = ? AND state = 'done' ORDER BY number", arm)
+        if job["run"] not in (None, run)
+        and any(
+            one.get("run") == run
+            for key in ("recordings", "validate_on", "after")
+            for one in json.loads(job["request"]).get(key) or ()
+        )
+    ]
+
+
+def _jobs_about(db: Database, arm: str, name: str) -> list[str]:
+    rows = db.rows(f"SELECT id, run, request FROM jobs WHERE arm = ? AND state IN {LIVE}", arm)  # noqa: S608 - ours
+    found = [one["id"] for one in rows if one["run"] == name or f'"{name}"' in one["request"]]
+    again = "SELECT id FROM reidentifications WHERE state = 'running' AND ? IN (motion, recorded, run)"
+    return found + [one["id"] for one in db.rows(again, name)]
+
+
+def _require_idle(db: Database, what: str, busy: list[str]) -> None:
+    if busy:
+        raise InUse(f"{what} is used by {', '.join(busy[:10])}; wait for the end, or cancel it")
+
+
+def _require_none(what: str, found: list[Dependent], *, anyway: bool) -> None:
+    if found and not anyway:
+        names = ", ".join(f"{one.kind} {one.id}" for one in found[:10]) + (", ..." if len(found) > 10 else "")
+        raise InUse(f"{what} is referred to by {names}; ask for deleting it anyway", found)
+
+
+def _delete_run(db: Database, state: Path, row: Row, who: str) -> None:
+    run, gone = row["id"], _hide(state / RUNS / row["id"])
+    with db.transaction():
+        # The hours that the arm has been driven are not forgotten.
+        db.write("UPDATE schedules SET counted = counted - ? WHERE arm = ?", row["seconds"] or 0.0, row["arm"])
+        db.write("DELETE FROM runs WHERE id = ?", run)
+        note(db, who, "run deleted", run, arm=row["arm"], manifest_sha256=row["manifest_sha256"])
+    (state / REPORTS / f"{run}.html").unlink(missing_ok=True)
+    _remove([gone])
+
+
+def _delete_motion(db: Database, state: Path, row: Row, who: str) -> None:
+    motion, gone = row["id"], _hide(state / MOTIONS / row["id"])
+    with db.transaction():
+        for schedule in _schedules_of(db, row):
+            remove_schedule(db, schedule, who)
+        db.write("DELETE FROM motions WHERE id = ?", motion)
+        note(db, who, "motion deleted", motion, arm=row["arm"], sha256=row["sha256"])
+    _remove([gone])
+
+
+def _hide(folder: Path) -> Path:
+    hidden = folder.with_name(f".{folder.name}{_GONE}")
+    if folder.exists():
+        shutil.rmtree(hidden, ignore_errors=True)
+        folder.rename(hidden)
+    return hidden
+
+
+def _remove(folders: Iterable[Path]) -> None:
+    for folder in list(folders):
+        shutil.rmtree(folder, ignore_errors=True)

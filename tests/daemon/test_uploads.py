@@ -1,0 +1,251 @@
+"""Recordings of one's own, uploaded in pieces: resumed, checked by hash, seen only when whole, identified from."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+import signal
+import socket
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from daemon.conftest import Asked, quick_text
+from daemon.served import daemon_process
+
+from ident_service.cli import main
+from ident_service.client import IdentClient
+from ident_service.record.open import open_recording
+from ident_service.service import uploads
+from ident_service.service.backup import back_up, restore
+from ident_service.service.registry.database import Database
+from ident_service.service.registry.runs import index_run
+
+COLUMNS = "columns:\n  t: {column: stamp, unit: ms}\n  q1: a\n  q2: b\n  tau1: {column: u, unit: mNm}\n  tau2: v\n"
+
+
+@pytest.fixture(scope="session")
+def table(commissioned: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of the arm `quick` as a CSV with a header and units of its own."""
+    path = tmp_path_factory.mktemp("table") / "monday run.csv"
+    lines = ["stamp,a,b,u,v,note"]
+    for block in open_recording(commissioned / "identification.mcap").blocks():
+        lines += [
+            f"{stamp * 1e-6!r},{q[0]!r},{q[1]!r},{1e3 * tau[0]!r},{tau[1]!r},ok"
+            for stamp, q, tau in zip(
+                block.stamp_ns.tolist(), block.position.tolist(), block.torque.tolist(), strict=True
+            )
+        ]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def announced(content: bytes, **changes: Any) -> dict[str, Any]:
+    sha256 = hashlib.sha256(content).hexdigest()
+    return {"arm": "planar2", "name": "mine.csv", "bytes": len(content), "sha256": sha256, **changes}
+
+
+def sent(daemon: Asked, upload: str, offset: int, data: bytes) -> Any:
+    return daemon.ask("PATCH", f"/api/v1/uploads/{upload}", content=data, headers={"Upload-Offset": str(offset)})
+
+
+def test_a_recording_arrives_in_pieces_and_is_a_run_when_it_is_whole(daemon: Asked) -> None:
+    content = os.urandom(100_000)
+    begun = daemon.post("/api/v1/uploads", announced(content))
+    assert (begun.status_code, begun.json()["received"], begun.json()["run"]) == (201, 0, None)
+    upload = begun.json()["id"]
+    assert sent(daemon, upload, 0, content[:30_000]).json()["received"] == 30_000
+    for offset in (0, 29_999, 30_001):
+        refused = sent(daemon, upload, offset, b"x")
+        assert (refused.status_code, refused.json()["error"]["kind"]) == (409, "AlreadyThere")
+    assert "30000" in refused.json()["error"]["message"]
+    assert daemon.post(f"/api/v1/uploads/{upload}/complete").status_code == 409
+    assert daemon.get("/api/v1/runs").json() == []
+    # Whoever announces it again goes on.
+    assert daemon.post("/api/v1/uploads", announced(content)).json() == daemon.get(f"/api/v1/uploads/{upload}").json()
+    assert sent(daemon, upload, 30_000, content[30_000:]).json()["received"] == 100_000
+    assert sent(daemon, upload, 100_000, b"more").status_code == 400
+    whole = daemon.post(f"/api/v1/uploads/{upload}/complete")
+    assert whole.status_code == 201
+    run = whole.json()["run"]
+    seen = daemon.get(f"/api/v1/runs/{run}").json()
+    assert (seen["kind"], seen["ending"], seen["arm"]) == ("recording", "uploaded", "planar2")
+    assert [(one["name"], one["bytes"]) for one in seen["recordings"]] == [("mine.csv", 100_000)]
+    assert daemon.get(f"/api/v1/runs/{run}/files/mine.csv").content == content
+    assert daemon.get("/api/v1/uploads").json() == []
+    # What is there is not sent again.
+    assert daemon.post("/api/v1/uploads", announced(content)).json()["run"] == run
+    assert daemon.post("/api/v1/uploads", announced(content, columns="x")).json()["run"] is None
+
+
+def test_what_is_not_what_was_announced_is_not_kept(daemon: Asked) -> None:
+    upload = daemon.post("/api/v1/uploads", announced(b"right")).json()["id"]
+    assert sent(daemon, upload, 0, b"wrong").status_code == 200
+    answer = daemon.post(f"/api/v1/uploads/{upload}/complete")
+    assert (answer.status_code, "another hash" in answer.text) == (422, True)
+    assert daemon.get("/api/v1/runs").json() == []
+    assert list((daemon.service.state / "runs").iterdir()) == []
+    assert list((daemon.service.state / ".uploads").iterdir()) == []
+    assert daemon.post("/api/v1/uploads", announced(b"right")).json()["received"] == 0
+
+
+def test_a_disk_that_is_full_at_the_end_costs_the_upload_and_no_more(
+    daemon: Asked, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    upload = daemon.post("/api/v1/uploads", announced(b"mine")).json()["id"]
+    sent(daemon, upload, 0, b"mine")
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(uploads, "write_manifest", full)
+        assert daemon.post(f"/api/v1/uploads/{upload}/complete").status_code == 507
+    assert list((daemon.service.state / "runs").iterdir()) == []
+    assert daemon.post("/api/v1/uploads", announced(b"mine")).json()["received"] == 0
+    sent(daemon, upload, 0, b"mine")
+    assert daemon.post(f"/api/v1/uploads/{upload}/complete").status_code == 201
+
+
+@pytest.mark.parametrize(
+    ("changes", "status", "said"),
+    [
+        ({"name": "arm.json"}, 400, "plain name"),
+        ({"name": "columns.yaml"}, 400, "plain name"),
+        ({"name": "../x.csv"}, 422, "name"),
+        ({"arm": "nobody"}, 404, "nobody"),
+        ({"bytes": 5 * 2**30}, 422, "bytes"),
+        ({"sha256": "x"}, 422, "sha256"),
+    ],
+)
+def test_what_cannot_be_a_recording_is_refused(daemon: Asked, changes: dict[str, Any], status: int, said: str) -> None:
+    answer = daemon.post("/api/v1/uploads", announced(b"x", **changes))
+    assert answer.status_code == status
+    assert said in answer.json()["error"]["message"]
+    assert not (daemon.service.state / ".uploads").exists()
+
+
+def test_room_is_made_sure_of_before_anything_is_sent(daemon: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
+    free = os.statvfs(daemon.service.state)
+    monkeypatch.setattr(uploads, "KEPT_FREE", free.f_blocks * free.f_frsize)  # more than can be free
+    answer = daemon.post("/api/v1/uploads", announced(b"x" * 1000))
+    assert answer.status_code == 507
+    assert "mine.csv has 1000 bytes" in answer.json()["error"]["message"]
+    # What others were promised counts, too.
+    monkeypatch.setattr(uploads, "KEPT_FREE", free.f_bavail * free.f_frsize - 3 * 2**30)
+    assert daemon.post("/api/v1/uploads", announced(b"a", bytes=2 * 2**30)).status_code == 201
+    assert daemon.post("/api/v1/uploads", announced(b"b", bytes=2 * 2**30)).status_code == 507
+    monkeypatch.setattr(uploads, "MOST_OPEN", 1)
+    answer = daemon.post("/api/v1/uploads", announced(b"c"))
+    assert (answer.status_code, "being uploaded" in answer.text) == (400, True)
+
+
+def test_a_piece_has_eight_megabytes_and_one_writer(daemon: Asked) -> None:
+    most = 8 * 2**20
+    upload = daemon.post("/api/v1/uploads", announced(b"", bytes=2 * most)).json()["id"]
+    assert sent(daemon, upload, 0, bytes(most)).json()["received"] == most
+    assert sent(daemon, upload, most, bytes(most + 1)).status_code == 413
+    seen = daemon.get(f"/api/v1/uploads/{upload}").json()["received"]
+    with uploads.Piece(daemon.service.state, upload, seen):
+        refused = sent(daemon, upload, seen, b"x")
+        assert (refused.status_code, "another piece" in refused.text) == (409, True)
+
+
+def test_half_uploads_go_after_a_day(daemon: Asked) -> None:
+    state = daemon.service.state
+    old, new = (daemon.post("/api/v1/uploads", announced(word)).json()["id"] for word in (b"old", b"new"))
+    for path in (state / ".uploads" / old, *(state / ".uploads" / old).iterdir()):
+        os.utime(path, (1.0, time.time() - uploads.HALF_SECONDS - 60.0))
+    assert uploads.delete_half_uploads(state) == [old]
+    assert [one["id"] for one in daemon.get("/api/v1/uploads").json()] == [new]
+    assert daemon.ask("DELETE", f"/api/v1/uploads/{new}").status_code == 204
+    assert daemon.get(f"/api/v1/uploads/{new}").status_code == 404
+
+
+def test_viewers_upload_nothing(daemon: Asked, viewer: str) -> None:
+    upload = daemon.post("/api/v1/uploads", announced(b"x")).json()["id"]
+    daemon.as_token(viewer)
+    assert daemon.post("/api/v1/uploads", announced(b"y")).status_code == 403
+    assert sent(daemon, upload, 0, b"x").status_code == 403
+    assert daemon.ask("DELETE", f"/api/v1/uploads/{upload}").status_code == 403
+    assert daemon.get(f"/api/v1/uploads/{upload}").json()["received"] == 0
+
+
+def test_a_backup_without_recordings_has_none_of_ones_own(daemon: Asked, tmp_path: Path) -> None:
+    upload = daemon.post("/api/v1/uploads", announced(b"mine")).json()["id"]
+    sent(daemon, upload, 0, b"mine")
+    run = daemon.post(f"/api/v1/uploads/{upload}/complete").json()["run"]
+    daemon.post("/api/v1/uploads", announced(b"half"))
+    back_up(daemon.service.state, tmp_path / "small.tar", recordings=False)
+    restore(tmp_path / "small.tar", tmp_path / "back", "test")
+    assert sorted(path.name for path in (tmp_path / "back" / "runs" / run).iterdir()) == [
+        *("arm.json", "manifest.json", "upload.json")
+    ]
+    assert not (tmp_path / "back" / ".uploads").exists()
+    with Database(tmp_path / "back") as db:
+        assert index_run(db, tmp_path / "back", run)["kind"] == "recording"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_an_upload_outlives_torn_lines_and_kills(state: Path) -> None:
+    content = os.urandom(3_000_000)
+    with daemon_process(state) as (process, client):
+        seen = client.post("/api/v1/uploads", announced(content))
+        host, _, port = client.url.removeprefix("http://").partition(":")
+        head = (
+            f"PATCH /api/v1/uploads/{seen['id']} HTTP/1.1\r\nHost: {host}:{port}\r\nUpload-Offset: 0\r\n"
+            f"Authorization: Bearer {(state / 'token').read_text().strip()}\r\nContent-Length: {len(content)}\r\n\r\n"
+        )
+        with socket.create_connection((host, int(port))) as line:
+            line.sendall(head.encode() + content[:1_000_000])
+            until = time.monotonic() + 60.0
+            while client.get(f"/api/v1/uploads/{seen['id']}")["received"] < 1_000_000 and time.monotonic() < until:
+                time.sleep(0.05)
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+    with daemon_process(state) as (_, client):
+        assert client.get(f"/api/v1/uploads/{seen['id']}")["received"] == 1_000_000
+        shares = list[float]()
+        (state.parent / "mine.csv").write_bytes(content)
+        named = client.upload("planar2", state.parent / "mine.csv", tell=shares.append)
+        assert (shares[0], shares[-1]) == (pytest.approx(1 / 3, rel=1e-3), 1.0)
+        assert client.content(f"/api/v1/runs/{named['run']}/files/{named['name']}") == content
+    assert "Traceback" not in (state.parent / "serve.log").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_parameters_are_identified_from_ones_own_data(
+    table: Path, state: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "columns.yaml").write_text(COLUMNS)
+    with daemon_process(state) as (_, client):
+        client.add_arm(quick_text())
+        words = ["identify", f"{table}@0:12", "--validate", f"{table}@13:", "--arm", "quick", "--json"]
+        there = ["--server", client.url, "--state", str(state), f"--columns={tmp_path / 'columns.yaml'}"]
+        assert main([*words, *there]) == 0
+        answer = json.loads(capsys.readouterr().out)
+        asked = answer["job"]["request"]
+        (recording,), (validation,) = asked["recordings"], asked["validate_on"]
+        assert (recording["name"], recording["end"], validation["start"]) == ("monday_run.csv", 12.0, 13.0)
+        assert recording["run"] == validation["run"]  # it was sent once
+        assert answer["answer"]["relative_error_percent"] < 3.0
+        _same_by_id(client, recording["run"])
+        # Its columns come with it; without them the arm's description does not fit.
+        bare = client.upload("quick", table)
+        ended = client.wait(client.begin("identify", arm="quick", recordings=[bare]).id)
+        assert (ended.state, bare["run"] == recording["run"]) == ("failed", False)
+        assert "stamp" in ended.detail
+        # What takes no columns file says so.
+        assert main(["payload", answer["job"]["run"], f"{recording['run']}", "--server", client.url]) == 2
+        assert "columns file" in capsys.readouterr().err
+
+
+def _same_by_id(client: IdentClient, run: str) -> None:
+    """The only recording of a run needs no name."""
+    ended = client.compute("identify", arm="quick", recordings=[{"run": run}])
+    assert ended.state == "done", ended

@@ -1,0 +1,45 @@
+"""The description of the API in a browser: the viewer that came along is what it says, and needs no network."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from importlib.resources import files
+
+import pytest
+from page.conftest import Reached
+from playwright.sync_api import Browser, ConsoleMessage, Request, expect
+
+VENDORED = files("ident_service.service.pages").joinpath("vendored")
+
+
+def test_the_viewer_is_what_its_document_says() -> None:
+    told = json.loads(VENDORED.joinpath("vendored.json").read_text())
+    assert set(told["sha256"]) == {"rapidoc-min.js", "rapidoc-min.js.LICENSE.txt", "LICENSE.txt"}
+    for name, sha256 in told["sha256"].items():
+        assert hashlib.sha256(VENDORED.joinpath(name).read_bytes()).hexdigest() == sha256, name
+    assert told["licence"] == "MIT"
+    assert f"RapiDoc {told['version']} " in VENDORED.joinpath("rapidoc-min.js").read_text()[:200]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(200)
+def test_the_api_can_be_browsed_without_network_or_token(browser: Browser, reached: Reached) -> None:
+    page = browser.new_context(viewport={"width": 1280, "height": 900}).new_page()
+    said, asked = list[str](), list[str]()
+
+    def hear(message: ConsoleMessage) -> None:
+        if message.type in ("error", "warning"):
+            said.append(message.text)
+
+    def see(request: Request) -> None:
+        asked.append(request.url)
+
+    page.on("console", hear)
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on("request", see)
+    page.goto(f"{reached.url}/api/docs")
+    expect(page.get_by_text("Stop all arms, under control").first).to_be_visible(timeout=60_000)
+    expect(page.get_by_text("Identify from a run").first).to_be_attached()
+    assert all(url.startswith((reached.url, "data:", "blob:")) for url in asked), asked
+    assert said == []

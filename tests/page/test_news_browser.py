@@ -1,0 +1,42 @@
+"""Lists of the page follow what happens, without a reload, and disturb nobody who stands in them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from page.conftest import Reached, log_in
+from playwright.sync_api import Browser, expect
+
+from ident_service.service.arm_state import fault_file
+from ident_service.service.jobs.asked import Base
+from ident_service.service.registry.arms import add_arm
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(200)]
+
+
+def test_lists_follow_what_happens(browser: Browser, reached: Reached, state: Path) -> None:
+    page = log_in(browser, reached)
+    page.wait_for_load_state("load")
+    loads = list[str]()
+    page.on("load", lambda _: loads.append(page.url))
+    main = page.locator("#main")
+    fault_file(state, "planar2").latch("overspeed", "too fast")
+    expect(main).to_contain_text("1 fault", timeout=30_000)
+    add_arm(reached.service.db, state, "extends: planar2\nname: bench\n", {}, "test")
+    expect(main.get_by_role("link", name="bench", exact=True)).to_be_visible(timeout=30_000)
+    # Whoever stands on a link there keeps it; what is missed comes when they leave.
+    main.get_by_role("link", name="bench", exact=True).focus()
+    fault_file(state, "planar2").acknowledge("overspeed")
+    page.wait_for_timeout(2000)
+    expect(main.get_by_role("link", name="bench", exact=True)).to_be_focused()
+    expect(main).to_contain_text("1 fault")
+    page.locator("header a").first.focus()
+    expect(main).not_to_contain_text("1 fault", timeout=30_000)
+    assert loads == []
+    page.get_by_role("link", name="Jobs", exact=True).click()
+    page.get_by_role("heading", name="Jobs", level=1).wait_for()
+    loads.clear()
+    reached.service.engine.create(Base(kind="base", arm="planar2"), "test")
+    expect(main.locator("tbody")).to_contain_text("done", timeout=60_000)
+    assert loads == []

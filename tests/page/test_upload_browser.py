@@ -1,0 +1,63 @@
+"""A recording of one's own, uploaded in a browser over a line that breaks, and identified from."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from page.conftest import Reached, log_in
+from playwright.sync_api import Browser, Route, expect
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+
+
+def test_a_file_goes_up_in_pieces_and_can_be_identified_from(
+    browser: Browser, reached: Reached, state: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "run of monday.csv"
+    file.write_bytes(os.urandom(9_000_000))
+    page = log_in(browser, reached)
+    problems, offsets = list[str](), list[int]()
+    page.on("pageerror", lambda error: problems.append(str(error)))
+
+    def broken_once(route: Route) -> None:
+        if route.request.method != "PATCH":
+            route.continue_()
+            return
+        offsets.append(int(route.request.headers["upload-offset"]))
+        if len(offsets) == 2:
+            route.abort()
+        else:
+            route.continue_()
+
+    page.route("**/api/v1/uploads/*", broken_once)
+    page.goto(f"{reached.url}/arms/planar2")
+    page.locator("summary", has_text="Upload a recording").click()
+    page.get_by_label("MCAP or CSV").set_input_files(file)
+    page.get_by_label("Columns of a CSV").fill("columns: {t: stamp}")
+    page.get_by_role("button", name="Upload").click()
+    page.wait_for_url("**/runs/*")
+    assert offsets == [0, 4 * 2**20, 4 * 2**20, 8 * 2**20]
+    run = page.url.rpartition("/")[2]
+    assert (state / "runs" / run / "run_of_monday.csv").read_bytes() == file.read_bytes()
+    assert (state / "runs" / run / "columns.yaml").read_text() == "columns: {t: stamp}"
+    # What is no recording is told by the job that reads it.
+    page.get_by_role("button", name="Identify").click()
+    page.get_by_role("link", name="Back to planar2").wait_for()
+    expect(page.locator("#state")).to_have_text("failed")
+    expect(page.locator("#detail")).to_contain_text("columns.yaml:1:1: columns: no joints")
+    assert problems == []
+
+
+def test_the_form_says_why_nothing_was_uploaded(browser: Browser, reached: Reached, tmp_path: Path) -> None:
+    file = tmp_path / "settings.json"
+    file.write_text("{}")
+    page = log_in(browser, reached)
+    page.goto(f"{reached.url}/arms/planar2")
+    page.locator("summary", has_text="Upload a recording").click()
+    page.get_by_label("MCAP or CSV").set_input_files(file)
+    page.get_by_role("button", name="Upload").click()
+    expect(page.locator("#upload-status")).to_contain_text(
+        "Not uploaded: 'settings.json': a recording has a plain name"
+    )
