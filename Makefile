@@ -9,7 +9,7 @@ READY  := $(VENV)/.ready
 # Set, it has each of a thousand child processes of the tests compile the whole package anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test unit coverage lint types bench bench-design bench-canopen bench-serve bench-stops bench-viewers campaign \
+.PHONY: demo test unit coverage lint types bench bench-design bench-canopen bench-serve bench-stops bench-viewers bench-peers campaign \
 	mutants test-socketcan test-foreign test-latest lock clean
 
 demo: $(READY)
@@ -19,7 +19,7 @@ demo: $(READY)
 # What a machine lacks (README: system packages) is skipped with its reason; with CI=true it fails.
 test: lint types coverage
 	$(TESTS) -m "not campaign and not realtime" $(GUARD_TESTS:%=--ignore=%)
-	$(BIN)/pytest -m "realtime and not campaign"
+	$(BIN)/pytest -m "realtime and not campaign" $$(grep -rl "mark.realtime" tests --include "test_*.py")
 
 # Three workers for two cores: tests that talk to processes of their own also wait.
 TESTS := $(BIN)/pytest -n 3 --dist worksteal
@@ -59,6 +59,10 @@ bench-stops: $(READY)
 
 bench-viewers: $(READY)
 	$(BIN)/python -m benchmarks.viewers
+
+# The command beside the script that somebody would write instead.
+bench-peers: $(READY)
+	$(BIN)/python -m benchmarks.peers
 
 # What takes too long for every change, once a night. The guest with the kernel's CAN emulates a processor for four minutes.
 campaign: test-socketcan

@@ -50,6 +50,7 @@ DOORS: dict[str, set[str]] = {
     "httpx": {"client"},
     "jinja2": {"service"},
     "prometheus_client": {"service"},
+    "standardwebhooks": {"service"},
     "starlette": {"service"},
     "uvicorn": {"service"},
 }
@@ -218,9 +219,9 @@ def test_the_checker_lets_pass_what_is_allowed(file: str, source: str) -> None:
     assert violations(source, file) == []
 
 
-def loaded_after(code: str) -> set[str]:
+def loaded_after(code: str, watched: tuple[str, ...] = HEAVY) -> set[str]:
     """Large libraries that a fresh interpreter has loaded after some code."""
-    script = f"import sys\n{code}\nprint('LOADED', *[name for name in {HEAVY!r} if name in sys.modules])"
+    script = f"import sys\n{code}\nprint('LOADED', *[name for name in {watched!r} if name in sys.modules])"
     result = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60, cwd=ROOT
     )
@@ -244,6 +245,29 @@ def test_identification_loads_cvxpy_only_when_it_is_used() -> None:
     loaded = loaded_after("import ident_service.estimation.identify, ident_service.service.identification")
     assert "clarabel" in loaded
     assert "cvxpy" not in loaded
+
+
+# Each run of an arm starts the first four of these, and waits for them; scipy alone would take each 0.2 s.
+@pytest.mark.parametrize(
+    ("program", "needed"),
+    [
+        ("ident_service.service.run", {"numpy", "pydantic", "pinocchio", "ruckig", "mcap"}),
+        ("ident_service.motion.process", {"numpy", "pydantic", "pinocchio", "ruckig"}),
+        ("sim_backend.plant_process", {"numpy", "pydantic", "pinocchio"}),
+        ("ident_service.record.recorder_loop", {"numpy", "mcap"}),
+        ("ident_service.service.target_process", {"numpy", "pydantic", "mcap", "yaml"}),
+        ("ident_service.service.api.app", {"numpy", "pydantic", "mcap", "yaml", "fastapi", "jinja2"}),
+    ],
+)
+def test_what_runs_beside_an_arm_loads_no_more_than_it_needs(program: str, needed: set[str]) -> None:
+    watched = (*HEAVY, "numpy", "pydantic", "scipy", "jsonschema_rs", "yaml")
+    assert loaded_after(f"import {program}", watched) <= needed
+
+
+def test_a_run_that_is_refused_has_loaded_no_estimation(tmp_path: Path) -> None:
+    words = ["run", "planar2", "--state", str(tmp_path)]
+    loaded = loaded_after(f"from ident_service.cli import main\nassert main({words!r}) == 3", (*HEAVY, "scipy"))
+    assert loaded <= {"pinocchio", "ruckig", "mcap"}
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["base", "--help"]])

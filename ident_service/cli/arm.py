@@ -10,6 +10,7 @@ import os
 import re
 import sys
 from contextlib import nullcontext
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,6 +49,12 @@ def add(verbs: Verbs) -> None:
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
     sub.add_argument("--home", action="store_true", help="for `ident home` and `ident recover`, and no motion")
+    sub.add_argument(
+        "--rate-seconds", type=seconds, metavar="S", help="hold the arm for so long to measure the rate (60 when new)"
+    )
+    sub.add_argument(
+        "--scale", action="store_true", help="move nothing: a person turns each joint by hand by an angle that is typed"
+    )
     sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person: the arm is supported")
     add_lease(sub, confirm=False)
     sub = verbs.add("run", _run, "move the arm along a motion and record it")
@@ -79,6 +86,8 @@ def add(verbs: Verbs) -> None:
     ):
         sub = verbs.add(name, _stop if name == "stop" else _ask, text)
         sub.add_argument("arm", metavar="ARM", nargs="?" if name == "stop" else None, help=_HELP_ARM)
+        if name == "supported":
+            sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person who sees it")
         sub.set_defaults(asks=name)
     sub = verbs.add("ack", _ack, "acknowledge a latched fault by its name")
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
@@ -141,6 +150,8 @@ def _check(arguments: argparse.Namespace) -> Answer:
             return str(arguments.confirm)
         return input(f"{question} ") if sys.stdin.isatty() and not arguments.json else ""
 
+    if arguments.scale:
+        return _scale(arguments, config)
     if arguments.home and arguments.motion is not None:
         raise UsageError("give a motion or --home, not both")
     motion = None if arguments.home else _chosen(config, arguments.motion)
@@ -161,10 +172,24 @@ def _check(arguments: argparse.Namespace) -> Answer:
         stoppable = StoppableArm(arm, until(lambda: controls.stop or stopping.requested(), lease))
         # The rate is measured with what a run gets of the kernel.
         with nullcontext() if arm.clock.lock_step else asked():
-            ticket = preflight(stoppable, model, motion, confirm=confirm)
+            seconds = 0.0 if arguments.rate_seconds is None else arguments.rate_seconds
+            ticket = preflight(stoppable, model, motion, confirm=confirm, rate_seconds=seconds)
     write_ticket(path, ticket)
     code = DONE if ticket.verdict is Verdict.PASSED else VERDICT_NO
     return code, ticket_text(ticket) + f"ticket: {path}\n", {"path": str(path), "ticket": ticket_document(ticket)}
+
+
+def _scale(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
+    """Have a person turn each joint by hand; nothing is energised."""
+    from ident_service.service.scale import FILE, check_scale
+
+    if arguments.json or not sys.stdin.isatty():
+        raise UsageError("--scale asks a person at a terminal, who turns each joint by hand")
+    found = check_scale(config, own_state_folder(arguments), lambda question: input(f"{question} "))
+    lines = [f"{'ok' if one.good else 'WRONG':<6} {one.words}" for one in found]
+    lines.append(f"kept in {FILE} of the arm's folder" if found else "no joint was turned")
+    good = bool(found) and all(one.good for one in found)
+    return (DONE if good else VERDICT_NO), "\n".join([*lines, ""]), {"joints": [asdict(one) for one in found]}
 
 
 def _run(arguments: argparse.Namespace, seconds: float | None = None) -> Answer:
@@ -245,17 +270,22 @@ def _stop(arguments: argparse.Namespace) -> Answer:
     name, path = _control(arguments)
     pid = ControlFile.stop_all(path)
     note_act(arguments, "stop", name, reached=[] if pid is None else [name])
-    if pid is None:
-        raise UsageError(f"nobody moves {name}; no motion will begin that was asked for before now ({path})")
-    return DONE, f"{name}: stop asked of process {pid}\n", {"arm": name, "asked": "stop", "pid": pid}
+    text = f"{name}: stop asked of process {pid}" if pid is not None else f"nobody moves {name}"
+    text += "" if pid is not None else "; no motion will begin that was asked for before now"
+    return DONE, f"{text}\n", {"arm": name, "asked": "stop", "pid": pid}
 
 
 def _ask(arguments: argparse.Namespace) -> Answer:
     from ident_service.motion.control_file import ControlFile, in_use
 
     name, path = _control(arguments)
-    if arguments.asks == "supported" and not in_use(path):
-        return _let_go(arguments)
+    if arguments.asks == "supported":
+        held = in_use(path)
+        _require_typed(
+            arguments, name, "is lowered slowly" if held else "is let go by its drives AT ONCE, if they hold it"
+        )
+        if not held:
+            return _let_go(arguments)
     with ControlFile.reach(path) as controls:
         if arguments.asks == "supported":
             controls.confirm_support()
@@ -267,6 +297,21 @@ def _ask(arguments: argparse.Namespace) -> Answer:
     note_act(arguments, arguments.asks, name, reached=[name])
     document: dict[str, Any] = {"arm": name, "asked": arguments.asks, "pid": pid}
     return DONE, f"{name}: {arguments.asks} asked of process {pid}\n", document
+
+
+def _require_typed(arguments: argparse.Namespace, name: str, follows: str) -> None:
+    """Take a person's word that an arm is supported: its name, typed now or as `--confirm`.
+
+    Raises:
+        UsageError: another word, or nobody to ask.
+    """
+    typed = arguments.confirm
+    if typed is None and sys.stdin.isatty() and not arguments.json:
+        typed = input(f"{name} {follows}. If it is supported and nobody is under it, type its name: ").strip()
+    if typed != name:
+        raise UsageError(
+            f"that an arm is supported is confirmed by its name, typed: --confirm {name}; nothing is let go"
+        )
 
 
 def _let_go(arguments: argparse.Namespace) -> Answer:

@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, own_state_folder, tell
-from ident_service.cli.words import FEASIBLE_SETS, Verbs, delay, replicates, seed, weight
-from ident_service.errors import UsageError
+from ident_service.cli.words import FEASIBLE_SETS, Verbs, columns_files, delay, replicates, seed, weight
 
 if TYPE_CHECKING:
     from ident_service.estimation.identify import Estimate
@@ -66,7 +65,7 @@ def add(verbs: Verbs) -> None:
         "--out",
         type=Path,
         metavar="DIR",
-        help="where results go, files of the same name being replaced (default: a new folder below the state folder)",
+        help="where results go, in the place of an earlier result (default: a new folder below the state folder)",
     )
 
 
@@ -74,7 +73,8 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
     from ident_service.excitation.excitation import read_excitation
     from ident_service.results.summary import summary
-    from ident_service.service.commission import new_run_folder, score_document, simulate
+    from ident_service.service.commission import score_document, simulate
+    from ident_service.service.folders import new_run_folder
     from ident_service.service.identification import custom_of
 
     config = described = load_arm(arguments.arm)
@@ -114,10 +114,10 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
 def _identify(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
     from ident_service.results.summary import summary
-    from ident_service.service.commission import new_run_folder
+    from ident_service.service.folders import new_run_folder
     from ident_service.service.identification import Request, identify_files
 
-    columns, columns_of = _columns(arguments.columns)
+    columns, columns_of = columns_files(arguments.columns)
     request = Request(
         arm=arguments.arm,
         recordings=tuple(arguments.recordings),
@@ -140,29 +140,12 @@ def _identify(arguments: argparse.Namespace) -> Answer:
     result = identify_files(request, folder, lambda line: tell(arguments, line))
     estimate = result.estimate
     sys.stderr.write("".join(f"ident: {line}\n" for line in result.warnings))
-    text = summary(estimate, result.unusable) + f"\nfiles: {folder}\n" + "".join(f"  {name}\n" for name in result.files)
+    text = summary(estimate, result.unusable, result.torque)
+    text += f"\nfiles: {folder}\n" + "".join(f"  {name}\n" for name in result.files)
     document = {"folder": str(folder), "files": list(result.files), "warnings": list(result.warnings)}
+    document["torque"] = result.torque
     document |= _estimate_document(estimate, result.unusable)
     return _exit_code(estimate, result.unusable), text, document
-
-
-def _columns(given: Sequence[str]) -> tuple[Path | None, dict[Path, Path]]:
-    """Tell the columns file of all recordings from those of one each."""
-    of_all: list[Path] = []
-    of_one: dict[Path, Path] = {}
-    for words in given:
-        recording, equals, file = words.partition("=")
-        if not equals or Path(words).is_file():
-            of_all.append(Path(words))
-        elif Path(recording) in of_one:
-            raise UsageError(f"--columns {words}: {recording} has a columns file already")
-        else:
-            of_one[Path(recording)] = Path(file)
-    if len(of_all) > 1:
-        raise UsageError(
-            f"--columns {of_all[1]}: one file is for all recordings; write RECORDING=FILE for those that differ"
-        )
-    return (of_all[0] if of_all else None), of_one
 
 
 def _exit_code(estimate: Estimate, unusable: Sequence[str]) -> int:

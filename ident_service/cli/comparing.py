@@ -50,7 +50,7 @@ def _compare(arguments: argparse.Namespace) -> Answer:
 
 def _payload(arguments: argparse.Namespace) -> Answer:
     from ident_service.results.comparison.text import comparison_text
-    from ident_service.service.commission import new_run_folder
+    from ident_service.service.folders import new_run_folder
     from ident_service.service.payload import payload_files
 
     folder = arguments.out or new_run_folder(own_state_folder(arguments), arguments.run.resolve().name, "payloads")

@@ -89,6 +89,12 @@ def add(verbs: Verbs) -> None:
     sub.add_argument("--keep", type=count, required=True, metavar="N", help="newest runs of each arm keep theirs")
     sub.add_argument("--yes", action="store_true", help="DELETE them")
     add_by(sub)
+    delete = verbs.group("delete", "a run, a motion or an arm of the registry; what refers to it is named first")
+    for kind in ("run", "motion", "arm"):
+        sub = delete.add(kind, _delete, f"delete one {kind} and its files")
+        sub.add_argument("name", metavar="NAME" if kind == "arm" else "ID")
+        sub.add_argument("--anyway", action="store_true", help="although something refers to it")
+        add_by(sub)
     sub = verbs.add("backup", _backup, "the state folder as one file: registry, documents, recordings, hashes")
     sub.add_argument("file", type=Path, metavar="FILE", help="which must not exist; a daemon may serve meanwhile")
     sub.add_argument("--without-recordings", action="store_true", help="the copy's registry calls them deleted")
@@ -165,6 +171,18 @@ def _prune(arguments: argparse.Namespace) -> Answer:
     return DONE, pruned_text(document), document
 
 
+def _delete(arguments: argparse.Namespace) -> Answer:
+    from ident_service.service import deletion
+    from ident_service.service.registry.database import Database
+
+    kind, state = arguments.word.rpartition(" ")[2], own_state_folder(arguments)
+    delete = {"run": deletion.delete_run, "motion": deletion.delete_motion, "arm": deletion.delete_arm}[kind]
+    with Database(state) as db:
+        found = delete(db, state, arguments.name, at_terminal(arguments), anyway=arguments.anyway)
+    document = {"deleted": arguments.name, "dependents": [asdict(one) for one in found]}
+    return DONE, deleted_text(document), document
+
+
 def _backup(arguments: argparse.Namespace) -> Answer:
     from ident_service.service.backup import back_up
 
@@ -183,6 +201,12 @@ def _restore(arguments: argparse.Namespace) -> Answer:
     text += "" if done.replaced is None else f"what stood there before: {done.replaced}\n"
     text += "tokens that were revoked since then count again (ident token list); each arm needs a new preflight\n"
     return DONE, text, {**asdict(done), "state": str(state)}
+
+
+def deleted_text(document: Mapping[str, Any]) -> str:
+    """Tell what was deleted, and what becomes of what referred to it."""
+    lines = "".join(f"  {one['kind']} {one['id']}: {one['becomes']}\n" for one in document["dependents"])
+    return f"{document['deleted']}: deleted\n{lines}"
 
 
 def pruned_text(document: Mapping[str, Any]) -> str:

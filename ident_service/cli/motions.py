@@ -38,6 +38,8 @@ def add(verbs: Verbs) -> None:
         help="a base parameter as `ident base` prints it, to be taught best (a_optimal); may be repeated",
     )
     sub.add_argument("--motion", choices=["fourier", "postures"], help="default: the arm's")
+    length = "of the motion, ramps included: whole periods of about the base frequency (default: the arm's)"
+    sub.add_argument("--length", type=seconds, metavar="SECONDS", help=length)
     sub.add_argument("--base-frequency", type=frequency, metavar="HZ")
     sub.add_argument("--harmonics", type=count, metavar="N")
     sub.add_argument("--periods", type=count, metavar="N")
@@ -47,7 +49,9 @@ def add(verbs: Verbs) -> None:
     sub.add_argument("--torque-margin", type=share, metavar="SHARE", help="of every torque limit, kept free")
     _know(sub)
     sub.add_argument("--seed", type=seed, default=0, help="of the random starts")
-    sub.add_argument("--seconds", type=seconds, help="time for the search (default: 60, or none with --starts)")
+    searched = "time for the search, not the motion's length (default: 60, or none with --starts)"
+    sub.add_argument("--search-time", type=seconds, metavar="SECONDS", help=searched)
+    sub.add_argument("--seconds", dest="search_time", type=seconds, help=argparse.SUPPRESS)  # its name before
     sub.add_argument("--starts", type=count, metavar="N", help="random starts; the result is then the same every time")
     sub.add_argument("--workers", type=workers, default=2, metavar="N", help="processes")
     sub.add_argument("--resume", type=Path, metavar="FILE", help="search.json of an earlier design, to go on from")
@@ -86,8 +90,8 @@ def _design(arguments: argparse.Namespace) -> Answer:
 
     from ident_service.config.load import load_arm
     from ident_service.excitation.search import Budget
-    from ident_service.service.commission import new_run_folder
     from ident_service.service.design import FILES, DesignRequest, design_files
+    from ident_service.service.folders import new_run_folder
     from ident_service.service.preview import preview_document
     from ident_service.service.preview_text import preview_text
 
@@ -97,7 +101,7 @@ def _design(arguments: argparse.Namespace) -> Answer:
         if arguments.criterion not in (None, "a_optimal"):
             raise UsageError(f"--parameter is for a_optimal, not for {arguments.criterion}")
         changes |= {"criterion": "a_optimal", "parameters": tuple(arguments.chosen)}
-    limit = arguments.seconds if arguments.seconds is not None or arguments.starts is not None else 60.0
+    limit = arguments.search_time if arguments.search_time is not None or arguments.starts is not None else 60.0
     request = DesignRequest(
         arm=arguments.arm,
         changes=changes,
@@ -105,6 +109,7 @@ def _design(arguments: argparse.Namespace) -> Answer:
         seed=arguments.seed,
         budget=Budget(limit, arguments.starts, arguments.workers),
         resume=arguments.resume,
+        length=arguments.length,
     )
     folder = arguments.out or new_run_folder(own_state_folder(arguments), load_arm(arguments.arm).name, "motions")
     stopping = StopOnSignal()
@@ -115,7 +120,9 @@ def _design(arguments: argparse.Namespace) -> Answer:
     if unfinished:
         sys.stderr.write(f"ident: {unfinished}\n")
     taught = bool(np.isfinite(seen.deviations).any())
-    text = preview_text(seen) + f"\nfiles: {folder}\n" + "".join(f"  {name}\n" for name in FILES)
+    binding = "".join(f"  {line}\n" for line in designed.binding)
+    binding = f"what holds the motion back\n{binding}\n" if binding else ""
+    text = preview_text(seen) + f"\n{binding}files: {folder}\n" + "".join(f"  {name}\n" for name in FILES)
     document: dict[str, Any] = {
         "folder": str(folder),
         "starts": designed.found.finished,
@@ -123,6 +130,7 @@ def _design(arguments: argparse.Namespace) -> Answer:
         "criterion_value": designed.excitation.made["criterion_value"],
     }
     document |= preview_document(seen)
+    document["binding"] = list(designed.binding)
     document["warnings"] = [*([unfinished] if unfinished else []), *seen.warnings]
     return (VERDICT_NO if seen.objections or not taught else DONE), text, document
 

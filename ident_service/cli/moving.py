@@ -139,7 +139,7 @@ def moved(
     from ident_service.motion.controls import LEASE_SECONDS
     from ident_service.motion.preflight.ticket import read_ticket
     from ident_service.service.arm_state import ticket_path
-    from ident_service.service.commission import new_run_folder
+    from ident_service.service.folders import new_run_folder
     from ident_service.service.run import run_motion
 
     state = own_state_folder(arguments)

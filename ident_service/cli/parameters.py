@@ -47,17 +47,20 @@ def add(verbs: Verbs) -> None:
 def _base(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
     from ident_service.model.arm_model import arm_model
-    from ident_service.model.base import base_parameters
+    from ident_service.model.base import base_parameters, remarks_on_angles
 
     model = arm_model(load_arm(arguments.arm))
     base = base_parameters(model.chain, model.layout)
+    warnings = remarks_on_angles(base)
     text = "".join(f"{number:4d}  {expression}\n" for number, expression in enumerate(base.expressions, 1))
     text += f"{base.size} base parameters of {len(base.names)} link parameters\n"
+    text += "".join(f"WARNING: {line}\n" for line in warnings)
     return (
         DONE,
         text,
         {
             "arm": model.config.name,
+            "warnings": list(warnings),
             "link_parameters": list(base.names),
             "base_parameters": {"expressions": list(base.expressions), "units": list(base.units)},
         },

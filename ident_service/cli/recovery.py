@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, own_state_folder, tell
+from ident_service.cli.answer import DONE, FAILED, VERDICT_NO, Answer, StopOnSignal, own_state_folder, tell
 from ident_service.cli.lease import add_lease, asked_lease, until
 from ident_service.cli.moving import add_can_log, moved
 from ident_service.cli.words import Verbs
@@ -59,7 +60,47 @@ def _home(arguments: argparse.Namespace) -> Answer:
         return _zero(arguments, config)
     if arguments.confirm is not None:
         raise UsageError("--confirm is for --zero; a motion needs the ticket of `ident check`")
+    if held := _lead_held(arguments, config):
+        return held
     return _slowly(arguments, config, Destination.HOME)
+
+
+def _lead_held(arguments: argparse.Namespace, config: ArmConfig) -> Answer | None:
+    """Have the process that holds the arm after a stop lead it home; None where none does."""
+    from ident_service.cli.answer import state_folder
+    from ident_service.cli.keeping import note_act
+    from ident_service.motion.control_file import ControlFile, in_use
+    from ident_service.motion.controls import LEASE_SECONDS, Homing
+    from ident_service.service.arm_state import control_path
+
+    path = control_path(state_folder(arguments), config.name)
+    if not in_use(path):
+        return None
+    with ControlFile.reach(path) as controls:
+        if not controls.waiting:
+            return None  # it moves, and the motion process refuses this one
+    if arguments.out is not None or arguments.can_log:
+        raise UsageError("--out and --can-log are for a motion of its own; the run that holds the arm has its folder")
+    lease, stopping = asked_lease(arguments, config), StopOnSignal()
+    with stopping, ControlFile.reach(path) as controls:
+        asked, pid, stopped = until(stopping.requested, lease), controls.pid, False
+        controls.ask_home()
+        tell(arguments, f"{config.name}: keep out of its reach; process {pid} leads it home, slowly. Ctrl-C stops.")
+        while (stage := controls.homing) in (Homing.ASKED, Homing.GOING) and in_use(path):
+            if not stopped and asked():
+                controls.ask_stop()
+                stopped = True
+            controls.renew_home()
+            time.sleep(0.1 * LEASE_SECONDS)
+    note_act(arguments, "home", config.name, reached=[config.name])
+    document = {"arm": config.name, "asked": "home", "pid": pid, "ended": stage.name.lower()}
+    if stage is Homing.ENDED and not stopped:
+        return DONE, f"{config.name}: led home; it is held there until `ident supported {arguments.arm}`\n", document
+    why = "the story of its run says why" if stage is Homing.REFUSED else "it was stopped"
+    held = (
+        f"it is still held: support it, then `ident supported {arguments.arm}`" if in_use(path) else "nobody holds it"
+    )
+    return FAILED, f"{config.name}: not led home, {why}; {held}\n", document
 
 
 def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:

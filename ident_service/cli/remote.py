@@ -6,7 +6,6 @@ Boundary: words to requests by id, answers to words. Files that are named here a
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import sys
 import time
@@ -16,8 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.answer import DONE, FAILED, FAULTED, USAGE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
-from ident_service.cli.words import Verbs, count
-from ident_service.errors import IdentError, UsageError
+from ident_service.cli.remote_recordings import file_of, recording
+from ident_service.cli.words import Verbs, columns_files, count
+from ident_service.errors import IdentError, UnknownId, UsageError
 
 if TYPE_CHECKING:
     from ident_service.client import IdentClient
@@ -121,28 +121,35 @@ def _simulate(client: IdentClient, arguments: argparse.Namespace) -> dict[str, A
     }
 
 
-def _identify(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
+def _identify(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
+    of_all, of_one = columns_files(arguments.columns)
+    if lost := [path for path in of_one if not path.is_file()]:
+        raise UsageError(f"--columns {lost[0]}=...: is no file here; a recording that is there has its columns")
+
+    def named(path: Path) -> dict[str, Any]:
+        return recording(client, arguments, arguments.arm, path, of_one.get(file_of(path), of_all))
+
     return {
         "arm": arguments.arm,
-        "recordings": [recording(path) for path in arguments.recordings],
-        "validate_on": [recording(path) for path in arguments.validate],
+        "recordings": [named(path) for path in arguments.recordings],
+        "validate_on": [named(path) for path in arguments.validate],
         "method": arguments.method,
         "feasible_set": arguments.feasible_set,
         "prior": arguments.prior,
     }
 
 
-def _design(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-    seconds = arguments.seconds if arguments.seconds is not None or arguments.starts is not None else 60.0
+def _design(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
+    limit = arguments.search_time if arguments.search_time is not None or arguments.starts is not None else 60.0
     return {
         "arm": arguments.arm,
-        "seconds": seconds,
+        "seconds": limit,
         "starts": arguments.starts,
         "seed": arguments.seed,
         "criterion": arguments.criterion,
         "parameters": arguments.chosen,
         "motion": arguments.motion,
-        "after": [recording(path) for path in arguments.after],
+        "after": [recording(client, arguments, arguments.arm, path) for path in arguments.after],
     }
 
 
@@ -181,19 +188,43 @@ def _home(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _stop(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    if arguments.arm is not None:
-        return _ask(client, arguments)
-    answer = client.post("/api/v1/stop")
+    arm = arguments.arm
+    answer = client.post("/api/v1/stop" if arm is None else f"/api/v1/arms/{word_of_address(arm)}/stop")
     names = ", ".join([*answer["arms"], *answer["jobs"]])
-    return DONE, f"stop asked of {names}\n" if names else "nobody moves an arm there\n", answer
+    if arm is not None and not names and not _known(client, arm):
+        return (
+            USAGE,
+            f"{arm}: the daemon knows no arm of this name; `ident stop --server {client.url}` stops all\n",
+            answer,
+        )
+    nobody = "nobody moves an arm there" if arm is None else f"nobody moves an arm {arm} there"
+    return DONE, f"stop asked of {names}\n" if names else f"{nobody}\n", answer
+
+
+def _known(client: IdentClient, arm: str) -> bool:
+    """Ask whether there is such an arm, once the stop has been sent; yes, where the question is not answered."""
+    try:
+        client.get(f"/api/v1/arms/{word_of_address(arm)}")
+    except UnknownId:
+        return False
+    except IdentError:
+        return True
+    return True
 
 
 def _ask(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     answer = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/{arguments.word}")
-    reached = bool(answer.get("reached", answer.get("arms")) or answer.get("jobs"))
-    if not reached:  # the exit code is that of the same words at the machine itself
+    if not answer["reached"]:  # the exit code is that of the same words at the machine itself
         return USAGE, f"{arguments.arm}: nobody moves an arm of this name there\n", answer
     return DONE, f"{arguments.arm}: {arguments.word} asked\n", answer
+
+
+def _supported(client: IdentClient, arguments: argparse.Namespace) -> Answer:
+    name = typed(arguments)
+    answer = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/supported", {"confirm": name})
+    if not answer["reached"]:
+        return USAGE, f"{name}: nobody holds an arm of this name there\n", answer
+    return DONE, f"{name}: supported asked\n", answer
 
 
 def _ack(client: IdentClient, arguments: argparse.Namespace) -> Answer:
@@ -230,7 +261,8 @@ REMOTE: dict[str, Verb] = {
     "run": asked(_run),
     "home": asked(_home),
     "stop": _stop,
-    **dict.fromkeys(("pause", "resume", "finish", "supported"), _ask),
+    **dict.fromkeys(("pause", "resume", "finish"), _ask),
+    "supported": _supported,
     "ack": _ack,
     "jobs list": _list,
     "jobs show": _show,
@@ -254,12 +286,13 @@ _OURS = frozenset({"json", "state", "server", "verb", "word", "words", "asks", "
 _MOTION = frozenset({"arm", "motion", "confirm"})
 _CARRIED: dict[str, frozenset[str]] = {
     "simulate": frozenset({"arm", "motion", "seed", "feasible_set"}),
-    "identify": frozenset({"arm", "recordings", "validate", "method", "feasible_set", "prior"}),
-    "design": frozenset({"arm", "seconds", "starts", "seed", "criterion", "chosen", "motion", "after"}),
+    "identify": frozenset({"arm", "recordings", "validate", "columns", "method", "feasible_set", "prior"}),
+    "design": frozenset({"arm", "search_time", "starts", "seed", "criterion", "chosen", "motion", "after"}),
     "check": _MOTION | {"home"},
     "run": _MOTION | {"speed", "until", "chosen"},
     "home": frozenset({"arm", "confirm", "zero"}),
-    **dict.fromkeys(("stop", "pause", "resume", "finish", "supported"), frozenset({"arm"})),
+    **dict.fromkeys(("stop", "pause", "resume", "finish"), frozenset({"arm"})),
+    "supported": frozenset({"arm", "confirm"}),
     "ack": frozenset({"arm", "fault"}),
     "jobs list": frozenset({"most"}),
     **dict.fromkeys(("jobs show", "jobs watch", "jobs cancel"), frozenset({"job"})),
@@ -317,9 +350,10 @@ def typed(arguments: argparse.Namespace) -> str:
     name = arguments.confirm
     if name is None and sys.stdin.isatty() and not arguments.json:
         what = "is zeroed" if getattr(arguments, "zero", False) else "will move"
+        what = "is let down" if getattr(arguments, "word", "") == "supported" else what
         name = input(f"{arguments.arm} {what} where you may not see it. Type its name to confirm: ").strip()
     if name != arguments.arm:
-        raise UsageError(f"a motion is confirmed by the arm's name, typed: --confirm {arguments.arm}")
+        raise UsageError(f"this is confirmed by the arm's name, typed: --confirm {arguments.arm}")
     return str(name)
 
 
@@ -338,17 +372,6 @@ def motion_id(client: IdentClient, arm: str, motion: Path | None) -> str | None:
         content = motion.read_text(encoding="utf-8", errors="replace")
         return str(client.post("/api/v1/motions", {"arm": arm, "motion": content})["id"])
     return str(motion)
-
-
-def recording(path: Path) -> dict[str, str | float]:
-    """Name a recording as the daemon does, from `RUN` or `RUN/NAME`, either with `@START:END`."""
-    from ident_service.record.files import split_range
-
-    named, seconds = split_range(str(path))
-    run, _, name = named.partition("/")
-    given = {"start": seconds[0], "end": seconds[1]} if seconds else {}
-    bounded = {key: value for key, value in given.items() if math.isfinite(value)}
-    return {"run": run, **({"name": name} if name else {}), **bounded}
 
 
 def word_of_address(word: str) -> str:

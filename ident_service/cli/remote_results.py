@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.answer import DONE, VERDICT_NO, Answer
 from ident_service.cli.daemon import token_line
-from ident_service.cli.keeping import pruned_text
-from ident_service.cli.remote import Verb, asked, recording, word_of_address
+from ident_service.cli.keeping import deleted_text, pruned_text
+from ident_service.cli.remote import Verb, asked, word_of_address
+from ident_service.cli.remote_recordings import recording
 from ident_service.cli.remote_words import in_words
 from ident_service.errors import ArmError, UsageError
 
@@ -51,8 +52,10 @@ def _compare(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _payload(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-    recordings = [recording(path) for path in arguments.recordings]
-    return {**_run(client, arguments), "recordings": recordings, "refit_offsets": arguments.refit_offsets}
+    run = _run(client, arguments)
+    arm = str(client.get(f"{_API}/runs/{run['run']}")["arm"])
+    recordings = [recording(client, arguments, arm, path) for path in arguments.recordings]
+    return {**run, "recordings": recordings, "refit_offsets": arguments.refit_offsets}
 
 
 def _fetched(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
@@ -118,6 +121,12 @@ def _rollback(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     return DONE, text, act
 
 
+def _delete(client: IdentClient, arguments: argparse.Namespace) -> Answer:
+    kind, name = arguments.word.rpartition(" ")[2], word_of_address(arguments.name)
+    done = client.delete(f"{_API}/{kind}s/{name}" + ("?anyway=true" if arguments.anyway else ""))
+    return DONE, deleted_text(done), done
+
+
 def _prune(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     found = client.post(f"{_API}/recordings/prune", {"keep": arguments.keep, "yes": arguments.yes})
     return DONE, pruned_text(found), found
@@ -133,6 +142,7 @@ def _revoke(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     return DONE, f"{arguments.name}: revoked\n", row
 
 
+_DELETES = ("delete run", "delete motion", "delete arm")
 VERBS: dict[str, Verb] = {
     "report": asked(_run, _reported),
     "export": asked(_export, _fetched),
@@ -145,6 +155,7 @@ VERBS: dict[str, Verb] = {
     "accept": _accept,
     "rollback": _rollback,
     "prune": _prune,
+    **dict.fromkeys(_DELETES, _delete),
     "token list": _tokens,
     "token revoke": _revoke,
 }
@@ -160,6 +171,7 @@ CARRIED: dict[str, frozenset[str]] = {
     "accept": frozenset({"run", "note"}),
     "rollback": frozenset({"arm", "note", "to"}),
     "prune": frozenset({"keep", "yes"}),
+    **dict.fromkeys(_DELETES, frozenset({"name", "anyway"})),
     "token list": frozenset(),
     "token revoke": frozenset({"name"}),
 }

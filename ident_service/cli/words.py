@@ -10,9 +10,11 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
+from pathlib import Path
 from typing import Any, NoReturn
 
 from ident_service.cli.answer import USAGE, Answer
+from ident_service.errors import UsageError
 
 FEASIBLE_SETS = ("pseudo_inertia", "inertia")
 
@@ -88,6 +90,35 @@ class Verbs:
         """Add a word that verbs of its own follow, as in `ident config check`."""
         parser = self.commands.add_parser(name, help=text)
         return Verbs(parser.add_subparsers(required=True, metavar="VERB"), self.common, f"{self.prefix}{name} ")
+
+
+def columns_files(given: Sequence[str]) -> tuple[Path | None, dict[Path, Path]]:
+    """Tell the columns file of all recordings from those of one each.
+
+    Args:
+        given: values of `--columns`, `FILE` or `RECORDING=FILE`.
+
+    Returns:
+        The file of all, if any, and that of each recording that has its own.
+
+    Raises:
+        UsageError: two for one recording, or for all.
+    """
+    of_all: list[Path] = []
+    of_one: dict[Path, Path] = {}
+    for words in given:
+        recording, equals, file = words.partition("=")
+        if not equals or Path(words).is_file():
+            of_all.append(Path(words))
+        elif Path(recording) in of_one:
+            raise UsageError(f"--columns {words}: {recording} has a columns file already")
+        else:
+            of_one[Path(recording)] = Path(file)
+    if len(of_all) > 1:
+        raise UsageError(
+            f"--columns {of_all[1]}: one file is for all recordings; write RECORDING=FILE for those that differ"
+        )
+    return (of_all[0] if of_all else None), of_one
 
 
 def seed(text: str) -> int:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.once import made_once
 
 from ident_service.cli import main
 from ident_service.config.load import shipped_arms
@@ -101,17 +104,18 @@ class Commissioned:
 
 @pytest.fixture(scope="session")
 def quick(tmp_path_factory: pytest.TempPathFactory) -> Commissioned:
-    """The small arm, commissioned by the command."""
-    import contextlib
-    import io
+    """The small arm, commissioned by the command; not to be changed."""
 
-    folder = tmp_path_factory.mktemp("quick")
-    arm = quick_arm(folder)
-    out = io.StringIO()
-    with contextlib.redirect_stdout(out):
-        code = run_main("simulate", arm, "--out", folder / "run")
-    assert code == 0, out.getvalue()
-    return Commissioned(arm, folder / "run", out.getvalue())
+    def make(folder: Path) -> None:
+        arm = quick_arm(folder)
+        out = io.StringIO()
+        with contextlib.redirect_stdout(out):
+            code = run_main("simulate", arm, "--out", folder / "run")
+        assert code == 0, out.getvalue()
+        (folder / "out").write_text(out.getvalue())
+
+    folder = made_once(tmp_path_factory, "quick", make)
+    return Commissioned(folder / "quick.yaml", folder / "run", (folder / "out").read_text())
 
 
 @dataclass(frozen=True)

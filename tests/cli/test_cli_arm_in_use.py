@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ from drivers.arm import Arm
 from ident_service.config.load import load_arm
 from ident_service.errors import DriverError
 from ident_service.motion.control_file import ControlFile
+from ident_service.motion.controls import Homing
 from ident_service.motion.factory import make_arm
 from ident_service.motion.stoppable import StoppableArm
 from ident_service.service.arm_state import control_path, fault_file
@@ -34,9 +37,57 @@ def test_an_arm_whose_description_is_a_daemons_is_stopped_by_its_name(ident: Ide
         for word in ("pause", "finish", "stop"):
             assert ident(word, "uploaded").code == 0
         assert (mover.stop, mover.finish) == (True, True)
+    # Nobody moves it any more: what was wanted is so, as for `ident stop` of all.
+    again = ident("stop", "uploaded", "--json")
+    assert (again.code, again.json["pid"]) == (0, None)
+    assert "nobody moves uploaded" in ident("stop", "uploaded").out
     fault_file(state, "uploaded").latch("lease_lost", "nobody was there")
     assert ident("ack", "uploaded", "lease_lost").code == 0
     assert ident("stop", "../uploaded").code == 2
+
+
+def test_that_an_arm_is_supported_takes_its_typed_name(ident: Ident, state: Path) -> None:
+    with ControlFile.take(control_path(state, "planar2"), None) as holder:
+        holder.wait_for_support()
+        for words in ((), ("--confirm", "planar"), ("--json",)):
+            ended = ident("supported", "planar2", *words)
+            assert (ended.code, holder.supported) == (2, False)
+        assert "typed: --confirm planar2" in ended.out + ended.err
+        assert ident("supported", "planar2", "--confirm", "planar2").code == 0
+        assert holder.supported
+
+
+def test_drives_that_hold_an_arm_are_not_told_to_let_go_without_its_name(
+    ident: Ident, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    let_go: list[str] = []
+    monkeypatch.setattr("ident_service.service.recover.let_go", lambda config, _: let_go.append(config.name) or ("j1",))
+    assert ident("supported", "planar2").code == 2
+    assert let_go == []
+    assert ident("supported", "planar2", "--confirm", "planar2").code == 0
+    assert let_go == ["planar2"]
+
+
+@pytest.mark.parametrize(("answer", "code"), [(Homing.ENDED, 0), (Homing.REFUSED, 1)])
+def test_home_leads_an_arm_that_another_process_holds(ident: Ident, state: Path, answer: Homing, code: int) -> None:
+    with ControlFile.take(control_path(state, "planar2"), None) as holder:
+        holder.wait_for_support()
+        holder.ask_stop()
+        stops = []
+
+        def hold() -> None:
+            while holder.homing is not Homing.ASKED:
+                time.sleep(0.01)
+            stops.append(holder.stop)
+            holder.tell_homing(answer)
+
+        loop = threading.Thread(target=hold, daemon=True)
+        loop.start()
+        ended = ident("home", "planar2", "--json")
+        loop.join(10.0)
+        assert ended.code == code
+        assert ended.json["ended"] == answer.name.lower()
+        assert stops == [False]
 
 
 @pytest.mark.slow

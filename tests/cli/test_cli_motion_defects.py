@@ -52,7 +52,7 @@ def test_obstacles_without_bodies_are_not_passed_over(tmp_path: Path, ident: Ide
 @pytest.mark.parametrize("out", ["file", "file/below", "/proc/nowhere"])
 def test_where_nothing_can_be_written_nothing_is_searched(out: str, tmp_path: Path, ident: Ident) -> None:
     (tmp_path / "file").write_text("")
-    ended = ident("design", "planar2", "--seconds", 600, "--out", tmp_path / out)
+    ended = ident("design", "planar2", "--search-time", 600, "--out", tmp_path / out)
     assert ended.code == 2
     assert left_over(tmp_path) == ["file"]
 

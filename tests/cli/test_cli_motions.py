@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 from cli.conftest import COARSE, Commissioned, Ended, Ident, left_over, quick_arm, run_main
+from helpers.once import made_once
 
 pytestmark = pytest.mark.slow  # designs and whole jobs
 
@@ -32,10 +33,11 @@ class DesignedBefore:
 
 @pytest.fixture(scope="module")
 def designed(tmp_path_factory: pytest.TempPathFactory) -> DesignedBefore:
-    folder = tmp_path_factory.mktemp("designed")
-    arm = quick_arm(folder, *COARSE)
-    assert run_main("design", arm, *QUICK, "--out", folder / "motion") == 0
-    return DesignedBefore(arm, folder / "motion")
+    def make(folder: Path) -> None:
+        assert run_main("design", quick_arm(folder, *COARSE), *QUICK, "--out", folder / "motion") == 0
+
+    folder = made_once(tmp_path_factory, "designed", make)
+    return DesignedBefore(folder / "quick.yaml", folder / "motion")
 
 
 def read(path: Path) -> dict[str, Any]:
@@ -251,7 +253,7 @@ def test_ctrl_c_ends_a_search_with_what_it_has(tmp_path: Path) -> None:
         "design",
         str(quick_arm(tmp_path, *COARSE)),
         *map(str, QUICK[2:]),
-        "--seconds",
+        "--search-time",
         "600",
         "--out",
         str(tmp_path / "m"),
@@ -264,3 +266,30 @@ def test_ctrl_c_ends_a_search_with_what_it_has(tmp_path: Path) -> None:
     assert process.returncode == 0, err
     assert "all limits are kept" in out
     assert sorted(path.name for path in (tmp_path / "m").iterdir()) == FILES
+
+
+def test_the_length_is_the_motion_s_and_the_search_s_time_has_its_own_name(tmp_path: Path, ident: Ident) -> None:
+    arm = quick_arm(tmp_path, *COARSE)
+    ended = ident(
+        "design", arm, "--starts", 1, "--workers", 1, "--length", 12, "--ramp", 1, "--out", tmp_path / "m", "--json"
+    )
+    assert ended.json["duration"] == pytest.approx(12.0)
+    shown = ident("design", "--help").out
+    assert "--search-time" in shown
+    assert "--seconds" not in shown
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (("--length", 3, "--ramp", 2), "the ramps alone take 4 s"),
+        (("--length", 9, "--periods", 1, "--base-frequency", 0.2), "leave one of them out"),
+        (("--length", 9, "--motion", "postures"), "has --postures"),
+    ],
+)
+def test_a_length_that_cannot_be_is_refused(
+    words: tuple[object, ...], reason: str, tmp_path: Path, ident: Ident
+) -> None:
+    ended = ident("design", quick_arm(tmp_path, *COARSE), *words, "--starts", 1, "--out", tmp_path / "m")
+    assert ended.code == 2
+    assert reason in ended.err

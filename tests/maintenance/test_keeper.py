@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from ident_service.service.jobs.recovery import explain_interrupted, mark_interr
 from ident_service.service.maintenance.keeper import Keeper
 from ident_service.service.maintenance.reidentification import Wanted, reidentifications
 from ident_service.service.maintenance.schedules import When, add_event, add_schedule, dues, enable_schedule, schedules
+from ident_service.service.maintenance.webhook import deliveries
 from ident_service.service.registry import jobs
 from ident_service.service.registry.arms import add_arm
 from ident_service.service.registry.audit import trail
@@ -297,22 +299,29 @@ def test_what_is_rolled_back_to_is_the_same_to_the_last_bit(scene: Scene, accept
     assert kept == ["0001", "0002", "0003"]
 
 
-def test_a_full_webhook_waits_and_a_check_by_hand_is_untouched(scene: Scene) -> None:
-    class Full:
-        room = 0
+def test_a_notice_is_kept_with_what_says_that_it_was_told(scene: Scene) -> None:
+    class Broken:
+        broken = True
 
-        def send(self, _: object) -> bool:
-            self.room -= 1
-            return self.room >= 0
+        def send(self, *_: object) -> None:
+            scene.db.write("INSERT INTO deliveries (id, arm, body, created) VALUES ('m', 'quick', '{}', 0)")
+            if self.broken:
+                raise sqlite3.OperationalError("database or disk is full")
 
-    full = Full()
-    scene.keeper._webhook = full
+    broken = Broken()
+    scene.keeper._webhook = broken
     scene.at_six()
-    scene.keeper.look()
-    assert [row["told"] for row in dues(scene.db)] == [0]
-    full.room = 1
+    with pytest.raises(sqlite3.OperationalError):
+        scene.keeper.look()
+    assert ([row["told"] for row in dues(scene.db)], deliveries(scene.db)) == ([0], [])
+    broken.broken = False
     for _ in range(3):
         scene.keeper.look()
-    assert [row["told"] for row in dues(scene.db)] == [1]
+    assert ([row["told"] for row in dues(scene.db)], len(deliveries(scene.db))) == ([1], 1)
+
+
+def test_a_check_by_hand_is_untouched(scene: Scene) -> None:
+    scene.at_six()
+    scene.keeper.look()
     scene.engine.create(Check(kind="check", arm=ARM), "ann")
     assert scene.queued == [("check", False)]

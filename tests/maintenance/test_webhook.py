@@ -1,25 +1,33 @@
-"""Notices to a real server on this machine: signed, tried again, given up, and never in anybody's way."""
+"""Notices to a real server on this machine: signed by the convention, kept, tried again, given up after days."""
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import hmac
 import json
 import socket
 import threading
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 import pytest
+from standardwebhooks.webhooks import Webhook as Verifier
+from standardwebhooks.webhooks import WebhookVerificationError
 
 from ident_service.errors import UsageError
 from ident_service.service.api.settings import Settings
-from ident_service.service.maintenance.webhook import MOST_WAITING, Webhook, read_secret, require_address
+from ident_service.service.maintenance.webhook import WAITS, Webhook, deliveries, read_secret, require_address
+from ident_service.service.registry.audit import trail
+from ident_service.service.registry.database import Database
 
 SECRET = b"0123456789abcdef0123456789abcdef"
-NOTICE = {"kind": "due", "id": 7, "arm": "quick", "what": "maintenance: öl"}
+NOTICE = {"id": 7, "arm": "quick", "what": "maintenance: öl"}
 
 
 class Receiver(ThreadingHTTPServer):
@@ -66,51 +74,117 @@ def receiver() -> Iterator[Receiver]:
     server.server_close()
 
 
-class GivenUp:
+class Clock:
+    """Time that passes when it is told to."""
+
     def __init__(self) -> None:
-        self.said, self.happened = list[str](), threading.Event()
+        self.at = float(int(time.time()))
 
-    def __call__(self, notice: Mapping[str, Any], why: str) -> None:
-        self.said.append(f"{notice['id']}: {why}")
-        self.happened.set()
-
-
-def test_a_notice_is_signed_and_tried_again(receiver: Receiver) -> None:
-    gave_up = GivenUp()
-    webhook = Webhook(receiver.url, SECRET, gave_up, waits=(0.01, 0.01), now=lambda: 1234.0)
-    assert webhook.send(NOTICE)
-    while len(receiver.heard) < 2:
-        receiver.enough.wait(10.0)
-    webhook.close()
-    assert gave_up.said == []
-    first, second = receiver.heard
-    assert first[0]["X-Ident-Delivery"] == second[0]["X-Ident-Delivery"]
-    headers, body = second
-    assert json.loads(body) == NOTICE
-    expected = hmac.new(SECRET, b"1234." + body, hashlib.sha256).hexdigest()
-    assert headers["X-Ident-Signature"] == f"sha256={expected}"
+    def __call__(self) -> float:
+        return self.at
 
 
-def test_a_redirection_is_not_followed(receiver: Receiver) -> None:
-    receiver.answers, gave_up = [302], GivenUp()
-    webhook = Webhook(receiver.url, SECRET, gave_up, waits=(0.01,))
-    webhook.send(NOTICE)
-    assert gave_up.happened.wait(20.0)
-    webhook.close()
-    assert gave_up.said == ["7: answered 302"]
+@pytest.fixture
+def db(tmp_path: Path) -> Iterator[Database]:
+    with Database(tmp_path / "state") as opened:
+        yield opened
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+def until(done: Callable[[], object]) -> None:
+    end = time.monotonic() + 30.0
+    while not done() and time.monotonic() < end:
+        time.sleep(0.02)
+    assert done()
+
+
+@contextmanager
+def sending(db: Database, url: str, clock: Clock, **words: Any) -> Iterator[Webhook]:
+    webhook = Webhook(db, url, SECRET, now=clock, **words)
+    try:
+        yield webhook
+    finally:
+        webhook.close()
+
+
+def test_a_receiver_of_the_convention_verifies_a_notice(receiver: Receiver, db: Database, clock: Clock) -> None:
+    with sending(db, receiver.url, clock) as webhook:
+        name = webhook.send("arm.due", clock.at, NOTICE)
+        until(lambda: deliveries(db)[0]["why"] == "answered 500")
+        clock.at += 4.0
+        time.sleep(0.7)
+        assert len(receiver.heard) == 1  # the next one comes after five seconds
+        clock.at += 2.0
+        until(lambda: deliveries(db)[0]["delivered"])
+    (first, _), (headers, body) = receiver.heard
+    assert first["webhook-id"] == headers["webhook-id"] == name
+    assert json.loads(body)["data"] == NOTICE
+    assert json.loads(body)["type"] == "arm.due"
+    told = Verifier("whsec_" + base64.b64encode(SECRET).decode()).verify(body, dict(headers))
+    assert told == json.loads(body)
+    with pytest.raises(WebhookVerificationError):
+        Verifier(SECRET).verify(body.replace(b"quick", b"quack"), dict(headers))
+    # By hand, as the convention's text says.
+    signed = f"{name}.{headers['webhook-timestamp']}.".encode() + body
+    digest = base64.b64encode(hmac.new(SECRET, signed, hashlib.sha256).digest()).decode()
+    assert headers["webhook-signature"] == f"v1,{digest}"
+    assert deliveries(db)[0]["tries"] == 2
+
+
+def test_what_waits_is_sent_after_a_restart(receiver: Receiver, db: Database, clock: Clock) -> None:
+    receiver.answers = [503]
+    with sending(db, receiver.url, clock) as webhook:
+        name = webhook.send("arm.drift_alarm", clock.at, NOTICE)
+        until(lambda: deliveries(db)[0]["tries"] == 1)
+    receiver.answers = [204]
+    clock.at += 6.0
+    with sending(db, receiver.url, clock):
+        until(lambda: deliveries(db)[0]["delivered"])
+    assert {headers["webhook-id"] for headers, _ in receiver.heard} == {name}
     assert len(receiver.heard) == 2
 
 
-def test_nobody_there_harms_nothing_and_what_waits_is_bounded() -> None:
+def test_it_is_tried_later_and_later_and_given_up_after_days(receiver: Receiver, db: Database, clock: Clock) -> None:
+    receiver.answers, began, at = [302], clock.at, list[float]()
+    with sending(db, receiver.url, clock) as webhook:
+        webhook.send("arm.due", clock.at, NOTICE)
+        while (row := deliveries(db)[0])["next"] is not None or row["tries"] == 0:
+            clock.at = row["next"]
+            at.append(clock.at - began)
+            until(lambda tries=row["tries"]: deliveries(db)[0]["tries"] > tries)
+    assert at == [0.0, *accumulate(WAITS)]
+    assert 2.0 < at[-1] / 86_400.0 < 4.0
+    # A redirection is not followed.
+    assert (deliveries(db)[0]["why"], len(receiver.heard)) == ("answered 302", len(WAITS) + 1)
+    line = trail(db)[0]
+    assert (line["what"], line["about"], line["detail"]["why"]) == ("webhook failed", "quick", "answered 302")
+
+
+def test_nothing_more_is_sent_to_who_is_gone(receiver: Receiver, db: Database, clock: Clock) -> None:
+    receiver.answers = [410]
+    with sending(db, receiver.url, clock) as webhook:
+        webhook.send("arm.due", clock.at, NOTICE)
+        until(lambda: deliveries(db)[0]["next"] is None)
+    assert (deliveries(db)[0]["tries"], trail(db)[0]["what"]) == (1, "webhook failed")
+
+
+def test_nobody_there_keeps_nobody_else_waiting(receiver: Receiver, db: Database, clock: Clock) -> None:
+    receiver.answers = [500, 204]
+    with sending(db, receiver.url, clock) as webhook:
+        webhook.send("arm.due", clock.at, NOTICE)
+        until(lambda: deliveries(db)[0]["tries"] == 1)
+        webhook.send("arm.due", clock.at, {**NOTICE, "id": 8})
+        until(lambda: deliveries(db)[0]["delivered"])
+        assert deliveries(db)[1]["delivered"] is None
     with socket.socket() as silent:
         silent.bind(("127.0.0.1", 0))  # bound, and never listening: every connection is refused
-        gave_up = GivenUp()
-        webhook = Webhook(f"http://127.0.0.1:{silent.getsockname()[1]}/", SECRET, gave_up, waits=(0.5,))
-        taken = [webhook.send({**NOTICE, "id": number}) for number in range(3 * MOST_WAITING)]
-        assert MOST_WAITING <= sum(taken) <= MOST_WAITING + 1
-        assert gave_up.happened.wait(20.0)
-        assert "ConnectionRefusedError" in gave_up.said[0]
-        webhook.close()
+        clock.at += 10.0
+        with sending(db, f"http://127.0.0.1:{silent.getsockname()[1]}/", clock):
+            until(lambda: "ConnectionRefusedError" in deliveries(db)[1]["why"])
 
 
 @pytest.mark.parametrize(
@@ -134,7 +208,7 @@ def test_addresses_that_are_refused(url: str) -> None:
         require_address(url)
 
 
-def test_a_secret_is_long_and_its_owners(tmp_path: Path) -> None:
+def test_a_secret_is_long_and_its_owners(tmp_path: Path, db: Database) -> None:
     path = tmp_path / "secret"
     path.write_bytes(SECRET + b"\n")
     path.chmod(0o644)
@@ -142,13 +216,18 @@ def test_a_secret_is_long_and_its_owners(tmp_path: Path) -> None:
         read_secret(path)
     path.chmod(0o600)
     assert read_secret(path) == SECRET
+    path.write_bytes(b"whsec_" + base64.b64encode(SECRET) + b"\n")
+    assert read_secret(path) == SECRET
+    path.write_bytes(b"whsec_%%%")
+    with pytest.raises(UsageError, match="base 64"):
+        read_secret(path)
     path.write_bytes(b"short")
     with pytest.raises(UsageError, match="16 to"):
         read_secret(path)
     with pytest.raises(UsageError, match="cannot be read"):
         read_secret(tmp_path / "none")
     with pytest.raises(UsageError, match="16 bytes"):
-        Webhook("https://host/", b"short")
+        Webhook(db, "https://host/", b"short")
     with pytest.raises(UsageError, match="needs both"):
         Settings(tmp_path, webhook="https://host/")
     with pytest.raises(UsageError, match="https only"):

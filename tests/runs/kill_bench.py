@@ -35,7 +35,7 @@ VICTIMS = {"parent": "ident_service", "recorder": "record.recorder_loop", "motio
 FAULT = {"parent": "lease_lost", "recorder": "recorder_behind", "motion": "motion_process"}
 MOTION = "{kind: seeded, seed: 1, base_frequency: 0.2, harmonics: 5, periods: 2}"
 # Drives that put up with a machine that stalls; what a watchdog does is tested in virtual time.
-REAL = "time: real, watchdog: 0.5, deadline: 2.0"
+REAL = "time: real, watchdog: 0.5, watchdog_reason: a simulated arm on a busy machine, deadline: 2.0"
 # A rate that a busy machine keeps, and gains that are stable at it.
 _GAINS = "{kp: 100, kd: 16, following_error: 0.4}"
 SLOW = f"control: {{rate: 50}}\njoints: {{shoulder: {_GAINS}, elbow: {_GAINS}}}\n"

@@ -18,7 +18,7 @@ from ident_service.cli import main
 from ident_service.cli.moving import _report_text
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.errors import UsageError
-from ident_service.estimation.doubt import REFERENCE, shares
+from ident_service.estimation.doubt import shares
 from ident_service.estimation.growing import Doubt
 from ident_service.estimation.target import LEAST_BLOCKS, Target, worst_share
 from ident_service.excitation.plan import excitation
@@ -73,7 +73,7 @@ def test_a_run_ends_early_with_what_it_is_for(
     assert main(words) == 0
     content = json.loads((tmp_path / "result" / "parameters.json").read_text())
     table = content["base_parameters"]
-    found = shares(np.array(table["values"]), np.array(table["standard_deviations"]), tuple(table["units"]))
+    found = shares(*(np.array(table[key]) for key in ("values", "standard_deviations", "negligible")))
     # Deviations from 40 blocks are known to 11 % themselves, and the result smooths otherwise than what is watched.
     assert (found <= 1.35 * SHARE).all(), found
     assert content["feasibility"]["feasible"]
@@ -91,8 +91,8 @@ def test_a_target_that_is_not_reached_lets_the_run_go_on_to_its_end(
     assert missed["parameter"] == "fv1"
     assert 0.0001 < missed["share"] < 1.0
     # Of all parameters of the same recording, those that are known as well as asked are left out, the worst come first.
-    every = [one["share"] for one in not_known(tmp_path / "run", Target(1e-6))]
-    some = not_known(tmp_path / "run", Target(float(np.median(every))))
+    every = [one["share"] for one in not_known(tmp_path / "run", Target(1e-6), PERIOD)]
+    some = not_known(tmp_path / "run", Target(float(np.median(every))), PERIOD)
     assert [one["share"] for one in some] == [share for share in every if share > np.median(every)]
     assert every == sorted(every, reverse=True)
     text = _report_text(report | {"until": {**report["until"], "missed": [missed, {"parameter": "m2", "share": None}]}})
@@ -124,28 +124,30 @@ def test_finish_is_refused_where_nobody_moves(virtual_arm: Path, tmp_path: Path,
     assert "nobody moves the arm" in capsys.readouterr().err
 
 
+_AS_ZERO = 0.01
+
+
 def doubt(model: ArmModel, values: float, deviation: float, blocks: int = LEAST_BLOCKS) -> Doubt:
     size = base_parameters(model.chain, model.layout).size
-    return Doubt(20.0, np.full(size, values), np.full(size, deviation), (), blocks)
+    return Doubt(20.0, np.full(size, values), np.full(size, deviation), _AS_ZERO * np.arange(1.0, size + 1), (), blocks)
 
 
 def test_the_rule(model: ArmModel) -> None:
     base = base_parameters(model.chain, model.layout)
     everything = Target(0.1).places(base, "planar2")
     assert everything.tolist() == list(range(base.size))
-    assert worst_share(doubt(model, 2.0, 0.1), base, everything) == pytest.approx(0.05)
-    # As good as zero: a share of the reference, the smallest of which counts.
-    least = min(REFERENCE[unit] for unit in base.units)
-    assert worst_share(doubt(model, 0.0, 1e-3), base, everything) == pytest.approx(1e-3 / least)
-    assert worst_share(doubt(model, 2.0, 0.1, LEAST_BLOCKS - 1), base, everything) == np.inf
+    assert worst_share(doubt(model, 2.0, 0.1), everything) == pytest.approx(0.05)
+    # As good as zero: a share of what is, the smallest of which counts.
+    assert worst_share(doubt(model, 0.0, 1e-3), everything) == pytest.approx(1e-3 / _AS_ZERO)
+    assert worst_share(doubt(model, 2.0, 0.1, LEAST_BLOCKS - 1), everything) == np.inf
     for unknown in (np.inf, np.nan):
-        assert worst_share(doubt(model, 2.0, unknown), base, everything) == np.inf
+        assert worst_share(doubt(model, 2.0, unknown), everything) == np.inf
     mixed = doubt(model, 2.0, 0.1)
     mixed.deviations[:3] = 1.0, 0.02, np.inf
     (second,) = chosen = Target(0.1, (base.expressions[1].replace(" ", ""),)).places(base, "planar2")
     assert second == 1
-    assert worst_share(mixed, base, chosen) == pytest.approx(0.01)
-    assert worst_share(mixed, base, everything) == np.inf
+    assert worst_share(mixed, chosen) == pytest.approx(0.01)
+    assert worst_share(mixed, everything) == np.inf
     for share in (0.0, 1.0, -1.0, float("nan")):
         with pytest.raises(UsageError, match="above 0 and below 1"):
             require_target(Target(share), model)

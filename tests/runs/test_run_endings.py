@@ -250,7 +250,7 @@ def test_an_arm_without_brakes_is_held_until_a_person_confirms(
     state = ["--state", str(tmp_path / "state")]
 
     def confirm() -> None:
-        assert main(["supported", "planar2", *state]) == 0
+        assert main(["supported", "planar2", "--confirm", "planar2", *state]) == 0
 
     said = when(monkeypatch, {"exciting": lambda: signal.raise_signal(signal.SIGINT), WAITS: confirm})
     assert main(["supported", loose[1], *state]) == 2  # nobody moves it, and its drives do not hold it

@@ -1,0 +1,66 @@
+"""Recordings of `--server`: named by the daemon's ids, or files that are here and are uploaded."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ident_service.cli.answer import tell
+from ident_service.errors import UsageError
+
+if TYPE_CHECKING:
+    from ident_service.client import IdentClient
+
+
+def recording(
+    client: IdentClient, arguments: argparse.Namespace, arm: str, path: Path, columns: Path | None = None
+) -> dict[str, Any]:
+    """Name a recording as the daemon does; a file that is here is uploaded first.
+
+    Args:
+        client: of the daemon.
+        arguments: of the verb.
+        arm: name of the arm that a file is of.
+        path: `FILE`, `RUN` or `RUN/NAME`, each with or without `@START:END`.
+        columns: says how a file is laid out.
+    """
+    from ident_service.record.files import split_range
+
+    file = file_of(path)
+    seconds = None if path.is_file() else split_range(str(path))[1]
+    given = {"start": seconds[0], "end": seconds[1]} if seconds else {}
+    bounded = {key: value for key, value in given.items() if math.isfinite(value)}
+    if file.is_file():
+        text = "" if columns is None else _text(columns)
+        return {**client.upload(arm, file, columns=text, tell=_percent(arguments, file)), **bounded}
+    run, _, name = str(file).partition("/")
+    return {"run": run, **({"name": name} if name else {}), **bounded}
+
+
+def file_of(path: Path) -> Path:
+    """Return what `FILE@START:END` names without the range, unless a file is called that."""
+    from ident_service.record.files import split_range
+
+    return path if path.is_file() else Path(split_range(str(path))[0])
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{path}: cannot be read: {error}") from None
+
+
+def _percent(arguments: argparse.Namespace, file: Path) -> Callable[[float], None]:
+    """Tell at each tenth how much of a file has arrived."""
+    told = [-1]
+
+    def share(arrived: float) -> None:
+        if int(10 * arrived) > told[0]:
+            told[0] = int(10 * arrived)
+            tell(arguments, f"{file.name}: {100.0 * arrived:.0f} % uploaded")
+
+    return share
