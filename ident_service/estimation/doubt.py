@@ -95,22 +95,30 @@ def uncertainty(equations: Equations, fit: LeastSquares) -> Uncertainty:
     return Uncertainty(covariance, np.where(blind, np.inf, largest), degrees, _noise(clusters, fit))
 
 
-def jackknife(clusters: Sequence[Sequence[Information]], fit: LeastSquares) -> tuple[Array, Array, NDArray[np.bool_]]:
+def jackknife(
+    clusters: Sequence[Sequence[Information]], fit: LeastSquares, along: Array | None = None
+) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Estimate a covariance by leaving out one cluster after the other (HC3).
 
     Args:
         clusters: blocks that count as one.
         fit: what solves all of them.
+        along: combinations of the parameters, shape (base, combinations); each parameter alone when None. The
+            covariance of few blocks says nothing about combinations, as it knows most of them far too well: their
+            degrees of freedom must be asked for with them.
 
     Returns:
-        The covariance, shape (base, base); degrees of freedom of its variances, shape (base,); and of which parameters
-        the data, or all clusters but one, say nothing, shape (base,).
+        The covariance of the combinations, shape (combinations, combinations); degrees of freedom of its variances,
+        shape (combinations,); and of which of them the data, or all clusters but one, say nothing.
     """
     size = len(fit.beta)
+    asked = np.eye(size) if along is None else along
     meat = np.zeros((size, size))
     bread = fit.inverse @ fit.inverse.T
-    alone = np.zeros(size)  # largest share of a parameter's white variance along a direction of one cluster alone
-    lengths, images = np.zeros((len(clusters), size)), np.zeros((len(clusters), size, size))
+    wanted = bread @ asked
+    variances = np.maximum(np.sum(asked * wanted, axis=0), np.finfo(float).tiny)
+    alone = np.zeros(len(variances))  # largest share of a white variance along a direction of one cluster alone
+    lengths, images = np.zeros((len(clusters), len(alone))), np.zeros((len(clusters), size, len(alone)))
     for number, cluster in enumerate(clusters):
         block = Information.sum(cluster)
         score = block.scores(fit.beta, fit.weights)
@@ -119,15 +127,16 @@ def jackknife(clusters: Sequence[Sequence[Information]], fit: LeastSquares) -> t
         shares, U = np.linalg.eigh(W @ bread @ W.T)
         others = shares < _ALONE
         inverse = (U[:, others] / (1.0 - shares[others])) @ U[:, others].T
-        left_out = inverse @ (W @ bread)
-        full = score + W.T @ (left_out @ score)
+        inverse = inverse @ W
+        full = score + W.T @ (inverse @ (bread @ score))
         meat += np.outer(full, full)
-        along = bread @ W.T @ U[:, ~others]
-        alone = np.maximum(alone, np.sum(along**2, axis=1) / np.maximum(np.diag(bread), np.finfo(float).tiny))
+        alone = np.maximum(alone, np.sum((U[:, ~others].T @ (W @ wanted)) ** 2, axis=0) / variances)
+        left_out = inverse @ wanted
         lengths[number] = np.sum(left_out**2, axis=0)
         images[number] = fit.inverse.T @ (W.T @ left_out)
-    blind = ~np.isfinite(fit.standard_deviations) | (alone > _SEEN_ALONE)
-    return bread @ meat @ bread, _degrees(lengths, images), blind
+    unseen = ~np.isfinite(fit.standard_deviations)
+    blind = np.any(asked[unseen] != 0.0, axis=0) | (alone > _SEEN_ALONE)
+    return wanted.T @ meat @ wanted, _degrees(lengths, images), blind
 
 
 def _noise(clusters: Sequence[Sequence[Information]], fit: LeastSquares) -> Array | None:
@@ -157,11 +166,11 @@ def widening(degrees: Array) -> Array:
 
 
 def _degrees(lengths: Array, images: Array) -> Array:
-    """Satterthwaite's degrees tr(G)^2 / |G|^2 per parameter, of the quadratic form G of errors that its variance is.
+    """Satterthwaite's degrees tr(G)^2 / |G|^2 of each, of the quadratic form G of errors that its variance is.
 
     With white errors, G_bc = [b = c] |g_b|^2 - m_b . m_c for blocks b and c: g_b is what the block's errors are
-    multiplied by (squared lengths `lengths`, shape (blocks, base)), m_b its image under the estimate (`images`, shape
-    (blocks, base, base), the parameter last).
+    multiplied by (squared lengths `lengths`, shape (blocks, asked)), m_b its image under the estimate (`images`, shape
+    (blocks, base, asked)). `asked` are parameters or combinations of them.
     """
     own = np.sum(images**2, axis=1)
     trace = np.sum(lengths - own, axis=0)

@@ -10,8 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ident_service.config.schema import JointTerm
+from ident_service.estimation.doubt import jackknife, widening
 from ident_service.estimation.feasible.feasibility import constrained_least_squares
 from ident_service.estimation.identify import Candidate, Estimate
 from ident_service.estimation.least_squares import TorqueError, ordinary_least_squares, torque_error
@@ -166,7 +168,8 @@ def _driving_friction(estimate: Estimate, deviations: float) -> list[tuple[str, 
     # Not those that were fitted: a robust method multiplies their rows.
     layout, base, total = estimate.model.layout, estimate.base, estimate.prepared.equations.moving
     place = {int(column): index for index, column in enumerate(base.base)}
-    coupling, found = estimate.model.chain.coupling, []
+    coupling = estimate.model.chain.coupling
+    driving: list[tuple[str, float, NDArray[np.float64]]] = []
     for drive, viscous in enumerate(layout.term_columns("viscous")):
         joint = drive if coupling[drive, drive] else int(np.argmax(np.abs(coupling[drive])))
         column = np.flatnonzero(total.supports[joint] == place[int(viscous)])[0]
@@ -179,12 +182,19 @@ def _driving_friction(estimate: Estimate, deviations: float) -> list[tuple[str, 
         for term, share in shares.items():
             if len(columns := layout.term_columns(term)):
                 row[place[int(columns[drive])]] = share
-        used = np.flatnonzero(row)  # of the others, some may have no finite deviation
-        variance = float(row[used] @ estimate.covariance[np.ix_(used, used)] @ row[used])
         torque = float(row @ estimate.fit.beta)
-        if np.isfinite(variance) and torque < -deviations * np.sqrt(variance):
-            found.append((estimate.model.chain.names[joint], torque, float(np.sqrt(variance))))
-    return found
+        if torque < 0.0:
+            driving.append((estimate.model.chain.names[joint], torque, row))
+    if not driving:
+        return []
+    rows = np.array([row for _, _, row in driving]).T
+    covariance, degrees, blind = jackknife(estimate.fitted.clusters, estimate.fit, rows)
+    doubt = np.where(blind, np.inf, np.sqrt(np.diag(covariance)) * widening(degrees))
+    return [
+        (name, torque, float(deviation))
+        for (name, torque, _), deviation in zip(driving, doubt, strict=True)
+        if torque < -deviations * deviation
+    ]
 
 
 def _of_joint(name: str, seen: JointQuality, model: ArmModel, *, revolute: bool) -> Iterator[str]:

@@ -24,6 +24,7 @@ class RangeRecording:
         start: of the range, included [s] after the file's first sample.
         end: of the range, excluded [s] after the file's first sample.
         whole: the file.
+        ended: when the motion ended early and the rest was left out [s after the file's first sample]; None if not.
         standstill: seconds that were left out as standstill at the start and at the end [s].
     """
 
@@ -45,6 +46,7 @@ class RangeRecording:
         before, after = time_range(whole)
         self.start, self.end = max(start, before), min(end, after)
         self.standstill = (0.0, 0.0)
+        self.ended: float | None = whole.ended if isinstance(whole, RangeRecording) else None
         self.whole: Recording = whole.whole if isinstance(whole, RangeRecording) else whole
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
@@ -65,6 +67,8 @@ class RangeRecording:
                 yield cut(block, int(start), int(stop))
         if not found:
             lasts = "it is empty" if first is None else f"it lasts {(last - first) * 1e-9:.6g} s"
+            if self.ended is not None:
+                lasts = f"the motion was stopped {self.ended:.6g} s after the first sample"
             raise RecordingError(self.path, f"no sample from {self.start:g} s to {self.end:g} s; {lasts}")
 
 

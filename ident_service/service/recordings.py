@@ -15,18 +15,20 @@ from ident_service.config.recording import RecordingFormat, disagreements, units
 from ident_service.errors import RecordingError, UsageError
 from ident_service.estimation.spectra import EDGE, USUAL
 from ident_service.model.arm_model import ArmModel
+from ident_service.motion.states import State
 from ident_service.record.files import split_range
 from ident_service.record.kept import KeptRecording
 from ident_service.record.mcap_file import McapRecording
 from ident_service.record.mcap_records import MAGIC
 from ident_service.record.measured import MeasuredRecording
 from ident_service.record.open import open_recording
-from ident_service.record.part import RangeRecording, first_stamp, time_range, without_standstill
+from ident_service.record.part import RangeRecording, first_stamp, without_standstill
 from ident_service.record.quality import Quality, quality
 from ident_service.record.recording import Recording
 
 # What of a format says how all recordings become samples, and not how one file is laid out.
 _STOPPING = 40  # level of the events that tell of a fault which stopped the arm (`motion/faults.py`)
+_ENDS = (State.STOPPED.value, State.FAULTED.value)
 _OF_ALL = ("trim", "gap", "stamps", "rate")
 
 
@@ -82,10 +84,16 @@ def open_together(
     asked = torque or model.config.identification.torque
     found = [open_for(path, model, forms.get(path), asked) for path in paths]
     kinds = [torque_in(recording) for recording in found]
-    remarks: tuple[str, ...] = ()
+    remarks = tuple(
+        f"{recording.path}: left out from {recording.ended:.6g} s after its first sample on: the motion was stopped,"
+        " and what acted on the arm from then on is not the recorded torque"
+        for recording in found
+        if isinstance(recording, RangeRecording) and recording.ended is not None
+    )
     if {"measured", "commanded"} <= set(kinds):
         without = ", ".join(path.name for path, kind in zip(paths, kinds, strict=True) if kind == "commanded")
         remarks = (
+            *remarks,
             f"identified from commanded torques: drives measured none in {without}, and the two are not mixed; leave "
             "these recordings out to use measured ones",
         )
@@ -126,6 +134,10 @@ def open_for(
     torque = torque or model.config.identification.torque
     whole = open_recording(file, model.chain.names, fmt=form, transmission=gears, torque=torque)
     recording: Recording = KeptRecording(whole)
+    if isinstance(whole, McapRecording | MeasuredRecording) and (ended := _ended(file, recording)) is not None:
+        # A range that a person asks for beyond this end is empty, and the error says so.
+        recording = RangeRecording(recording, 0.0, ended)
+        recording.ended = ended
     if seconds is not None:
         recording = RangeRecording(recording, *seconds, label=path.name.removeprefix(file.name))
     if form.standstill == "cut":
@@ -133,6 +145,19 @@ def open_for(
         edge = model.config.identification.edge
         recording = without_standstill(recording, EDGE / USUAL if edge == "choose" else edge)
     return recording
+
+
+def _ended(file: Path, recording: Recording) -> float | None:
+    """Say when a stop or a fault ended the motion of a recording of ours [s after its first sample]; None if neither.
+
+    From then on brakes or the drives themselves hold the arm, and the recorded torque is not what acts on it.
+    """
+    log = McapRecording(file)
+    if not log.own:
+        return None
+    ends = (event.stamp_ns for event in log.read_extras().events if event.name == "ident" and event.message in _ENDS)
+    ended = min(ends, default=None)
+    return None if ended is None else (ended - first_stamp(recording)) * 1e-9
 
 
 def own_formats(
@@ -187,14 +212,14 @@ def require_no_fault(path: Path, recording: Recording) -> None:
     Raises:
         RecordingError: names the fault and when it was.
     """
-    file, _ = file_and_range(path)
+    file, seconds_asked = file_and_range(path)
     with file.open("rb") as stream:
         if stream.read(len(MAGIC)) != MAGIC:
             return
     log = McapRecording(file)
     if not log.own:
         return
-    start, end = time_range(recording)
+    start, end = (-np.inf, np.inf) if seconds_asked is None else seconds_asked
     first = first_stamp(recording)
     for event in log.read_extras().events:
         seconds = (event.stamp_ns - first) * 1e-9

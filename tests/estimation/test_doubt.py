@@ -14,6 +14,7 @@ from ident_service.estimation.doubt import jackknife, negligible, uncertainty, v
 from ident_service.estimation.equations import Equations
 from ident_service.estimation.least_squares import ordinary_least_squares
 from ident_service.model.base import base_parameters
+from ident_service.model.chain import Array
 from ident_service.model.information import Information
 
 
@@ -34,6 +35,22 @@ def test_it_is_the_jackknife_over_blocks() -> None:
     got, *_ = jackknife(gathered.clusters, fit)
     scale = np.sqrt(np.outer(np.diag(wanted), np.diag(wanted)))
     np.testing.assert_allclose(got / scale, wanted / scale, rtol=0, atol=1e-8)
+
+
+def test_combinations_are_the_parameters_of_other_coordinates() -> None:
+    rng = np.random.default_rng(3)
+    W, y, T = rng.normal(size=(60, 3)), rng.normal(size=60), rng.normal(size=(3, 3))
+    pairs = list(zip(np.split(W, 6), np.split(y, 6), strict=True))
+
+    def cut(change: Array) -> Equations:
+        return Equations(tuple(one_joint_information(rows @ change, torque) for rows, torque in pairs), len(W))
+
+    # y = W b = (W T) c with c = T^-1 b.
+    other, gathered = cut(T), cut(np.eye(3))
+    wanted = jackknife(other.clusters, ordinary_least_squares(other.total))
+    got = jackknife(gathered.clusters, ordinary_least_squares(gathered.total), np.linalg.inv(T).T)
+    for one, another in zip(got, wanted, strict=True):
+        np.testing.assert_allclose(one, another, rtol=1e-8)
 
 
 @pytest.mark.slow
