@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,11 +16,15 @@ from drivers.canopen.budget import budget
 from drivers.canopen.dictionary import Entry, Kind
 from drivers.canopen.profile import HEARTBEAT, Write
 from ident_service.config.canopen import CanopenDrive, CanopenDriver, disagreements, quick_stop_decelerations
+from ident_service.config.limits import motion_limits
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError
 from ident_service.model.arm_model import arm_model
+from ident_service.model.expected_friction import expected_friction
 from ident_service.motion.preflight.check import Verdict
+from ident_service.motion.preflight.session import Session
 from ident_service.motion.preflight.watchdog import watchdog_check
+from ident_service.motion.reference import hold
 from sim_backend.pucks.faults import parse_fault
 from sim_backend.pucks.lock_step import LockStepArm
 
@@ -46,6 +51,16 @@ def arm_of(first: str, second: str, **driver: Any) -> ArmConfig:
     return weightless_config(drives=drives, **{"heartbeats": BEATS, "status": status} | driver)
 
 
+def limited(config: ArmConfig) -> ArmConfig:
+    """The same with limits and gains for every joint, so that a loop may hold it."""
+    rest = {"velocity": 2.0, "acceleration": 5.0, "jerk": 50.0, "following_error": 0.2, "kp": 100.0, "kd": 16.0}
+    joints = {
+        name: joint.model_copy(update={**rest, "position": (-3.0, 3.0), "home": joint.home or 0.5})
+        for name, joint in config.joints.items()
+    }
+    return config.model_copy(update={"joints": joints})
+
+
 class Bench:
     """An open, enabled arm over a tapped bus."""
 
@@ -63,7 +78,14 @@ class Bench:
         return self.taps
 
     def check(self) -> Any:
-        return watchdog_check(self.arm, arm_model(self.config), PERIOD, ZERO)
+        model = arm_model(limited(self.config))
+        model = replace(model, prior=model.layout.vector(self.config.driver.emulation.truth))
+        limits, described = motion_limits(model.config), self.arm.describe()
+        home = self.arm.exchange(ZERO).position
+        friction = expected_friction(model, limits, self.config.design.friction_guess)
+        session = Session(self.arm, model, limits, described, home, friction)
+        session.follow(hold(home), 0.02)
+        return watchdog_check(self.arm, model, session, hold(home).at)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from flight_bench import FOREVER, TRUTH, Flight, FlightArm, check_of, joint_changes, only_failure, verdicts
 
-from drivers.arm import Sample
+from drivers.arm import Sample, Watchdog
 from drivers.clock import VirtualClock
 from ident_service.config.load import load_arm
 from ident_service.errors import ArmFault, DriverError
@@ -367,6 +367,55 @@ def test_drives_without_a_watchdog_are_refused() -> None:
     check = only_failure(ticket, "watchdog")
     assert "1400h" in check.remedy
     assert all(one.value is None for one in check.measures)
+
+
+class Beating(FlightArm):
+    """An arm whose drives claim to watch a heartbeat, and go on without; what they show can be bent meanwhile."""
+
+    bent: Callable[[Sample], Sample] = staticmethod(lambda sample: sample)
+    silent_from: int | None = None
+
+    def watchdogs(self) -> tuple[Watchdog, ...]:
+        return tuple(Watchdog(name, "heartbeat", 0.1, of_torque=False) for name in ("shoulder", "elbow"))
+
+    def withhold(self, kind: str) -> None:
+        assert kind == "heartbeat"
+        self.silent_from = len(self.torques)
+
+    def exchange(self, torque: Array | None) -> Sample:
+        sample = super().exchange(torque)
+        return sample if self.silent_from is None else self.bent(sample)
+
+
+def beating(shift: float) -> tuple[Flight, Beating]:
+    """A flight of such an arm, whose elbow seems to have been pushed by so much while its drives miss heartbeats."""
+    flight = Flight()
+    arm = Beating(from_config(flight.model.config))
+    arm.bent = lambda sample: replace(sample, position=sample.position + np.array([0.0, shift]))
+    flight.arm = arm
+    return flight, arm
+
+
+def test_while_drives_miss_a_heartbeat_the_loop_goes_on_holding_the_arm() -> None:
+    flight, arm = beating(0.004)
+    ticket = flight.ticket()
+    assert "heartbeat withheld: goes on" in only_failure(ticket, "watchdog").measures[0].what
+    assert arm.silent_from is not None
+    before, after = arm.torques[arm.silent_from - 1], np.array(arm.torques[arm.silent_from + 2 :])
+    assert len(after) > 50
+    # The pushed elbow is pulled back, and let alone when it is there.
+    assert after[:, 1].min() < before[1] - 0.05
+    assert after[-1, 1] > after[:, 1].min() + 0.03
+
+
+def test_an_arm_that_goes_astray_while_drives_miss_a_heartbeat_is_let_go_at_once() -> None:
+    flight, arm = beating(0.2)
+    reason = only_failure(flight.ticket(), "watchdog").reason
+    assert reason.startswith("at rest, while drives missed heartbeat")
+    assert "elbow" in reason
+    assert reason.endswith("the arm was let go")
+    assert arm.silent_from is not None
+    assert len(arm.torques) - arm.silent_from < 5
 
 
 def test_an_interruption_leaves_the_arm_without_torque() -> None:

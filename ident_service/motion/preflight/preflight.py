@@ -268,7 +268,7 @@ class _Preflight:
                 moved += (follow_stroke(session, one) for one in planned)
                 session.follow(hold(session.home), SETTLE)
                 if try_watchdog:
-                    silent = watchdog_check(self.arm, self.model, session.period, session.torque)
+                    silent = watchdog_check(self.arm, self.model, session, hold(session.home).at)
             if silent is None:
                 session.release()
         except ArmError as error:
@@ -309,8 +309,11 @@ class _Preflight:
                 stroke = strokes(session, self.model, room, only=0)[0]
             session.energise()
             session.follow(hold(home), SETTLE)
-            session.follow(stroke, DWELL + 0.5 * stroke.there.duration)
-            moving = watchdog_check(self.arm, self.model, period, session.torque, stroke.joint)
+            half = DWELL + 0.5 * stroke.there.duration
+            session.follow(stroke, half)
+            moving = watchdog_check(
+                self.arm, self.model, session, lambda elapsed: stroke.at(half + elapsed), stroke.joint
+            )
         except (MotionRefused, ArmFault) as error:
             self.arm.stop(StopKind.TORQUE_OFF)
             return failed(CODE, f"in motion: {error}", REST_REMEDY, at_rest.measures)

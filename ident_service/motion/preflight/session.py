@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector
+from drivers.arm import Arm, ArmDescription, Flags, Sample, StopKind, Vector
 from ident_service.config.limits import MotionLimits
 from ident_service.errors import ArmFault
 from ident_service.model.arm_model import ArmModel, control_model
@@ -144,6 +144,7 @@ class Session:
         self._since = Elapsed(period)
         self._torque = self.gravity.copy()
         self._rows: list[tuple[Sample, Setpoint]] = []
+        self._words: tuple[int, ...] = ()
         self._friction = still
         self._stiffness = limits.kp * np.diag(self.mass)
 
@@ -185,12 +186,8 @@ class Session:
             elapsed = (sample.stamp_ns - begin_ns) * 1e-9
             setpoint = reference.at(elapsed)
             self._rows.append((sample, setpoint))
-            since = self._since(sample.stamp_ns)
-            control = self._control
-            usable, fault = self._guard.feedback(sample, setpoint, control.velocity, control.correction, elapsed=since)
-            if fault is not None and fault.reaction is not Reaction.WARN:
-                raise ArmFault(fault.code, fault.message, [row[0] for row in self._rows[-100:]])
-            wanted = control.torque(sample.position, usable, setpoint, since)
+            self._words = sample.status
+            wanted = self._led(sample, setpoint, np.zeros(len(self.home), dtype=bool))
             if shaking is not None:
                 # On its way only: a joint that sticks would look like one whose encoder does.
                 moving = np.clip(np.abs(setpoint.velocity) / (2.0 * _CREEP), 0.0, 1.0)
@@ -203,6 +200,38 @@ class Session:
     def torque(self) -> Vector:
         """The torque that is sent next [N m or N], shape (joints,)."""
         return self._torque
+
+    def lead_in_silence(self, sample: Sample, setpoint: Setpoint, given_up: Flags, *, sends: bool) -> None:
+        """Judge a cycle in which drives miss something on purpose, and work out the torque that follows.
+
+        What drives say of themselves is what is being tried, and is not judged here; neither are joints whose drives
+        have given up torque, but for their limits. Every other joint is held and guarded as before.
+
+        Args:
+            sample: of this cycle.
+            setpoint: for the joints that are held.
+            given_up: which joints no longer are, shape (joints,).
+            sends: whether torque is sent; where it is what drives miss, the last one stays the last one.
+
+        Raises:
+            ArmFault: the guard found something that is more than a warning.
+        """
+        self._rows.append((sample, setpoint))
+        undisturbed = replace(sample, status=self._words, events=(), torque=self._torque, torque_difference=None)
+        there = np.where(given_up, sample.position, setpoint.position)
+        going = np.where(given_up, 0.0, setpoint.velocity)
+        asked = Setpoint(there, going, np.where(given_up, 0.0, setpoint.acceleration))
+        wanted = self._led(undisturbed, asked, given_up) + self._against_friction(asked, 0.0)
+        if sends:
+            self._torque = self._limited(wanted)
+
+    def wait_in_silence(self) -> None:
+        """Go on with the torque that was sent last, through the guard, while drives tell no positions.
+
+        Raises:
+            ArmFault: the guard found something that is more than a warning.
+        """
+        self._torque = self._limited(self._torque)
 
     def trace(self) -> Trace:
         """The cycles of the last `follow`, also of one that a fault ended."""
@@ -218,6 +247,15 @@ class Session:
                 break
             self._torque = self._limited(held * (left / cycles), band=False)
         self._arm.stop(StopKind.TORQUE_OFF)
+
+    def _led(self, sample: Sample, setpoint: Setpoint, given_up: Flags) -> Vector:
+        """The control law's torque for a sample that the guard has judged [N m or N], shape (joints,)."""
+        since, control = self._since(sample.stamp_ns), self._control
+        velocity, correction = (np.where(given_up, 0.0, of) for of in (control.velocity, control.correction))
+        usable, fault = self._guard.feedback(sample, setpoint, velocity, correction, elapsed=since)
+        if fault is not None and fault.reaction is not Reaction.WARN:
+            raise ArmFault(fault.code, fault.message, [row[0] for row in self._rows[-100:]])
+        return control.torque(sample.position, usable, setpoint, since)
 
     def _against_friction(self, setpoint: Setpoint, learning: float) -> Vector:
         """Torque that moving joints need besides the model's, learned from how they lag [N m or N], shape (joints,)."""

@@ -7,16 +7,19 @@ person must have typed the arm's name first.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.arm import Arm, Sample, StopKind, Vector, Watchdog
+from drivers.arm import Arm, Flags, Sample, StopKind, Vector, Watchdog
 from drivers.status import AxisStatus
+from ident_service.errors import ArmFault
 from ident_service.model.arm_model import ArmModel
 from ident_service.motion.preflight.check import Check, Verdict, failed, judged, measure, skipped
 from ident_service.motion.preflight.plan import LONGEST_SILENCE
+from ident_service.motion.preflight.session import Session
+from ident_service.motion.reference import Setpoint
 
 CODE = "watchdog"
 _STOPS = 0.5  # s that a slow joint is given to come to rest
@@ -84,28 +87,32 @@ def watchdogs_of(arm: Arm, model: ArmModel) -> tuple[Watchdog, ...]:
     return arm.watchdogs() or tuple(Watchdog(name, "torque_frames", most) for name in model.chain.names)
 
 
-def watchdog_check(arm: Arm, model: ArmModel, period: float, torque: Vector, moving: int | None = None) -> Check:
+def watchdog_check(
+    arm: Arm, model: ArmModel, session: Session, setpoint_at: Callable[[float], Setpoint], moving: int | None = None
+) -> Check:
     """Fall silent on an arm that is held, and look at what its drives do; the arm is without torque afterwards.
 
     What one kind of watchdog watches is withheld after the other, and everything else goes on: a drive that stops for
-    another reason has not proven its watchdog.
+    another reason has not proven its watchdog. So do the closed loop and its guard, for the joints whose drives have
+    not given up yet; only where SYNC is withheld, and no position comes, the last torque goes on.
 
     Args:
-        arm: enabled, held by the last torque sent, which goes on acting until a drive gives it up.
+        arm: enabled, held by `session`.
         model: for names, and the watchdog's time in the driver's section where the driver does not tell it.
-        period: [s].
-        torque: the last one sent [N m or N], shape (joints,).
+        session: what holds it; without torque frames the last torque acts until a drive gives it up.
+        setpoint_at: where the joints that are held should be, by the time since the silence began [s].
         moving: number of the joint that moves, whose travel is measured; None at standstill.
 
     Raises:
         DriverError: the arm does not answer.
     """
+    period = session.period
     dogs = watchdogs_of(arm, model)
     told = float(getattr(model.config.driver, "report_delay", 0.0))
     where = "at rest" if moving is None else "in motion"
     gave_up: dict[int, tuple[float, AxisStatus]] = {}
     strange: list[str] = []
-    begun: float | None = None
+    begun = 0
     at: Vector = np.zeros(0)
     try:
         for kind in sorted({dog.kind for dog in dogs}, key=_ORDER.index):
@@ -116,11 +123,11 @@ def watchdog_check(arm: Arm, model: ArmModel, period: float, torque: Vector, mov
                 arm.withhold(kind)
             begin_ns: int | None = None
             while True:
-                sample = arm.exchange(None if of_torque else torque)
+                sample = arm.exchange(None if of_torque else session.torque)
                 status = arm.drive_status() or tuple(AxisStatus(word) for word in sample.status)
                 if begin_ns is None:
                     begin_ns = sample.stamp_ns
-                    if begun is None:
+                    if not at.size:
                         begun, at = sample.stamp_ns, sample.position
                         if not all(word & AxisStatus.POWERED for word in status):
                             return failed(CODE, "the drives do not report that they have power", REMEDY)
@@ -131,9 +138,21 @@ def watchdog_check(arm: Arm, model: ArmModel, period: float, torque: Vector, mov
                     gave_up[number] = silent, word
                     if number not in watched:
                         strange.append(f"{dogs[number].drive} stopped when {_WORDS[kind]} stayed away, not by its own")
+                if strange:
+                    break
+                if kind == "sync_loss":
+                    session.wait_in_silence()
+                else:
+                    setpoint = setpoint_at((sample.stamp_ns - begun) * 1e-9)
+                    session.lead_in_silence(sample, setpoint, _joints_of(gave_up, model), sends=not of_torque)
                 if all(number in gave_up for number in watched) or silent > most:
                     break
+            if strange:
+                break
         travel = _travel(arm, at, moving) if moving is not None else None
+    except ArmFault as ended:
+        why = f"{where}, while drives missed {_WORDS[kind]} and before all had said that they stopped: {ended}"
+        return failed(CODE, f"{why}; the arm was let go", REMEDY)
     finally:
         arm.stop(StopKind.TORQUE_OFF)
     found = []
@@ -154,6 +173,12 @@ def watchdog_check(arm: Arm, model: ArmModel, period: float, torque: Vector, mov
 def _most(dog: Watchdog, period: float, told: float) -> float:
     """How long a drive may take until it has said that it stopped [s]."""
     return LONGEST_SILENCE if dog.seconds is None else _LATER * dog.seconds + _CYCLES * period + told
+
+
+def _joints_of(drives: Collection[int], model: ArmModel) -> Flags:
+    """Tell which joints these drives, by number, have a part in, shape (joints,)."""
+    coupling = model.chain.coupling
+    return np.asarray((coupling[list(drives)] != 0.0).any(axis=0))
 
 
 def _reaction(word: AxisStatus) -> str:
