@@ -17,6 +17,9 @@ from ident_service.model.chain import Array, Chain
 # Of the velocity limit: over so much of the reference's velocity the Coulomb part fed forward turns round. A sign would
 # step by twice the friction, and chatter where a reference stands.
 _TURNS = 0.02
+# Behind dry gears more: turning round at the acceleration limit changes the torque by this at most, half of what the
+# guard lets through (libfranka's 1000 N m/s), whose other half the errors at a reversal need.
+_TURNING = 500.0  # N m/s or N/s
 
 
 @dataclass(frozen=True)
@@ -72,8 +75,10 @@ class FrictionFeedforward:
         """
         self.friction, self.share = friction, share
         self._coupling = chain.coupling
-        self._turns = 1.0 / (_TURNS * np.abs(chain.coupling) @ limits.velocity)
         self._coulomb, self._viscous = share * friction.coulomb, share * friction.viscous
+        moves = np.abs(chain.coupling)
+        over = np.maximum(_TURNS * moves @ limits.velocity, self._coulomb * (moves @ limits.acceleration) / _TURNING)
+        self._turns = 1.0 / over
 
     def torque(self, velocity: Array) -> Array:
         """Torque to add [N m or N] for a reference's velocity [rad/s or m/s], each of shape (..., joints)."""

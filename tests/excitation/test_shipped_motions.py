@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
+from helpers.changed_arms import recorded_arm
 
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.config.simulation import SimulatedDriver
@@ -23,6 +26,16 @@ def test_every_simulated_arm_is_here() -> None:
 def test_a_shipped_motion_may_be_made_from_home(name: str, motion: str) -> None:
     model = arm_model(load_arm(name))
     require_clear_from_home(model, excitation(model, motion))  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_the_arm_with_dry_gears_makes_its_motion_at_its_own_rate(tmp_path: Path) -> None:
+    """Its joints stick, and its torque swings by twice its friction wherever they turn round."""
+    config = load_arm("sixaxis")
+    short = config.motions.identification.model_copy(update={"periods": 1})
+    motions = config.motions.model_copy(update={"identification": short})
+    recording = recorded_arm(config.model_copy(update={"motions": motions}), tmp_path / "run.mcap")
+    assert sum(len(block.stamp_ns) for block in recording.blocks()) > 10000
 
 
 def test_a_motion_that_comes_too_near_is_refused() -> None:

@@ -14,6 +14,7 @@ from ident_service.model.arm_model import control_model
 from ident_service.model.expected_friction import ExpectedFriction, FrictionFeedforward
 from ident_service.model.rigid_body import InverseDynamics
 from ident_service.motion.control import ComputedTorque
+from ident_service.motion.guard import TORQUE_RATE
 from ident_service.motion.reference import Setpoint, rest
 from sim_backend.arm import from_config
 
@@ -172,6 +173,15 @@ def test_friction_fed_forward_has_no_step_where_the_reference_turns_round(speed:
     slope = 0.8 * (np.array([0.5, 0.2]) / (0.02 * LIMITS.velocity) + np.array([0.3, 0.1]))
     one, other = (friction().torque(np.full(2, value)) for value in (speed, speed + more))
     assert (np.abs(other - one) <= slope * abs(more) + 1e-12).all()
+
+
+def test_friction_behind_dry_gears_turns_round_more_slowly_than_the_guard_allows() -> None:
+    dry = np.array([40.0, 40.0])
+    fed = FrictionFeedforward(ExpectedFriction(dry, np.zeros(2), np.zeros(2)), 0.8, MODEL.chain, LIMITS)
+    pace = np.linspace(-1.0, 1.0, 2001)[:, None] * LIMITS.velocity
+    steepest = (np.abs(np.diff(fed.torque(pace), axis=0)) / np.diff(pace, axis=0)).max(axis=0)
+    assert (steepest * LIMITS.acceleration <= 0.5 * TORQUE_RATE * (1.0 + 1e-9)).all()
+    assert (steepest * LIMITS.acceleration > 0.45 * TORQUE_RATE).all()
 
 
 def test_an_arm_with_far_less_friction_than_expected_comes_to_rest_without_hunting() -> None:
