@@ -156,6 +156,7 @@ def parameters_document(estimate: Estimate, described: ArmConfig | None = None) 
             "names": list(model.layout.names),
             "units": list(model.layout.units),
             "values": estimate.delta.tolist(),
+            **({} if estimate.nearest_to is None else {"nearest_to": estimate.nearest_to}),
         }
     apart = estimate.noise_deviations
     held = estimate.constrained_intervals

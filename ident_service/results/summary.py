@@ -10,6 +10,7 @@ import numpy as np
 from ident_service.estimation.doubt import IDENTIFIED_BELOW, NEGLIGIBLE_TORQUE, WEAK_BELOW
 from ident_service.estimation.identify import Candidate, Estimate
 from ident_service.estimation.least_squares import TorqueError
+from ident_service.model.likely_bodies import IN_WORDS
 from ident_service.results.rows_and_filter import how_fitted, wrapped
 
 
@@ -118,7 +119,8 @@ def _feasibility(estimate: Estimate) -> str:
     kind = estimate.conditions.kind
     if estimate.feasible:
         text = f"feasible ({kind}): margin {estimate.margin:.3g}, a real body could have these parameters\n"
-        text += "(motion shows base parameters only; the link values behind them are one body of many: see --prior)"
+        of_many = "" if estimate.nearest_to is None else f", the nearest to {IN_WORDS[estimate.nearest_to]}"
+        text += f"(motion shows base parameters only; the link values behind them are one body of many{of_many})"
         if estimate.tight:
             text += "\nthe data pull against:\n" + "\n".join(f"  {name}" for name in estimate.tight)
         return text

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cvxpy as cp
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible
 from ident_service.estimation.feasible.posing import EPSILON, Lift
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base import BaseParameters, base_parameters
+from ident_service.model.likely_bodies import likely_bodies
 
 KINDS: tuple[FeasibleSetName, ...] = ("inertia", "pseudo_inertia")
 
@@ -50,11 +53,16 @@ def test_every_body_with_the_same_base_parameters_leads_to_the_same_one(arm: str
         np.testing.assert_allclose(again, found, rtol=1e-7, atol=1e-9)
 
 
-def test_it_is_the_minimiser_that_another_solver_finds() -> None:
+@pytest.mark.parametrize(("likely", "moves"), [(False, False), (True, False), (True, True)])
+def test_it_is_the_minimiser_that_another_solver_finds(likely: bool, moves: bool) -> None:
     model, base = of("planar2")
+    bodies = likely_bodies(replace(model, prior=None)) if likely else None
+    rng = np.random.default_rng(2)
+    # Of moving parameters all but the last two, which are friction.
+    near = 30.0 * rng.normal(size=(base.size, base.size)) * (np.arange(base.size) < base.size - 2) if moves else None
     conditions = feasible_set("pseudo_inertia", base.names, model.config)
     start = feasibility_test(base.K @ model.layout.vector(model.config.driver.truth), base, conditions).delta  # type: ignore[union-attr, arg-type]
-    found = central(start, base, conditions)
+    found = central(start, base, conditions, bodies, near)
     delta = cp.Variable(len(start))
     terms = []
     inset = 0.5 * min(EPSILON, conditions.margin(start)[0])
@@ -63,15 +71,27 @@ def test_it_is_the_minimiser_that_another_solver_finds() -> None:
         if block.size == 0:
             terms.append(-cp.sum(cp.log(entries / block.references())))
             continue
-        root = np.sqrt(block.references())
+        root = np.diag(np.sqrt(block.references()))
+        if bodies is not None:
+            root = np.linalg.cholesky(symmetric(block.F @ bodies.delta + block.f, block.size))
+        inverse = np.linalg.inv(root)
         # Row by row of the matrix, each entry a linear combination of those of the upper triangle.
         picks = np.array([symmetric(unit, block.size).ravel() for unit in np.eye(len(block.f))]).T
         matrix = cp.reshape(picks @ entries, (block.size, block.size), order="C")
-        scaled = np.diag(1.0 / root) @ matrix @ np.diag(1.0 / root)
+        scaled = inverse @ matrix @ inverse.T
         terms.append(-cp.log_det(scaled) + cp.trace(scaled))
-    problem = cp.Problem(cp.Minimize(sum(terms)), [base.K @ delta == base.K @ start])
+    change, kept = base.K @ delta - base.K @ start, np.ones(base.size, dtype=bool)
+    if near is not None:
+        kept = ~near.any(axis=0)
+        # log(1 - |x|^2) as the determinant of [[1, x], [x^T, 1]].
+        x, one = cp.reshape(near @ change, (base.size, 1), order="C"), np.ones((1, 1))
+        terms.append(-cp.log_det(cp.bmat([[np.eye(base.size), x], [x.T, one]])))
+    problem = cp.Problem(cp.Minimize(sum(terms)), [change[np.flatnonzero(kept)] == 0.0])
     problem.solve(solver=cp.CLARABEL)
     assert problem.status == "optimal"
+    if near is not None:
+        moved = np.linalg.norm(near @ (base.K @ (found - start)))
+        assert 0.5 < moved < 1.0
     scale = np.array([reference(name) for name in base.names])
     np.testing.assert_allclose(delta.value / scale, found / scale, rtol=1e-3, atol=1e-3)
 

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 from real_data.conftest import Identified
 
-from benchmarks.real_data import CASES, Case, judged, violations
+from benchmarks.real_data import CASES, Case, case_estimate, judged, violations
 from ident_service.config.load import load_arm
+from ident_service.estimation.feasible.feasibility import constrained_least_squares
 from ident_service.estimation.identify import Estimate
+from ident_service.model.arm_model import arm_model
 
 pytestmark = pytest.mark.slow
 
@@ -28,6 +33,34 @@ def test_the_descriptions_say_nothing_of_how_to_identify(case: Case) -> None:
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.arm)
 def test_the_target_is_met_by_parameters_that_a_body_could_have(case: Case, identified: Identified) -> None:
     assert_met(case, identified(case.arm))
+
+
+def test_link_values_are_those_of_an_arm(shared: Path) -> None:
+    """The maker's table of the UR10 (7.1, 12.7, 4.3, 2.0, 2.0 and 0.4 kg); the description says nothing of masses."""
+    (case,) = (case for case in CASES if case.arm == "ur10")
+    estimate = case_estimate(case, None, "none", arm_model(load_arm(case.arm)))
+    assert estimate.nearest_to == "geometry"
+    assert estimate.delta is not None
+    layout = estimate.model.layout
+    bodies = [estimate.delta[layout.inertial(link)] for link in range(layout.joints)]
+    masses = np.array([body[-1] for body in bodies])
+    assert (masses > 0.3).all()
+    assert 20.0 < masses.sum() < 40.0  # 28.6 by the maker
+    assert masses[1] == masses.max()
+    assert 10.0 < masses[1] < 16.0
+    assert all(np.linalg.norm(body[6:9]) / body[-1] < 0.4 for body in bodies)
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.arm)
+def test_for_likely_link_values_no_parameter_moves_by_more_than_a_hundredth_of_its_deviation(
+    case: Case, identified: Identified
+) -> None:
+    estimate = identified(case.arm)
+    held = constrained_least_squares(estimate.fit, estimate.base, estimate.conditions)
+    moved = np.abs(estimate.beta - held.beta)
+    # What data do not see has no deviation, and does not move.
+    assert (moved <= 0.0101 * estimate.standard_deviations)[np.isfinite(estimate.standard_deviations)].all()
+    assert moved.max() > 0.0
 
 
 def test_the_entropic_prior_of_the_kuka_is_no_worse(identified: Identified) -> None:

@@ -6,11 +6,16 @@ its path, so on rounding and on the processor. The answer here does not: it mini
     f(delta) = sum_blocks -logdet(D_b(delta) - t 1) + sum_links tr(S_b^-1 D_b(delta))
     over all delta with K delta = beta and E delta + e = 0
 
-with S_b the reference scales of `blocks.py`, and t half of the paper's margin (eq. 21), so that where data press
-against the set no more than the other half is given up. The first sum is the barrier whose minimiser is the analytic
-centre (Boyd and Vandenberghe, *Convex Optimization*, 8.5.3); with the second, f is per link the entropic divergence
-from the reference body of 1 kg and 0.1 m (Lee, Wensing and Park 2020), so that nothing is drawn to infinity where
-nothing bounds a mass. f is strictly convex and self-concordant; Newton's method finds its minimiser to the last digits.
+with S_b what D_b is of a likely body where one is known, else the reference scales of `blocks.py`, and t half of the
+paper's margin (eq. 21), so that where data press against the set no more than the other half is given up. The first sum
+is the barrier whose minimiser is the analytic centre (Boyd and Vandenberghe, *Convex Optimization*, 8.5.3); with the
+second, f is per link the entropic divergence from the likely body, or from one of 1 kg and 0.1 m (Lee, Wensing and Park
+2020), so that nothing is drawn to infinity where nothing bounds a mass. f is strictly convex and self-concordant;
+Newton's method finds its minimiser to the last digits.
+
+Where data press against the set, the only bodies with exactly these base parameters are nearly points and rods. So an
+estimate's base parameters may move by far less than is known of them, K delta = beta + x with |N x| < 1, and f has the
+barrier -log(1 - |N x|^2) besides.
 """
 
 from __future__ import annotations
@@ -26,6 +31,7 @@ from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.feasible.posing import EPSILON, Lift
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
+from ident_service.model.likely_bodies import LikelyBodies
 
 _ITERATIONS = 200
 _CONVERGED = 1e-10  # Newton's decrement: the distance from the minimiser in the metric of f
@@ -53,24 +59,37 @@ class _Matrix:
     bounded: bool
 
 
-def central(delta: Array, base: BaseParameters, conditions: FeasibleSet) -> Array:
+def central(
+    delta: Array,
+    base: BaseParameters,
+    conditions: FeasibleSet,
+    likely: LikelyBodies | None = None,
+    near: Array | None = None,
+) -> Array:
     """Move link parameters to the centre of those with the same base parameters.
 
     Args:
         delta: inside the feasible set (margin above 0), SI units, shape (parameters,).
         base: grouping of the parameters.
         conditions: the feasible set.
+        likely: bodies to stay near to; ones of 1 kg and 0.1 m at each link's origin when None.
+        near: N above, shape (rows, base): base parameters with a column of zeros do not move; none moves when None.
 
     Returns:
-        Link parameters with the same base parameters to rounding, inside the set, shape (parameters,); `delta` itself
-        where rounding forbids a step.
+        Link parameters with the same base parameters to rounding, or as near to them as `near` says, inside the set,
+        shape (parameters,); `delta` itself where rounding forbids a step.
     """
-    free = Lift(base).of_dependent
+    lift = Lift(base)
+    N = np.zeros((0, base.size)) if near is None else near
+    moving = np.flatnonzero(np.any(N != 0.0, axis=0))
+    free = np.column_stack([lift.of_dependent, lift.of_beta[:, moving]])
+    N = np.column_stack([np.zeros((len(N), len(lift.dependent))), N[:, moving]])
     E, _ = conditions.equality_rows()
     if len(E):
-        free = free @ scipy.linalg.null_space(E @ free)
+        kept = scipy.linalg.null_space(E @ free)
+        free, N = free @ kept, N @ kept
     inset = _KEPT * min(EPSILON, conditions.margin(delta)[0])
-    matrices = [matrix for block in conditions.blocks for matrix in _matrices(block, delta, free, inset)]
+    matrices = [matrix for block in conditions.blocks for matrix in _matrices(block, delta, free, inset, likely)]
     y, before = np.zeros(free.shape[1]), np.inf
     for _ in range(_ITERATIONS if matrices else 0):
         # With D = L L^T and M_k = L^-1 dD/dy_k L^-T, f has the gradient -J^T r and the Hessian J^T J, where J has the
@@ -89,7 +108,10 @@ def central(delta: Array, base: BaseParameters, conditions: FeasibleSet) -> Arra
             rows.append(J)
             wanted.append((np.eye(len(L)) - (L.T @ L if matrix.bounded else 0.0)).ravel())
             moves.append(move)
-        J, r = np.vstack(rows), np.concatenate(wanted)
+        away = N @ y
+        left = 1.0 - float(away @ away)
+        J = np.vstack([*rows, np.sqrt(2.0 / left) * N, 2.0 / left * (away @ N)[None]])
+        r = np.concatenate([*wanted, -np.sqrt(2.0 / left) * away, np.zeros(1)])
         norms = np.linalg.norm(J, axis=0)
         unit = np.divide(1.0, norms, out=np.zeros(len(norms)), where=norms > 0.0)  # 0: no condition feels the direction
         step = unit * scipy.linalg.lstsq(J * unit, r, lapack_driver="gelsy")[0]
@@ -98,18 +120,29 @@ def central(delta: Array, base: BaseParameters, conditions: FeasibleSet) -> Arra
             break
         before = decrement
         along = [np.tensordot(step[matrix.directions], move, 1) for matrix, move in zip(matrices, moves, strict=True)]
-        y += _length(np.concatenate([np.linalg.eigvalsh(change) for change in along]), decrement) * step
+        changes = np.concatenate([np.linalg.eigvalsh(change) for change in along])
+        y += _length(changes, away, N @ step, decrement) * step
     found = np.asarray(delta + free @ y)
     return found if conditions.margin(found)[0] > 0.0 else delta
 
 
-def _length(changes: Array, decrement: float) -> float:
-    """Minimise f along Newton's step, where it is -sum log(1 + s mu) + s (sum mu - decrement^2), mu the `changes`."""
+def _length(changes: Array, away: Array, going: Array, decrement: float) -> float:
+    """Minimise f along Newton's step, with mu the `changes`, and |N x| that of `away` + s `going`.
+
+    There it is -sum log(1 + s mu) - log(1 - |N x|^2) and linear in s besides, with the slope -decrement^2 at 0.
+    """
+    c, b, a = float(away @ away), float(away @ going), float(going @ going)
+
+    def bound(s: float) -> float:
+        return 2.0 * (b + a * s) / (1.0 - c - 2.0 * b * s - a * s**2)
 
     def slope(s: float) -> float:
-        return float(np.sum(changes * (1.0 - 1.0 / (1.0 + s * changes)))) - decrement**2
+        barrier = float(np.sum(changes * (1.0 - 1.0 / (1.0 + s * changes))))
+        return barrier + bound(s) - bound(0.0) - decrement**2
 
     longest = min(_STEP / max(-float(changes.min()), np.finfo(float).tiny), _LONGEST)
+    if a > 0.0:  # to where |N x| is 1
+        longest = min(longest, _STEP * (np.sqrt(b**2 + a * (1.0 - c)) - b) / a)
     if slope(longest) < 0.0:
         return longest
     # f is convex: halving finds its minimum, without the 0.1 s in which scipy.optimize loads.
@@ -120,15 +153,13 @@ def _length(changes: Array, decrement: float) -> float:
     return 0.5 * (low + high)
 
 
-def _matrices(block: Block, delta: Array, free: Array, inset: float) -> list[_Matrix]:
+def _matrices(block: Block, delta: Array, free: Array, inset: float, likely: LikelyBodies | None) -> list[_Matrix]:
     """The block's matrix, or its numbers as matrices of one row, those that no direction changes left out."""
     values, slopes = block.F @ delta + block.f - inset * block.identity(), block.F @ free
     directions = np.flatnonzero(np.any(slopes != 0.0, axis=0))
     if block.size:
-        root = np.sqrt(block.references())
-        value, *found = (
-            symmetric(entries, block.size) / np.outer(root, root) for entries in (values, *slopes.T[directions])
-        )
+        G = np.linalg.inv(_root(block, likely))
+        value, *found = (G @ symmetric(entries, block.size) @ G.T for entries in (values, *slopes.T[directions]))
         return [_Matrix(value, directions, np.array(found), bounded=True)] if found else []
     scaled = [(value / unit, row / unit) for value, row, unit in zip(values, slopes, block.references(), strict=True)]
     return [
@@ -136,3 +167,17 @@ def _matrices(block: Block, delta: Array, free: Array, inset: float) -> list[_Ma
         for value, row in scaled
         if np.any(row != 0.0)
     ]
+
+
+def _root(block: Block, likely: LikelyBodies | None) -> Array:
+    """A root of S_b, shape (size, size)."""
+    scales = np.diag(np.sqrt(block.references()))
+    if likely is None:
+        return scales
+    inverse = np.linalg.inv(scales)
+    try:
+        return np.asarray(
+            scales @ np.linalg.cholesky(inverse @ symmetric(block.F @ likely.delta + block.f, block.size) @ inverse)
+        )
+    except np.linalg.LinAlgError:  # a condition that the likely bodies do not fulfil
+        return scales

@@ -24,6 +24,7 @@ from ident_service.estimation.feasible.posing import (
 from ident_service.estimation.least_squares import unit_columns
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
+from ident_service.model.likely_bodies import LikelyBodies
 
 _AT_TARGET = 1e-8  # of the target's size: a distance that is none
 # Weights of the distance (in units of the largest column) in the objective, in turn. A solve that was hard may have
@@ -60,10 +61,17 @@ class FeasibleEstimate:
     bound: float = np.inf
     penalty: float | None = None
 
-    def centred(self, base: BaseParameters, conditions: FeasibleSet) -> FeasibleEstimate:
-        """Return the same base parameters with the most central link parameters, see `central.py`."""
-        delta = central(self.delta, base, conditions)
-        return replace(self, delta=delta, margin=conditions.margin(delta)[0])
+    def centred(
+        self,
+        base: BaseParameters,
+        conditions: FeasibleSet,
+        likely: LikelyBodies | None = None,
+        near: Array | None = None,
+    ) -> FeasibleEstimate:
+        """Return the link parameters nearest to likely ones, with these base parameters or near ones: `central.py`."""
+        delta = central(self.delta, base, conditions, likely, near)
+        beta = self.beta if near is None else base.K @ delta
+        return replace(self, beta=beta, delta=delta, margin=conditions.margin(delta)[0])
 
 
 def hold(problem: ConicProblem, conditions: FeasibleSet, to_delta: Array, inside: Array) -> None:

@@ -1,0 +1,111 @@
+"""Bodies that an arm's links are likely to have: those of its prior, else rods of its geometry.
+
+Motion tells base parameters only, and many bodies move alike. Who looks at link values expects those of the arm: of all
+bodies behind the same base parameters the nearest to these is chosen (`estimation/feasible/central.py`). They are no
+knowledge: they change no base parameter and no verdict.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ident_service.config.workspace import Capsule
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.chain import Array
+from ident_service.model.layout import INERTIAL
+
+# Of industrial and research arms: castings, motors and gears fill about half of a link's outline with metal.
+_DENSITY = 1500.0  # kg/m^3
+_RADIUS = 0.05  # m, of the rods of an arm of 1 m without geometry; it grows with the root of the reach
+_LEAST_REACH = 0.1  # m; of mechanisms without lengths
+
+
+Source = Literal["prior", "geometry"]
+IN_WORDS: dict[Source, str] = {"prior": "the bodies of its prior", "geometry": "rods along its links"}
+
+
+@dataclass(frozen=True)
+class LikelyBodies:
+    """Link parameters to choose near to.
+
+    Attributes:
+        delta: SI units, shape (layout.size,); joint terms are zero.
+        source: whether all of them are the prior's, or some are guessed from geometry.
+    """
+
+    delta: Array
+    source: Source
+
+
+def likely_bodies(model: ArmModel) -> LikelyBodies:
+    """Say what bodies the links of an arm are likely to have.
+
+    A link whose prior is a real body has that one. Any other is a rod, of the description's capsules where it has some,
+    else along the lines from its joint to the next ones, with the bounds of its mass and of the arm's kept.
+    """
+    chain, layout = model.chain, model.layout
+    delta, guessed = np.zeros(layout.size), []
+    reach = max(float(np.linalg.norm([*chain.translation[1:], *chain.link_translation], axis=1).sum()), _LEAST_REACH)
+    for link, name in enumerate(chain.names):
+        place = layout.inertial(link)
+        if model.prior is not None and _is_body(model.prior[place]):
+            delta[place] = model.prior[place]
+            continue
+        rods = model.config.geometry.get(name) or _lines(model, link, _RADIUS * np.sqrt(reach))
+        parameters = sum((_rod(rod) for rod in rods), np.zeros(len(INERTIAL)))
+        joint = model.config.joints.get(name)
+        if joint is not None and joint.body.mass is not None:
+            parameters = parameters * (np.clip(parameters[-1], *joint.body.mass) / parameters[-1])
+        delta[place] = parameters
+        guessed.append(place)
+    total = model.config.constraints.total_mass
+    masses = sum(float(delta[place][-1]) for place in guessed)
+    known = sum(float(delta[layout.inertial(link)][-1]) for link in range(chain.joints)) - masses
+    if guessed:
+        # Of a prior that is heavier than the arm may be, nothing is left for the others; so a tenth of a guess.
+        left = np.inf if total.upper is None else total.upper - known
+        wanted = float(np.clip(masses, total.lower - known, left)) if left > 0.0 else 0.1 * masses
+        for place in guessed:
+            delta[place] *= wanted / masses
+    return LikelyBodies(delta, "geometry" if guessed else "prior")
+
+
+def _lines(model: ArmModel, link: int, radius: float) -> Sequence[Capsule]:
+    """The ways from a link's joint to the joints that it carries and to its own frame, in its frame."""
+    chain = model.chain
+    R, origin = chain.link_rotation[link], chain.link_translation[link]
+    ends = [chain.translation[child] for child, parent in enumerate(chain.parents) if parent == link]
+    points = [R.T @ (end - origin) for end in ends] or [np.zeros(3)]
+    begin = tuple((-R.T @ origin).tolist())
+    return [Capsule(start=begin, end=tuple(point.tolist()), radius=radius) for point in points]
+
+
+def _rod(rod: Capsule) -> Array:
+    """The inertial parameters of a homogeneous cylinder in place of a capsule, shape (10,), see `INERTIAL`."""
+    start, end = np.array(rod.start), np.array(rod.end)
+    way, r = end - start, rod.radius
+    distance = float(np.linalg.norm(way))
+    length = distance + r  # of a cylinder of about the capsule's volume
+    along = way / distance if distance > 0.0 else np.array([0.0, 0.0, 1.0])
+    m = _DENSITY * np.pi * r**2 * length
+    center = 0.5 * (start + end)
+    axis = np.outer(along, along)
+    second = m * (length**2 / 12.0 * axis + 0.25 * r**2 * (np.eye(3) - axis) + np.outer(center, center))
+    L = np.trace(second) * np.eye(3) - second
+    return np.array([L[0, 0], L[0, 1], L[0, 2], L[1, 1], L[1, 2], L[2, 2], *(m * center), m])
+
+
+def _is_body(parameters: Array) -> bool:
+    """Whether inertial parameters are those of a real body: their pseudo-inertia is positive definite."""
+    xx, xy, xz, yy, yz, zz, *first, m = parameters
+    if not m > 0.0:
+        return False
+    L = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    center = np.array(first) / m
+    spread = (0.5 * np.trace(L) * np.eye(3) - L) / m - np.outer(center, center)
+    size = float(np.linalg.norm(center)) + np.sqrt(max(float(np.trace(spread)), 0.0))
+    return bool(np.linalg.eigvalsh(spread)[0] > 1e-8 * size**2)
