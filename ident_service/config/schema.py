@@ -288,8 +288,12 @@ class FourierMotion(Section):
         return self
 
 
-class SeededMotion(Section):
-    """A random Fourier motion, the same for the same seed, scaled into the arm's limits with a share left over."""
+class SeededMotion(GrownSection):
+    """A random Fourier motion, the same for the same seed, scaled into the arm's limits with a share left over.
+
+    It is about the middle of the position limits, or about home. About home the torque, of which gravity takes its part
+    whatever `use` is, may take 70 % of its limit.
+    """
 
     kind: Literal["seeded"]
     seed: Seed
@@ -298,6 +302,8 @@ class SeededMotion(Section):
     periods: Count = 3
     ramp: NonNegative = 0.0
     use: Annotated[float, Field(gt=0, le=1)] = 0.7
+    about: Literal["middle", "home"] = "middle"
+    later = frozenset({"about"})
 
 
 Motion = Annotated[FourierMotion | SeededMotion, Field(discriminator="kind")]

@@ -15,6 +15,8 @@ from ident_service.excitation.fourier import FourierSeries
 from ident_service.excitation.path import FourierPath
 from ident_service.model.arm_model import ArmModel
 
+_HELD = 0.7  # of the torque limits, that a motion about home takes at most
+
 
 def excitation(
     model: ArmModel, purpose: Literal["identification", "validation"], *, checked: bool = True
@@ -47,7 +49,7 @@ def _seeded(motion: SeededMotion, model: ArmModel, limits: MotionLimits) -> Four
     """A random series, each joint scaled to use the same share of its tightest limit, then all of them for torque."""
     rng = np.random.default_rng(motion.seed)
     shape = (model.chain.joints, motion.harmonics)
-    middle = 0.5 * (limits.lower + limits.upper)
+    middle = limits.home if motion.about == "home" else 0.5 * (limits.lower + limits.upper)
     series = FourierSeries(motion.base_frequency, rng.normal(size=shape), rng.normal(size=shape), middle)
     asked = demands(FourierPath(series, 1, motion.ramp), model)
     room = np.minimum(limits.upper - middle, middle - limits.lower)
@@ -62,12 +64,14 @@ def _seeded(motion: SeededMotion, model: ArmModel, limits: MotionLimits) -> Four
     )
     factor = (motion.use / used)[:, None]
     series = FourierSeries(motion.base_frequency, series.a * factor, series.b * factor, middle)
+    most = motion.use if motion.about == "middle" else max(motion.use, _HELD)
     for _ in range(20):
         torque = demands(FourierPath(series, 1, motion.ramp), model).torque
-        if torque is None or bool(np.all(torque <= motion.use * limits.torque)):
+        if torque is None or bool(np.all(torque <= most * limits.torque)):
             return series
         series = series.scaled(0.8)
     raise MotionRefused(
-        f"{model.config.name}: gravity alone asks for more than {motion.use:.0%} of a torque limit around the middle "
-        "of the position limits; give a Fourier motion of your own under motions"
+        f"{model.config.name}: gravity alone asks for more than {most:.0%} of a torque limit around "
+        f"{'home' if motion.about == 'home' else 'the middle of the position limits'}; give a Fourier motion of your"
+        " own under motions"
     )

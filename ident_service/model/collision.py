@@ -102,6 +102,39 @@ class CollisionModel:
         )
 
 
+def share_touching(model: ArmModel, within: float, postures: int, seed: int) -> dict[tuple[str, str], float]:
+    """Say in which share of random postures the bodies of each pair touch, the moving link first.
+
+    Args:
+        model: of an arm, also of one whose bodies always touch.
+        within: nearer than this counts as touching [m].
+        postures: how many are drawn, within the position limits.
+        seed: of the draw.
+
+    Raises:
+        ModelError: geometry that does not fit the arm.
+    """
+    around = scene(model)
+    every = [contact for contacts in around.contacts for contact in contacts]
+    if not every:
+        return {}
+    mechanism = kinematics(around.chain)
+    data, (solids, found) = mechanism.createData(), geometry(around, every)
+    lower, upper = around.limits.T
+    drawn = np.random.default_rng(seed).uniform(lower, upper, size=(postures, around.chain.joints))
+    touching = np.zeros((postures, len(every)), dtype=bool)
+    for row, posture in zip(touching, drawn, strict=True):
+        pin.computeDistances(mechanism, data, solids, found, posture)
+        row[:] = [result.min_distance <= within for result in found.distanceResults]
+    shares, start = {}, 0
+    for contacts in around.contacts:
+        first, second = contacts[0]
+        pair = around.bodies[first].owner, around.bodies[second].owner
+        shares[pair] = float(touching[:, start : start + len(contacts)].any(axis=1).mean())
+        start += len(contacts)
+    return shares
+
+
 def kinematics(chain: Chain) -> pin.Model:
     """Where the joints carry what stands still in their frames; without masses."""
     model = pin.Model()

@@ -49,13 +49,12 @@ def likely_bodies(model: ArmModel) -> LikelyBodies:
     """
     chain, layout = model.chain, model.layout
     delta, guessed = np.zeros(layout.size), []
-    reach = max(float(np.linalg.norm([*chain.translation[1:], *chain.link_translation], axis=1).sum()), _LEAST_REACH)
     for link, name in enumerate(chain.names):
         place = layout.inertial(link)
         if model.prior is not None and _is_body(model.prior[place]):
             delta[place] = model.prior[place]
             continue
-        rods = model.config.geometry.get(name) or _lines(model, link, _RADIUS * np.sqrt(reach))
+        rods = model.config.geometry.get(name) or lines_of(model, link)
         parameters = sum((_rod(rod) for rod in rods), np.zeros(len(INERTIAL)))
         joint = model.config.joints.get(name)
         if joint is not None and joint.body.mass is not None:
@@ -74,14 +73,21 @@ def likely_bodies(model: ArmModel) -> LikelyBodies:
     return LikelyBodies(delta, "geometry" if guessed else "prior")
 
 
-def _lines(model: ArmModel, link: int, radius: float) -> Sequence[Capsule]:
-    """The ways from a link's joint to the joints that it carries and to its own frame, in its frame."""
+def lines_of(model: ArmModel, link: int) -> Sequence[Capsule]:
+    """Give capsules along the ways from a link's joint to the joints that it carries, in the link's frame.
+
+    Args:
+        model: of the arm.
+        link: its number.
+    """
     chain = model.chain
+    lengths = np.linalg.norm([*chain.translation[1:], *chain.link_translation], axis=1)
+    radius = _RADIUS * float(np.sqrt(max(float(lengths.sum()), _LEAST_REACH)))
     R, origin = chain.link_rotation[link], chain.link_translation[link]
     ends = [chain.translation[child] for child, parent in enumerate(chain.parents) if parent == link]
     points = [R.T @ (end - origin) for end in ends] or [np.zeros(3)]
     begin = tuple((-R.T @ origin).tolist())
-    return [Capsule(start=begin, end=tuple(point.tolist()), radius=radius) for point in points]
+    return [Capsule.model_validate({"from": begin, "to": tuple(point.tolist()), "radius": radius}) for point in points]
 
 
 def _rod(rod: Capsule) -> Array:

@@ -86,7 +86,8 @@ def arm_part(
     held = {name: _checked(model, name, value, file) for name, value in part.lock.items()}
     outside = {str(name) for name in model.names[1:]} - inside - set(held)
     held |= {name: _rest(model, name) for name in outside if name not in followers}
-    waiting = {name: one for name, one in followers.items() if name not in held}
+    # A joint without a link, or on another tree, stands in the file and not in the mechanism.
+    waiting = {name: one for name, one in followers.items() if name not in held and model.existJointName(name)}
     while ready := [name for name, one in waiting.items() if one.joint in held]:
         for name in ready:
             follower = waiting.pop(name)

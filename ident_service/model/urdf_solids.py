@@ -50,12 +50,19 @@ def urdf_solids(kinematics: Kinematics, chain: Chain, skip: frozenset[str]) -> l
             continue
         where = f"{file.name}: link {link.get('name')!r}"
         for element in elements:
-            placement = pin.SE3(rotation, translation) * _origin(element.find("origin"), where)
-            bodies.append(Body(owner, joint, _solid(element, placement.rotation, placement.translation, owner, where)))
+            placement = pin.SE3(rotation, translation) * origin_of(element.find("origin"), where)
+            bodies.append(
+                Body(owner, joint, solid_of(element, placement.rotation, placement.translation, owner, where))
+            )
     return bodies
 
 
-def _solid(collision: ET.Element, rotation: Array, center: Array, owner: str, where: str) -> Solid:
+def solid_of(collision: ET.Element, rotation: Array, center: Array, owner: str, where: str) -> Solid:
+    """Give the solid of a collision element that is placed so in its joint's frame; `owner` and `where` for errors.
+
+    Raises:
+        ModelError: a mesh, or a shape or number that cannot be read.
+    """
     geometry = collision.find("geometry")
     shape = next(iter(geometry), None) if geometry is not None else None
     if shape is None:
@@ -79,7 +86,8 @@ def _solid(collision: ET.Element, rotation: Array, center: Array, owner: str, wh
     raise ModelError(f"{where}: collision geometry {shape.tag!r} is none of box, sphere, cylinder, capsule")
 
 
-def _origin(origin: ET.Element | None, where: str) -> pin.SE3:
+def origin_of(origin: ET.Element | None, where: str) -> pin.SE3:
+    """Give the placement that an `<origin>` says, the identity without one; ModelError where it cannot be read."""
     if origin is None:
         return pin.SE3.Identity()
     return pin.SE3(

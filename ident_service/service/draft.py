@@ -1,0 +1,108 @@
+"""A description of an arm as it is drawn up, and as the YAML file that a person goes on with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import yaml
+
+RATE = 500.0  # Hz, at which most arms' gains are stable and a simulation is quick
+CLEARANCE = 0.02  # m
+FRICTION_GUESS = 0.04  # of the torque limits, what the description expects
+LARGEST_USE = 0.6  # share of the limits of the first motion that is tried
+
+
+@dataclass
+class Draft:
+    """What is decided, to be written as YAML.
+
+    Attributes:
+        name: of the arm.
+        urdf: name of the file beside the description.
+        part: `base`, `tip` and `lock` of its kinematics.
+        joints: keys of each joint.
+        geometry: capsules of links whose meshes are replaced.
+        may_touch: pairs that always touch.
+        prior: names and values where the URDF's bodies are not those of real links; empty where they are.
+        use: share of the limits that the motions take.
+        seeds: of the two motions.
+        truth: of the simulated arm.
+        remarks: what was guessed, for people.
+    """
+
+    name: str
+    urdf: str
+    part: dict[str, Any]
+    joints: dict[str, dict[str, Any]] = field(default_factory=dict)
+    geometry: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
+    may_touch: list[tuple[str, str]] = field(default_factory=list)
+    prior: dict[str, float] = field(default_factory=dict)
+    use: float = LARGEST_USE
+    seeds: tuple[int, int] = (1, 2)
+    truth: dict[str, float] = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)
+
+
+def short(value: float, digits: int = 4) -> float:
+    """A number as people write it."""
+    return float(f"{value:.{digits}g}")
+
+
+def in_yaml(draft: Draft) -> str:
+    """The description as YAML with comments."""
+    guessed = "\n".join(f"#   {line}" for line in draft.remarks)
+    head = f"""\
+# {draft.name}, begun by `ident new` from {draft.urdf}. Look through it before a real arm moves by it.
+{"# Guessed, as the URDF says nothing of it:" + chr(10) + guessed if guessed else "# Limits and bodies are the URDF's."}
+format: ident-arm
+version: 1
+name: {_flow(draft.name)}
+
+kinematics: {_flow(draft.part)}
+
+gravity: [0, 0, -9.81] # m/s^2 in the base frame: the arm stands upright
+terms: [drive_inertia, viscous, coulomb, offset]
+"""
+    units = (
+        "# rad, rad/s, rad/s^2, rad/s^3, N m; for slides m, m/s, m/s^2, m/s^3, N\n"
+        "# Accelerations, jerks, following errors, gains, home and the drives' inertias are guesses."
+    )
+    parts = [head]
+    if draft.joints:
+        rows = "".join(f"  {_flow(name)}:\n    {_flow(keys)}\n" for name, keys in draft.joints.items())
+        parts.append(f"{units}\njoints:\n{rows}")
+    if draft.prior:
+        parts.append(f"prior: # guessed from lengths; SI units, in the link frames\n  {_flow(draft.prior)}\n")
+    parts.append(f"control: {{rate: {RATE:g}}} # Hz\n")
+    if draft.geometry:
+        rows = "".join(f"  {_flow(name)}: {_flow(each)}\n" for name, each in draft.geometry.items())
+        parts.append(f"geometry: # m, in the link frames; around the URDF's meshes\n{rows}")
+    space: dict[str, Any] = {"clearance": CLEARANCE}
+    if draft.may_touch:
+        space["may_touch"] = [list(pair) for pair in draft.may_touch]
+    parts.append(
+        f"workspace: {_flow(space)} # m\n"
+        "# obstacles: {table: {half_space: {normal: [0, 0, 1], offset: -0.1}}} # what else must not be touched\n"
+    )
+    parts.append(
+        f"design: {{friction_guess: [{FRICTION_GUESS:g}, {FRICTION_GUESS:g}]}} # shares of the torque limits\n"
+    )
+    motion = {"kind": "seeded", "about": "home", "base_frequency": 0.1, "harmonics": 5, "periods": 2, "use": draft.use}
+    first, second = ({**motion, "seed": seed} for seed in draft.seeds)
+    parts.append(f"motions:\n  identification: {_flow(first)}\n  validation: {_flow(second)}\n")
+    torque = [keys["torque"] for keys in draft.joints.values()]
+    noise, step = ([short(share * value, 2) for value in torque] for share in (2e-3, 2e-4))
+    driver: dict[str, Any] = {
+        "kind": "simulated", "time": "virtual", "seed": 1, "truth": draft.truth, "encoder_resolution": 2e-5,
+        "torque_resolution": step, "torque_noise": noise, "delay_cycles": 1,
+    }  # fmt: skip
+    rows = "".join(f"  {key}: {_flow(value)}\n" for key, value in driver.items() if value or key == "seed")
+    parts.append(f"driver: # a simulated arm whose links, drives and friction are drawn about the prior's\n{rows}")
+    return "\n".join(parts)
+
+
+def _flow(value: Any) -> str:
+    """A value in YAML's flow style on as many lines as it needs, indented as a nested value."""
+    text = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10**6).strip()
+    return text.removesuffix("\n...").removesuffix("...").strip()

@@ -1,0 +1,406 @@
+"""A first description of an arm from its URDF: everything that a simulated run needs, guessed where nothing is known.
+
+What the URDF says is taken over; what it lacks is guessed as a careful person would, and said to be a guess in a
+comment. The simulated arm is another one than the prior: its links, drives and friction are drawn about it, so that
+identifying it shows what identification does. Before anything is written, the description is loaded, home and both
+motions are found clear, and the gains stable.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ident_service.config.limits import motion_limits
+from ident_service.config.load import load_arm
+from ident_service.config.quantities import TextFile
+from ident_service.config.workspace import BASE
+from ident_service.errors import ModelError, MotionRefused, UsageError
+from ident_service.excitation.plan import excitation
+from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.model.chain import Array
+from ident_service.model.collision import CollisionModel, share_touching
+from ident_service.model.likely_bodies import likely_bodies, lines_of
+from ident_service.model.mechanism import count_mechanism
+from ident_service.model.outline import mesh_capsules
+from ident_service.model.rigid_body import InverseDynamics
+from ident_service.motion.guard import TORQUE_RATE, TORQUE_RATE_SHARE
+from ident_service.motion.preflight.check import Verdict
+from ident_service.motion.preflight.plan import stability_check
+from ident_service.record.files import write_atomically
+from ident_service.service.commission import require_clear_from_home
+from ident_service.service.draft import CLEARANCE, LARGEST_USE, RATE, Draft, in_yaml, short
+
+_ARM = 3  # joints that make a branch an arm and not a gripper
+_TURN, _SLIDE = np.pi, 0.5  # rad and m either way, of joints without limits
+_VELOCITY = {True: 2.0, False: 0.3}  # rad/s, m/s
+_SECONDS = 0.25  # in which a joint reaches its velocity, at most acceleration
+_FOLLOWS = {True: 0.2, False: 0.05}  # rad, m
+_GAINS = ((400.0, 40.0), (225.0, 30.0), (100.0, 20.0), (49.0, 14.0))  # all of damping 1
+_LIGHT = 0.3  # of the torque limits, that holding home should take at most
+_HEAVY = 1.5  # times what holds the arm anywhere, that a torque limit should be at least
+_FRICTION = 0.03  # of the torque limit, Coulomb, and viscous at the velocity limit
+_DRIVE = 0.02  # s in which a geared drive alone would reach its velocity limit with its torque limit
+_RATE_SHARE = 0.15  # of the torque rate that the guard lets through, that a motion's jerk may ask for
+_POSTURES, _SEED = 300, 20140101
+_USES, _SEEDS = (
+    (LARGEST_USE, 0.4, 0.25, 0.15, 0.08),
+    range(1, 9),
+)  # shares of the limits and seeds of motions that are tried
+_GLANCES, _GLANCE = 200, 1.3  # postures of a motion that are looked at first, and clearances they must have
+# Share of postures from which links that touch are no collision, by the joints between them: capsules of links around a
+# shoulder or a wrist reach into each other.
+_TOUCHES, _ALWAYS = {2: 0.3, 3: 0.6}, 0.95
+
+
+@dataclass(frozen=True)
+class Said:
+    """What a URDF says of a joint; None where it says nothing that could be meant."""
+
+    position: tuple[float, float] | None
+    velocity: float | None
+    effort: float | None
+
+
+def new_description(
+    urdf: Path,
+    out: Path | None = None,
+    name: str | None = None,
+    base: str | None = None,
+    tip: str | None = None,
+    tell: Callable[[str], None] = lambda _: None,
+) -> tuple[Path, tuple[str, ...]]:
+    """Write the description of an arm, and its URDF beside it where that is elsewhere.
+
+    Args:
+        urdf: the file.
+        out: where the description goes; `NAME.yaml` in the present folder when None.
+        name: of the arm; that of the file when None.
+        base: link that the arm stands on; the root when None.
+        tip: link that it ends at; before the gripper of the longest branch when None.
+        tell: called with a line at each step.
+
+    Returns:
+        The description's path, and what was guessed.
+
+    Raises:
+        UsageError: no such file, or something is there where it would be written.
+        ModelError: not a URDF that holds an arm.
+        MotionRefused: no posture or motion is free of collisions.
+    """
+    if not urdf.is_file():
+        raise UsageError(f"{urdf}: no such file")
+    called = _plain(urdf.stem if name is None else name)
+    path = Path(f"{called}.yaml") if out is None else out
+    beside = path.parent / urdf.name
+    for there in (path, beside):
+        if there.exists() and not (there == beside and there.samefile(urdf)):
+            raise UsageError(f"{there}: exists already; give --out another place")
+    try:
+        text = urdf.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"{urdf}: cannot be read: {error}") from None
+    file = TextFile(name=urdf.name, text=text)
+    count_mechanism(file, "urdf")
+    draft = Draft(called, urdf.name, _part(text, file.name, base, tip))
+    with tempfile.TemporaryDirectory() as staging:
+        trial = Path(staging) / "arm.yaml"
+        shutil.copyfile(urdf, trial.with_name(urdf.name))
+
+        def loaded() -> ArmModel:
+            trial.write_text(in_yaml(draft), encoding="utf-8")
+            return arm_model(load_arm(trial))
+
+        tell("joints and bodies")
+        _joints(draft, loaded(), _said(text))
+        _bodies(draft, loaded, urdf.parent)
+        tell("a posture to begin in")
+        model = _home(draft, loaded)
+        _drives(draft, model)
+        tell("gains and motions")
+        _gains(draft, loaded)
+        _motions(draft, loaded)
+        loaded()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not beside.exists():
+        write_atomically(beside, text)
+    write_atomically(path, in_yaml(draft))
+    return path, tuple(draft.remarks)
+
+
+def _plain(name: str) -> str:
+    found = "".join(letter if letter.isalnum() or letter in "_-" else "_" for letter in name).strip("_-")
+    return found or "arm"
+
+
+def _part(text: str, file: str, base: str | None, tip: str | None) -> dict[str, Any]:
+    """Which part of the URDF is the arm: from `base`, or the root, along the branch with most joints to its gripper."""
+    try:
+        robot = ET.fromstring(text)  # noqa: S314 - counted before
+    except ET.ParseError as error:
+        raise ModelError(f"{file}: not well-formed XML: {error}") from None
+    part: dict[str, Any] = {"urdf": file}
+    if base is not None:
+        part["base"] = base
+    if tip is not None:
+        return part | {"tip": tip}
+    children: dict[str, list[tuple[str, str, bool]]] = {}
+    carried, leaders = set(), set()
+    for joint in robot.findall("joint"):
+        parent, child = (joint.find(role) for role in ("parent", "child"))
+        if parent is None or child is None:
+            continue
+        mimic = joint.find("mimic")
+        moves = joint.get("type") in ("revolute", "continuous", "prismatic") and mimic is None
+        if mimic is not None:
+            leaders.add(mimic.get("joint", ""))
+        children.setdefault(parent.get("link", ""), []).append((child.get("link", ""), joint.get("name", ""), moves))
+        carried.add(child.get("link", ""))
+    roots = [link.get("name", "") for link in robot.findall("link") if link.get("name", "") not in carried]
+    if base is None and len(roots) != 1:
+        raise ModelError(f"{file}: {len(roots)} links hang on no joint; name the arm's --base")
+
+    def depth(link: str) -> int:
+        return max((moves + depth(child) for child, _, moves in children.get(link, [])), default=0)
+
+    link, branched = roots[0] if base is None else base, False
+    while True:
+        ways = [(moves + depth(child), child, name, moves) for child, name, moves in children.get(link, [])]
+        ways = [way for way in ways if way[0] > 0]
+        if not ways:
+            break
+        longest = max(ways, key=lambda way: way[0])
+        count, onward, joint_name, moves = longest
+        # Where branches part that are no arms, or a joint leads others by mimicry, the gripper begins.
+        if count < _ARM and (len(ways) > 1 or (moves and joint_name in leaders)):
+            branched = True
+            break
+        branched = branched or len(ways) > 1 or len(children.get(link, [])) > 1
+        link = onward
+    return part | {"tip": link} if branched else part
+
+
+def _said(text: str) -> dict[str, Said]:
+    found = {}
+    for joint in ET.fromstring(text).findall("joint"):  # noqa: S314 - counted before
+        limit = joint.find("limit")
+
+        def number(key: str, limit: ET.Element | None = limit) -> float | None:
+            try:
+                value = float(limit.get(key, "nan")) if limit is not None else float("nan")
+            except ValueError:
+                return None
+            return value if np.isfinite(value) else None
+
+        lower, upper = number("lower"), number("upper")
+        ranged = lower is not None and upper is not None and lower < upper and joint.get("type") != "continuous"
+        position = (float(lower or 0.0), float(upper or 0.0)) if ranged else None
+        velocity, effort = number("velocity"), number("effort")
+        found[joint.get("name", "")] = Said(
+            position,
+            velocity if velocity is not None and 0.0 < velocity < 100.0 else None,
+            effort if effort is not None and 0.0 < effort < 1e5 else None,
+        )
+    return found
+
+
+def _joints(draft: Draft, model: ArmModel, said: Mapping[str, Said]) -> None:
+    """Limits of every joint: the URDF's, else guesses; torque limits that can hold the arm."""
+    chain = model.chain
+    if model.prior is None:
+        likely = likely_bodies(model)
+        draft.prior = _table(model, likely.delta)
+        draft.remarks.append("bodies: the URDF has none that could be real; they are guessed from its lengths")
+        model = ArmModel(model.config, model.chain, model.layout, likely.delta)
+    ranges = [
+        (said[name].position if name in said else None) or ((-_TURN, _TURN) if turns else (-_SLIDE, _SLIDE))
+        for name, turns in zip(chain.names, chain.revolute, strict=True)
+    ]
+    gravity, inertia = _worst(model, ranges)
+    for k, name in enumerate(chain.names):
+        turns, one = chain.revolute[k], said.get(name, Said(None, None, None))
+        velocity = one.velocity or _VELOCITY[turns]
+        acceleration = velocity / _SECONDS
+        torque = one.effort or _HEAVY * (gravity[k] + 2.0 * inertia[k] * acceleration)
+        if torque < _HEAVY * gravity[k]:
+            draft.remarks.append(f"{name}: its effort limit of {torque:g} hardly holds the arm ({gravity[k]:.3g})")
+        drive = _DRIVE * torque / velocity
+        acceleration = min(acceleration, max(0.3 * torque / (inertia[k] + drive), 0.1 * velocity / _SECONDS))
+        rate = min(TORQUE_RATE, TORQUE_RATE_SHARE * torque)
+        jerk = min(10.0 * acceleration, _RATE_SHARE * rate / (inertia[k] + drive))
+        missing = [
+            key
+            for key, value in (("position", one.position), ("velocity", one.velocity), ("torque", one.effort))
+            if value is None
+        ]
+        if missing:
+            draft.remarks.append(f"{name}: {', '.join(missing)} limit guessed; the URDF has none")
+        draft.joints[name] = {
+            "position": [short(value) for value in ranges[k]],
+            "velocity": short(velocity),
+            "acceleration": short(acceleration),
+            "jerk": short(jerk),
+            "torque": short(torque),
+            "following_error": _FOLLOWS[turns],
+            "home": short(min(max(0.0, ranges[k][0]), ranges[k][1])),
+            "kp": _GAINS[0][0],
+            "kd": _GAINS[0][1],
+            "drive_inertia": short(drive, 3),
+        }
+
+
+def _prior(model: ArmModel) -> Array:
+    if model.prior is None:
+        raise ModelError(f"{model.config.name}: no bodies")
+    return model.prior
+
+
+def _worst(model: ArmModel, ranges: list[tuple[float, float]]) -> tuple[Array, Array]:
+    """Largest torque of gravity, and largest inertia of each joint, over random postures."""
+    low, high = np.array(ranges).T
+    dynamics = InverseDynamics(model.chain, model.layout, _prior(model))
+    still, gravity, inertia = np.zeros(model.chain.joints), np.zeros(model.chain.joints), np.zeros(model.chain.joints)
+    for q in np.random.default_rng(_SEED).uniform(low, high, size=(_POSTURES, model.chain.joints)):
+        gravity = np.maximum(gravity, np.abs(dynamics.torque(q, still, still)))
+        inertia = np.maximum(inertia, np.diag(dynamics.mass_matrix(q)))
+    return gravity, inertia
+
+
+def _bodies(draft: Draft, loaded: Callable[[], ArmModel], folder: Path) -> None:
+    """Capsules in place of meshes, and pairs that touch whatever the arm does."""
+    model = loaded()
+    chain = model.chain
+    capsules, unread = mesh_capsules(model.config.kinematics, chain, folder)
+    for owner in unread:
+        if owner not in capsules:
+            capsules[owner] = list(lines_of(model, chain.names.index(owner))) if owner != BASE else []
+    for owner, found in capsules.items():
+        draft.geometry[owner] = [one.model_dump(by_alias=True, mode="json") for one in found]
+    if unread:
+        draft.remarks.append(f"geometry: no mesh of {', '.join(unread)} could be read; capsules are guessed")
+    model = loaded()
+    inner = (BASE, *chain.names)
+    for (moving, other), share in share_touching(model, 2.0 * CLEARANCE, _POSTURES, _SEED).items():
+        path = [0, *(joint + 1 for joint in chain.ancestors(chain.names.index(moving)))]
+        between = len(path) - 1 - path.index(inner.index(other)) if inner.index(other) in path else None
+        if share >= (_ALWAYS if between is None else _TOUCHES.get(between, _ALWAYS)):
+            draft.may_touch.append((moving, other))
+    if draft.may_touch:
+        pairs = ", ".join(" and ".join(pair) for pair in draft.may_touch)
+        draft.remarks.append(f"geometry: {pairs} touch in most postures, as their capsules are; they are not checked")
+
+
+def _home(draft: Draft, loaded: Callable[[], ArmModel]) -> ArmModel:
+    """Choose where motions begin: zero, the middle, or what is most free of random postures; and keep it."""
+    model = loaded()
+    limits = motion_limits(model.config)
+    low, high = limits.lower, limits.upper
+    margin = 0.15 * (high - low)
+    middle = 0.5 * (low + high)
+    drawn = np.random.default_rng(_SEED).uniform(low + margin, high - margin, size=(_POSTURES, len(low)))
+    postures = np.vstack([np.clip(0.0, low + margin, high - margin), middle, 0.5 * (drawn + middle), drawn])
+    collision = CollisionModel(model)
+    distances = collision.distances(postures)
+    free = distances.min(axis=1) if distances.shape[1] else np.full(len(postures), np.inf)
+    dynamics, still = InverseDynamics(model.chain, model.layout, _prior(model)), np.zeros(len(low))
+    held = np.array([np.max(np.abs(dynamics.torque(q, still, still)) / limits.torque) for q in postures])
+    good = (free >= 3.0 * CLEARANCE) & (held <= _LIGHT)
+    if good.any():
+        place = int(np.argmax(good))
+    else:  # the lightest of those that have room, or what has most
+        roomy = free >= min(3.0 * CLEARANCE, float(free.max()))
+        place = int(np.argmin(np.where(roomy, held, np.inf)))
+    if not (free[place] > CLEARANCE and held[place] <= 1.0 / _HEAVY):
+        pair = collision.pairs[int(np.argmin(distances[place]))] if len(collision.pairs) else "gravity"
+        raise MotionRefused(
+            f"{draft.name}: none of {len(postures)} postures is clear and can be held ({pair}); is the URDF in metres"
+            " and radians, and does its root stand on the ground?"
+        )
+    for name, value in zip(draft.joints, postures[place], strict=True):
+        draft.joints[name]["home"] = round(float(value), 2)
+    return loaded()
+
+
+def _drives(draft: Draft, model: ArmModel) -> None:
+    """Draw the simulated arm: links about the prior's, drives and friction of their own."""
+    rng = np.random.default_rng(_SEED)
+    chain, layout, prior = model.chain, model.layout, _prior(model)
+    limits = motion_limits(model.config)
+    drives = np.array([joint["drive_inertia"] for joint in draft.joints.values()])
+    delta = prior.copy()
+    for link in range(chain.joints):
+        place = layout.inertial(link)
+        delta[place] = drawn_about(prior[place], rng)
+    shares = 1.0 + 0.3 * rng.uniform(-1.0, 1.0, size=(3, chain.joints))
+    delta[layout.term_columns("drive_inertia")] = drives * shares[0]
+    delta[layout.term_columns("viscous")] = _FRICTION * limits.torque / limits.velocity * shares[1]
+    delta[layout.term_columns("coulomb")] = _FRICTION * limits.torque * shares[2]
+    delta[layout.term_columns("offset")] = 0.1 * _FRICTION * limits.torque * rng.uniform(-1.0, 1.0, chain.joints)
+    draft.truth = _table(model, delta)
+
+
+def drawn_about(parameters: Array, rng: np.random.Generator) -> Array:
+    """Draw a real body about another one: A P A^T with A near the identity, so masses within about a tenth.
+
+    Args:
+        parameters: of a real body, shape (10,), see `INERTIAL`.
+        rng: where the draw comes from.
+    """
+    xx, xy, xz, yy, yz, zz, x, y, z, m = parameters
+    L = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    P = np.empty((4, 4))
+    P[:3, :3], P[:3, 3], P[3, :3], P[3, 3] = 0.5 * np.trace(L) * np.eye(3) - L, (x, y, z), (x, y, z), m
+    size = np.sqrt(np.trace(P[:3, :3]) / m)
+    A = np.eye(4) + 0.05 * rng.uniform(-1.0, 1.0, size=(4, 4))
+    A[:3, 3] *= size
+    A[3, :3] = 0.0
+    P = A @ P @ A.T
+    L = np.trace(P[:3, :3]) * np.eye(3) - P[:3, :3]
+    return np.array([L[0, 0], L[0, 1], L[0, 2], L[1, 1], L[1, 2], L[2, 2], *P[:3, 3], P[3, 3]])
+
+
+def _gains(draft: Draft, loaded: Callable[[], ArmModel]) -> None:
+    for kp, kd in _GAINS:
+        for joint in draft.joints.values():
+            joint.update(kp=kp, kd=kd)
+        model = loaded()
+        if stability_check(model, motion_limits(model.config), None).verdict is Verdict.PASSED:
+            return
+    draft.remarks.append(f"gains: not stable at {RATE:g} Hz even at kp {kp:g}; see `ident config check`")
+
+
+def _motions(draft: Draft, loaded: Callable[[], ArmModel]) -> None:
+    """Choose the largest motions about home that keep limits and clearance."""
+    refused: MotionRefused | None = None
+    collision = CollisionModel(loaded())
+    for use in _USES:
+        draft.use, found = use, list[int]()
+        for seed in _SEEDS:
+            draft.seeds = (seed, seed)
+            model = loaded()
+            try:
+                # A glance, before all of the way is proven.
+                path = excitation(model, "identification", checked=False).path
+                seen = collision.distances(path.at(np.linspace(0.0, path.duration, _GLANCES))[0])
+                if seen.min(initial=np.inf) < _GLANCE * CLEARANCE:
+                    raise MotionRefused(f"{collision.pairs[int(seen.min(axis=0).argmin())]} come too near")
+                require_clear_from_home(model, excitation(model, "identification"))
+            except MotionRefused as error:
+                refused = error
+                continue
+            found.append(seed)
+            if len(found) == 2:
+                draft.seeds = (found[0], found[1])
+                return
+    raise MotionRefused(f"{draft.name}: no motion of {len(_SEEDS)} keeps its limits and clearance; the last: {refused}")
+
+
+def _table(model: ArmModel, delta: Array) -> dict[str, float]:
+    return {name: short(value, 7) for name, value in zip(model.layout.names, delta.tolist(), strict=True) if value}

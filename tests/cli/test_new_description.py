@@ -1,0 +1,161 @@
+"""`ident new`: a URDF becomes a description that simulates, says what it guessed, and leaves nothing half-written."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from model.test_locked_joints import PANDA, joint, link
+
+from ident_service.cli import main
+from ident_service.config.load import load_arm
+from ident_service.config.simulation import SimulatedDriver
+from ident_service.errors import ModelError
+from ident_service.model.arm_model import arm_model
+from ident_service.model.outline import capsule_around
+from ident_service.model.rigid_body import inertia_from_delta
+from ident_service.service.new_description import _part, drawn_about
+
+
+def box_stl(x: float, y: float, z: float) -> bytes:
+    """A binary STL of a box about the origin with these half edges [m]."""
+    corners = np.array([[i, j, k] for i in (-x, x) for j in (-y, y) for k in (-z, z)])
+    faces = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1)]
+    faces += [(2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]
+    rows = [struct.pack("<12fH", 0, 0, 0, *corners[list(face)].ravel(), 0) for face in faces]
+    return b"\0" * 80 + struct.pack("<I", len(faces)) + b"".join(rows)
+
+
+MESH = (
+    '<collision><origin xyz="0.15 0 0"/><geometry><mesh filename="package://boxes/bar.stl" scale="2 1 1"/></geometry>'
+    "</collision></link>"
+)
+BARS = (
+    '<?xml version="1.0"?><robot name="bars">'
+    + '<link name="base_link"/>'
+    + link("upper", 2.0).replace("</link>", MESH)
+    + link("lower", 1.0).replace("</link>", MESH)
+    + joint("shoulder", "revolute", "base_link", "upper", "0 0 0.3 1.5708 0 0")
+    + joint("elbow", "revolute", "upper", "lower", "0.4 0 0 0 0 0")
+    + "</robot>"
+)
+
+
+@pytest.mark.slow
+def test_a_stock_urdf_simulates_without_an_edit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "stock").mkdir()
+    (tmp_path / "stock" / "panda.urdf").write_text(PANDA)
+    assert main(["new", "stock/panda.urdf", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["description"] == "panda.yaml"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["panda.urdf", "panda.yaml", "stock"]
+    config = load_arm(tmp_path / "panda.yaml")
+    # The hand's fingers are held; the limits are the file's.
+    assert len(config.joints) == 7
+    assert all(one.position == (-2.9, 2.9) and one.torque == 87.0 for one in config.joints.values())
+    assert main(["config", "check", "panda.yaml"]) == 0
+    assert main(["simulate", "panda.yaml", "--out", "run", "--state", "state"]) == 0
+    scored = json.loads((tmp_path / "run" / "score.json").read_text())
+    assert scored["noise_free_torque_error_percent"] < 1.0
+    # The truth is another arm than the prior.
+    driver = config.driver
+    assert isinstance(driver, SimulatedDriver)
+    assert driver.truth is not None
+    model = arm_model(config)
+    assert model.prior is not None
+    truth = model.layout.vector(driver.truth)
+    masses = [model.layout.inertial(k).stop - 1 for k in range(7)]
+    shares = truth[masses] / model.prior[masses]
+    assert (shares > 0.8).all()
+    assert (shares < 1.25).all()
+    assert np.abs(shares - 1.0).max() > 0.01
+
+
+@pytest.mark.slow
+def test_meshes_become_capsules_around_them(tmp_path: Path) -> None:
+    folder = tmp_path / "boxes" / "urdf"
+    folder.mkdir(parents=True)
+    (tmp_path / "boxes" / "bar.stl").write_bytes(box_stl(0.06, 0.03, 0.02))
+    (folder / "bars.urdf").write_text(BARS)
+    assert main(["new", str(folder / "bars.urdf"), "--out", str(tmp_path / "arm" / "bars.yaml")]) == 0
+    geometry = load_arm(tmp_path / "arm" / "bars.yaml").geometry
+    for owner in ("shoulder", "elbow"):
+        (capsule,) = geometry[owner]
+        # The scale makes it 0.12 m either way along x, about 0.15 m.
+        assert sorted((capsule.start[0], capsule.end[0])) == pytest.approx([0.03, 0.27], abs=0.002)
+        assert capsule.radius == pytest.approx(np.hypot(0.03, 0.02), abs=0.002)
+
+
+def test_what_is_there_is_not_written_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "panda.urdf").write_text(PANDA)
+    (tmp_path / "panda.yaml").write_text("mine")
+    assert main(["new", str(tmp_path / "panda.urdf"), "--out", str(tmp_path / "panda.yaml")]) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert (tmp_path / "panda.yaml").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "words"),
+    [
+        ("no xml", 1, "not a URDF that can be read"),
+        ('<robot name="x"><link name="a"/></robot>', 1, "no movable joint"),
+        ('<robot name="x"><link name="a"/><link name="b"/></robot>', 1, "2 links hang on no joint"),
+    ],
+)
+def test_a_file_that_holds_no_arm_leaves_nothing(
+    text: str, code: int, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "x.urdf").write_text(text)
+    assert main(["new", str(tmp_path / "x.urdf"), "--out", str(tmp_path / "new" / "x.yaml")]) == code
+    assert words in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["x.urdf"]
+
+
+def tree(*joints: tuple[str, str, str, str]) -> str:
+    names = dict.fromkeys(name for _, parent, child, _ in joints for name in (parent, child))
+    links = "".join(link(name, 1.0) for name in names)
+    return (
+        '<robot name="t">' + links + "".join(joint(n, k, p, c, "0 0 0.1 0 0 0") for n, p, c, k in joints) + "</robot>"
+    )
+
+
+def test_the_arm_is_the_longest_branch_and_ends_where_its_gripper_begins() -> None:
+    arm = [(f"j{k}", f"l{k}", f"l{k + 1}", "revolute") for k in range(5)]
+    assert _part(tree(*arm), "t", None, None) == {"urdf": "t"}
+    fingers = [("f1", "l5", "f1", "prismatic"), ("f2", "l5", "f2", "prismatic")]
+    assert _part(tree(*arm, *fingers), "t", None, None)["tip"] == "l5"
+    other = [(f"o{k}", "l0" if k == 0 else f"o{k}", f"o{k + 1}", "revolute") for k in range(3)]
+    assert _part(tree(*arm, *other), "t", None, None)["tip"] == "l5"
+    assert _part(tree(*arm), "t", "l1", "l3") == {"urdf": "t", "base": "l1", "tip": "l3"}
+    with pytest.raises(ModelError, match="--base"):
+        _part(tree(*arm, ("p", "elsewhere", "else", "revolute")), "t", None, None)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_drawn_body_is_real_and_near(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    body = np.array([0.3, 0.01, -0.02, 0.4, 0.03, 0.2, 0.1, -0.2, 0.3, 4.0])
+    drawn = drawn_about(body, rng)
+    inertia = inertia_from_delta(drawn)
+    assert np.linalg.eigvalsh(0.5 * np.trace(inertia.inertia) * np.eye(3) - inertia.inertia)[0] > 0.0
+    assert 0.85 < drawn[9] / body[9] < 1.15
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(2, 40))
+def test_a_capsule_encloses_its_points(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(count, 3)) * rng.uniform(0.01, 0.5, size=3) + rng.normal(size=3)
+    capsule = capsule_around(points)
+    start, end = np.array(capsule.start), np.array(capsule.end)
+    way = end - start
+    share = np.clip((points - start) @ way / max(way @ way, 1e-12), 0.0, 1.0)
+    apart = np.linalg.norm(points - start - share[:, None] * way, axis=1)
+    assert (apart <= capsule.radius + 5e-4).all()
