@@ -20,6 +20,7 @@ def body(kind: str, text: str) -> dict[str, object]:
     return {"description": ARM.format(kind=kind), "files": {"arm.xml": text}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "text", "message"),
     [

@@ -66,6 +66,7 @@ def test_every_operation_is_explained_by_examples_that_are_good(daemon: Asked) -
     assert len(set(summaries)) >= len(summaries) - 2, sorted(summaries)
 
 
+@pytest.mark.slow
 def test_what_an_example_asks_for_is_understood(daemon: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patched:
         patched.setattr(daemon.service.engine, "_look", lambda: None)  # nothing begins

@@ -78,6 +78,7 @@ def drawn(setting: Setting, kind: str, weight: float | str) -> Estimate:
 # The prior.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["euclidean", "entropic"])
 def test_a_prior_draws_as_strongly_as_its_weight(setting: Setting, plain: Estimate, kind: str) -> None:
     assert setting.model.prior is not None
@@ -291,6 +292,7 @@ def test_columns_of_a_foreign_header(setting: Setting, capsys: pytest.CaptureFix
     assert "no column for tau1" in mistake["error"]["message"]
 
 
+@pytest.mark.slow
 def test_delay_by_the_command(setting: Setting, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     path = written(made(setting.model, setting.delta, 2, late=0.0061), tmp_path / "late.csv")
     words = ("identify", path, "--arm", setting.arm, "--out")

@@ -54,6 +54,7 @@ def identified(velocity: str, recording: SampledRecording, **more: object) -> Es
     return identify(with_options(model, options), [recording])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["butterworth", "savitzky_golay"])
 def test_fine_velocities_beside_coarse_positions_are_chosen(method: str) -> None:
     recording = noisy(*arm())

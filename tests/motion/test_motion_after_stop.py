@@ -213,6 +213,7 @@ def test_an_arm_is_lowered_without_a_word_where_its_description_says_so() -> Non
     assert (rig.moves_when_left() < 0.02).all()
 
 
+@pytest.mark.slow
 def test_the_floor_ends_a_lowering() -> None:
     low = -0.3
     rig = Rig(loose("lower", control={"after_stop": "lower", "floor": low}))
@@ -265,6 +266,7 @@ def test_a_controlled_stop_after_a_fault_is_held_too() -> None:
     assert [fault.code for fault in rig.latch.faults] == ["late_cycles"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("after", ["hold", "lower"])
 def test_an_arm_that_does_not_follow_is_lowered_until_it_rests(after: str) -> None:
     rig = Rig(loose(after), Fault(400, FaultKind.LOAD_ATTACHED, size=4.0))
