@@ -16,7 +16,6 @@ from ident_service.model.base import base_from_expressions, base_parameters
 from ident_service.model.layout import INERTIAL
 
 
-@pytest.mark.slow
 @settings(max_examples=15)
 @given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 5), square=st.booleans())
 def test_real_bodies_are_proven_feasible(seed: int, joints: int, square: bool) -> None:
@@ -34,7 +33,6 @@ def test_real_bodies_are_proven_feasible(seed: int, joints: int, square: bool) -
             assert verification.verdict == "feasible", verification.message
 
 
-@pytest.mark.slow
 @settings(max_examples=10)
 @given(seed=st.integers(0, 2**32 - 1), square=st.booleans())
 def test_impossible_bodies_are_proven_infeasible(seed: int, square: bool) -> None:

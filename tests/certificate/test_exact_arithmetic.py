@@ -35,7 +35,6 @@ def gram(factor: Matrix) -> Matrix:
     return [[sum((a * b for a, b in zip(x, y, strict=True)), Fraction(0)) for y in factor] for x in factor]
 
 
-@pytest.mark.slow
 @given(matrices(4, 2))
 def test_a_gram_matrix_of_low_rank_is_semidefinite_and_not_definite(factor: Matrix) -> None:
     assert is_positive_semidefinite(gram(factor))

@@ -45,6 +45,7 @@ def commands() -> Iterator[list[str]]:
                 yield words[words.index("ident", words.index("--volume") + 4) + 1 :]
 
 
+@pytest.mark.slow
 def test_every_command_is_understood() -> None:
     found = list(commands())
     assert len(found) > 20

@@ -45,6 +45,7 @@ def verbs() -> dict[str, Parser]:
     return dict(below(parser()))
 
 
+@pytest.mark.slow
 def test_every_verb_is_done_by_a_daemon_or_says_why_not() -> None:
     done, carried = table()
     assert len(verbs()) > 45

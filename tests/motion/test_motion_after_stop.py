@@ -244,6 +244,7 @@ def test_a_joint_at_the_end_of_its_range_rests_there() -> None:
     assert rig.latch.faults == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "code"), [(FaultKind.DRIVE_FAULT, "drive_fault"), (FaultKind.NODE_SILENT, "feedback_gone")]
 )

@@ -240,7 +240,6 @@ def test_the_extent_of_any_pieces_is_where_they_lead(seed: int) -> None:
     np.testing.assert_allclose(highest, position.max(axis=0), atol=5e-3)
 
 
-@pytest.mark.slow
 @settings(max_examples=30)
 @given(SEEDS)
 def test_the_extent_of_a_stop_is_where_it_goes(seed: int) -> None:
