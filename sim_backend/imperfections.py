@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from drivers.arm import Vector
+from drivers.arm import Flags, Vector
 from ident_service.errors import DriverError
 
 
@@ -47,21 +47,41 @@ class Imperfections:
 
     def encode(self, position: Vector) -> Vector:
         """The position an encoder shows, a new array of shape (joints,)."""
-        return _in_steps(position, self.encoder_resolution)
+        return _in_steps(position, self._encoder_steps)
 
     def drive(self, torque: Vector) -> Vector:
         """The torque a drive can make of a request, a new array of shape (joints,)."""
-        return np.asarray(np.minimum(np.maximum(_in_steps(torque, self.torque_resolution), -self._reach), self._reach))
+        least, most = self._range
+        return np.asarray(np.minimum(np.maximum(_in_steps(torque, self._torque_steps), least), most))
 
     @cached_property
-    def _reach(self) -> Vector:
-        """The largest whole step inside the limit, because rounding could lead out of it again."""
+    def _encoder_steps(self) -> _Steps:
+        return _steps(self.encoder_resolution)
+
+    @cached_property
+    def _torque_steps(self) -> _Steps:
+        return _steps(self.torque_resolution)
+
+    @cached_property
+    def _range(self) -> tuple[Vector, Vector]:
+        """The largest whole steps inside the limits, because rounding could lead out of them again."""
         step, limit = self.torque_resolution, self.torque_limit
         whole = np.where(step > 0.0, step, 1.0)
         # A limit that is a whole number of steps must stay one when their quotient is rounded down.
-        return np.where(step > 0.0, np.floor(limit / whole * (1.0 + 1e-12)) * whole, limit)
+        reach = np.where(step > 0.0, np.floor(limit / whole * (1.0 + 1e-12)) * whole, limit)
+        return -reach, reach
 
 
-def _in_steps(value: Vector, step: Vector) -> Vector:
-    whole = np.where(step > 0.0, step, 1.0)
-    return np.where(step > 0.0, np.rint(value / whole) * whole, value)
+# Where values have steps, or None where all have; and the steps, 1 where a value is continuous.
+_Steps = tuple[Flags | None, Vector]
+
+
+def _steps(step: Vector) -> _Steps:
+    stepped = step > 0.0
+    return None if stepped.all() else stepped, np.where(stepped, step, 1.0)
+
+
+def _in_steps(value: Vector, steps: _Steps) -> Vector:
+    stepped, step = steps
+    whole: Vector = np.rint(value / step) * step
+    return whole if stepped is None else np.where(stepped, whole, value)

@@ -8,6 +8,7 @@ Boundary: pure functions of time; whether an arm may move so is `demands.py`'s q
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -56,7 +57,7 @@ class FourierSeries:
 
     def derivatives(self, time: Array, highest: int) -> list[Array]:
         """Position and its time derivatives up to the order `highest`, each of shape (samples, joints)."""
-        rates = 2.0 * np.pi * self.base_frequency * np.arange(1, self.a.shape[1] + 1)
+        rates = self._rates
         phase = time[..., None] * rates
         sine, cosine = np.sin(phase), np.cos(phase)
         a, b = self.a.T, self.b.T
@@ -67,6 +68,11 @@ class FourierSeries:
             sine, cosine = cosine * rates, -sine * rates
             values.append(cosine @ a + sine @ b)
         return values[: highest + 1]
+
+    @cached_property
+    def _rates(self) -> Array:
+        """Of the harmonics [rad/s], shape (harmonics,)."""
+        return np.asarray(2.0 * np.pi * self.base_frequency * np.arange(1, self.a.shape[1] + 1))
 
     def scaled(self, factor: float) -> FourierSeries:
         """The same motion about the same middle with all amplitudes times `factor`."""

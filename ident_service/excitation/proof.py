@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from ident_service.config.limits import MotionLimits
 from ident_service.excitation.basis import Basis
 from ident_service.excitation.clearance import Clearance, Tube, certified_clearance
 from ident_service.excitation.demands import Demands, demands
-from ident_service.excitation.path import STEP_PEAKS, FourierPath, PosturePath
+from ident_service.excitation.path import STEP_PEAKS, FourierPath, Path, PosturePath
 from ident_service.excitation.tracking import Tracking, track, way_width
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array
@@ -48,7 +48,7 @@ def proof_of(
     collision: CollisionModel,
     torque_margin: float | None = None,
 ) -> Proof:
-    """Bound everything a motion asks, and simulate the arm where the reference keeps its limits.
+    """Bound everything a motion asks, and simulate the arm where its reference is proven to keep every limit.
 
     Args:
         path: the motion.
@@ -59,19 +59,22 @@ def proof_of(
             description's when None.
     """
     margin = model.config.design.torque_margin if torque_margin is None else torque_margin
-    least = model.config.workspace.clearance
     ways = _ways(path, limits)
-    asked, on_ways = demands(path, model), demands(ways, model)
-    tracking: Tracking | None = None
-    tubes: tuple[Tube | None, Tube | None] = (None, None)
-    if model.prior is not None and not asked.violations(model.chain.names, limits, model.config.supply):
-        tracking = track(path, model, margin)
-        if collision.pairs and not tracking.objections(model.chain.names, limits):
-            tubes = tracking.width, way_width(ways, model, margin)
-    if not collision.pairs:
-        return Proof(asked, None, None, on_ways, tracking)
-    near = [certified_clearance(collision, one, least, tube) for one, tube in zip((path, ways), tubes, strict=True)]
-    return Proof(asked, near[0], near[1], on_ways, tracking)
+
+    def clear(one: Path, tube: Tube | None = None) -> Clearance | None:
+        return certified_clearance(collision, one, model.config.workspace.clearance, tube) if collision.pairs else None
+
+    proof = Proof(demands(path, model), clear(path), clear(ways), demands(ways, model))
+    if model.prior is None or objections(proof, model, limits):
+        return proof
+    tracking = track(path, model, margin)
+    proof = replace(proof, tracking=tracking)
+    if not collision.pairs or objections(proof, model, limits):
+        return proof
+    proof = replace(proof, clearance=clear(path, tracking.width))
+    if objections(proof, model, limits):
+        return proof
+    return replace(proof, approach=clear(ways, way_width(ways, model, margin)))
 
 
 def _ways(path: FourierPath | PosturePath, limits: MotionLimits) -> PosturePath:

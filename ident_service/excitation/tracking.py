@@ -238,7 +238,7 @@ def _followed(
             break
         torque = law.torque(q, rate, push[k] + kd * (pace[k] - rate) + kp * away) + feedforward[k]
         np.maximum(fastest, np.abs(rate), out=fastest)
-        queue.append(np.clip(torque, -limit, limit))
+        queue.append(np.minimum(np.maximum(torque, -limit), limit))
         after = plant.next_velocity(q, v, queue.popleft(), period)
         q, v = q + 0.5 * period * (v + after), after
     return positions, fastest

@@ -182,6 +182,9 @@ class ForwardDynamics:
         inertia = self._terms["drive_inertia"]
         self._drive_matrix = chain.coupling.T @ (inertia[:, None] * chain.coupling)
         self._offset = chain.coupling.T @ self._terms["offset"]
+        # Left out where they are zero: a motion takes ten thousands of steps.
+        self._couples = not np.array_equal(chain.coupling, np.eye(chain.joints))
+        self._bends = any(self._terms[term].any() for term in ("stribeck", "quadratic", "viscous_asymmetry"))
 
     def torque(self, position: Array, velocity: Array, acceleration: Array) -> NDArray[np.float64]:
         """`M(q) ddq + c(q, dq) + g(q)` [N m or N], shape (joints,), drive inertia included, no friction."""
@@ -217,12 +220,19 @@ class ForwardDynamics:
         """
         from scipy.linalg.lapack import dposv  # loads for 0.2 s, and no process that moves an arm needs it
 
-        damping = self._secant(self._coupling @ velocity)
-        rest = pin.nonLinearEffects(self._model, self._data, position, velocity)
-        resistance = self._coupling.T @ (damping[:, None] * self._coupling)
+        force = torque - pin.nonLinearEffects(self._model, self._data, position, velocity) - self._offset
         # Of a mass matrix only the upper triangle is filled, and read by this solver.
-        implicit = pin.crba(self._model, self._data, position) + self._drive_matrix + period * resistance
-        _, acceleration, status = dposv(implicit, torque - rest - self._offset - resistance @ velocity)
+        implicit = pin.crba(self._model, self._data, position) + self._drive_matrix
+        if self._couples:
+            damping = self._secant(self._coupling @ velocity)
+            resistance = self._coupling.T @ (damping[:, None] * self._coupling)
+            implicit += period * resistance
+            force -= resistance @ velocity
+        else:
+            damping = self._secant(velocity)
+            implicit.flat[:: len(velocity) + 1] += period * damping
+            force -= damping * velocity
+        _, acceleration, status = dposv(implicit, force)
         if status != 0:
             raise ModelError("the mass matrix is not positive definite: no real body has these parameters")
         return np.asarray(velocity + period * acceleration)
@@ -230,6 +240,8 @@ class ForwardDynamics:
     def _secant(self, rate: Array) -> Array:
         """D of every drive at its velocity, shape (joints,)."""
         terms, speed = self._terms, np.abs(rate)
+        if not self._bends:
+            return np.asarray(np.maximum(terms["viscous"] + terms["coulomb"] / np.maximum(speed, self._CREEP), 0.0))
         dry = terms["coulomb"] + terms["stribeck"] * np.exp(-((rate / self._stribeck_velocity) ** 2))
         damping = terms["viscous"] + dry / np.maximum(speed, self._CREEP) + terms["quadratic"] * speed
         damping += terms["viscous_asymmetry"] * np.sign(rate)

@@ -53,6 +53,9 @@ class Emulator:
         self.body, self.faces, self.names = body, tuple(faces), tuple(names)
         self.observer: Callable[[Truth], None] | None = None
         self._buses = tuple(buses)
+        self._on_bus: dict[int, list[tuple[int, Face]]] = {bus: [] for bus in self._buses}
+        for drive, face in enumerate(self.faces):
+            self._on_bus[self._buses[drive]].append((drive, face))
         self._injection = Injection(body, self.faces, self._buses)
         self._period_ns = round(body.plant.period * 1e9)
         self._configured: tuple[PuckFault, ...] = tuple(faults)
@@ -127,10 +130,8 @@ class Emulator:
         self.body.catch_up(now_ns)
         sent: list[Sent] = []
         is_sync = False
-        for drive, face in enumerate(self.faces):
-            if self._buses[drive] != bus or drive == sender or self._injection.dead(drive):
-                continue
-            if face.listens(frame.identifier):
+        for drive, face in self._on_bus.get(bus, ()):
+            if face.listens(frame.identifier) and drive != sender and not self._injection.dead(drive):
                 self._deadline = None
                 is_sync = is_sync or frame.identifier == face.sync_identifier
                 sent += self._injection.on_the_way(drive, face.receive(frame, now_ns), now_ns)

@@ -96,7 +96,7 @@ class LockStepArm:
         self._run(self.clock.now_ns())
         while not heard:
             self._require_bus(bus)
-            due = self._due()
+            due, _ = self._due()
             if due is None or due > deadline_ns:
                 self.clock.sleep_until_ns(deadline_ns)
                 self._run(self.clock.now_ns())
@@ -124,16 +124,25 @@ class LockStepArm:
         if self.emulator.gone:
             raise DriverError(f"bus {bus} is gone")
 
-    def _due(self) -> int | None:
-        """When something happens next."""
-        times = [self.emulator.next_deadline_ns, *(wire.next_ns for wire in self._wires)]
-        return min((time for time in times if time is not None), default=None)
+    def _due(self) -> tuple[int | None, int | None]:
+        """When something happens next, and the bus on which a frame has come then, if that is what happens."""
+        due = arrived = None
+        for bus, wire in enumerate(self._wires):
+            time = wire.next_ns
+            if time is not None and (due is None or time < due):
+                due, arrived = time, bus
+        deadline = self.emulator.next_deadline_ns
+        if deadline is not None and (due is None or deadline < due):
+            return deadline, None
+        return due, arrived
 
     def _run(self, now_ns: int) -> None:
         """Everything that happens until this time, in its order."""
-        while (due := self._due()) is not None and due <= now_ns:
+        while True:
+            due, arrived = self._due()
+            if due is None or due > now_ns:
+                break
             self._now_ns = max(due, self._now_ns)
-            arrived = next((bus for bus, wire in enumerate(self._wires) if wire.next_ns == due), None)
             if arrived is None:
                 self._carry(self.emulator.tick(due))
             else:

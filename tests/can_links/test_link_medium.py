@@ -105,6 +105,7 @@ def test_waiting_frames_go_out_by_arbitration_of_the_first_of_each(drawn: list[l
         assert len(heard(port)) == len(expected) - len(queue)
 
 
+@pytest.mark.slow
 @given(st.lists(frames(), min_size=1, max_size=40), st.lists(st.integers(0, 3000_000), min_size=40, max_size=40))
 def test_the_pace_is_exact_however_late_the_host_looks(drawn: list[Frame], looks: list[int]) -> None:
     medium, (sender, listener) = on_wire(2, 1_000_000)

@@ -108,6 +108,7 @@ def test_power_is_the_same_on_both_sides(arm: tuple[Coordinates, Array], share: 
         )
 
 
+@pytest.mark.slow
 @given(joints)
 def test_a_torque_is_sent_within_half_a_count_of_each_motor(torque: Array) -> None:
     wanted = torque * [20, 15, 10, 5, 1, 1, 0.3]

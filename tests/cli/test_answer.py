@@ -88,6 +88,7 @@ def nohup(hangups_are_heard: None) -> Iterator[None]:
     signal.signal(signal.SIGHUP, before)
 
 
+@pytest.mark.slow
 def test_an_answer_that_cannot_be_written_is_no_success_and_no_traceback() -> None:
     with open("/dev/full", "w") as full:  # noqa: PTH123 - a device
         ended = subprocess.run(

@@ -25,6 +25,7 @@ def test_version(ident: Ident) -> None:
     assert ident("--version").out == f"ident-service {__version__}\n"
 
 
+@pytest.mark.slow
 def test_state_folder_is_the_option_s_then_the_variable_s_then_the_user_s(
     quick: Commissioned, ident: Ident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -41,6 +42,7 @@ def test_state_folder_is_the_option_s_then_the_variable_s_then_the_user_s(
     assert parent() == tmp_path / "home" / ".local" / "state" / "ident" / "runs"
 
 
+@pytest.mark.slow
 def test_runs_of_the_same_second_get_folders_of_their_own(quick: Commissioned, ident: Ident, state: Path) -> None:
     words = ("identify", quick.folder / "identification.mcap", "--arm", quick.arm, "--json")
     folders = {ident(*words).json["folder"] for _ in range(3)}

@@ -64,6 +64,7 @@ def test_a_design_is_not_written_over(tmp_path: Path, ident: Ident) -> None:
     assert (tmp_path / "motion.json").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_a_search_without_time_says_so_and_is_no_success(tmp_path: Path, ident: Ident) -> None:
     ended = ident("design", quick_arm(tmp_path), "--seconds", 1e-9, "--workers", 1, "--out", tmp_path / "m", "--json")
     assert ended.code == 3

@@ -155,6 +155,7 @@ def test_files_that_are_no_recordings(place: Path, quick: Commissioned, ident: I
     refused(place, ident, identify(place, quick, path), 1, str(path))
 
 
+@pytest.mark.slow
 def test_validation_on_the_fitted_recording(place: Path, quick: Commissioned, ident: Ident) -> None:
     recording = quick.folder / "identification.mcap"
     copy = place / "copy.mcap"

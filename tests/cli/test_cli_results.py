@@ -139,6 +139,7 @@ def test_png_without_its_library_says_how_to_get_it(
     assert not (tmp_path / "figures").exists()
 
 
+@pytest.mark.slow
 def test_png_without_a_font_is_refused(
     folder: Path, ident: Ident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -93,6 +93,7 @@ def test_simulate_keeps_what_it_says(quick: Commissioned) -> None:
     assert used == [{"name": "identification.mcap", "sha256": manifest["identification.mcap"]}]
 
 
+@pytest.mark.slow
 def test_identify_in_words(quick: Commissioned, ident: Ident, tmp_path: Path) -> None:
     out = tmp_path / "out"
     recording, unseen = quick.folder / "identification.mcap", quick.folder / "validation.mcap"
@@ -116,6 +117,7 @@ def test_identify_in_words(quick: Commissioned, ident: Ident, tmp_path: Path) ->
     np.testing.assert_allclose(one, other, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_identify_as_json(quick: Commissioned, ident: Ident, state: Path) -> None:
     recording, unseen = quick.folder / "identification.mcap", quick.folder / "validation.mcap"
     ended = ident("identify", recording, "--arm", quick.arm, "--validate", unseen, "--json")
@@ -143,6 +145,7 @@ def test_identify_from_csv(quick: Commissioned, samples: Samples, ident: Ident, 
     assert (apart <= np.maximum(0.02, 0.5 * np.array(wanted["standard_deviations"]))).all(), apart
 
 
+@pytest.mark.slow
 def test_identify_from_two_recordings(quick: Commissioned, ident: Ident, tmp_path: Path) -> None:
     recordings = [quick.folder / f"{name}.mcap" for name in ("identification", "validation")]
     ended = ident("identify", *recordings, "--arm", quick.arm, "--out", tmp_path / "out", "--json")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import scipy.stats
+import scipy  # its statistics load for a second where they are used
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

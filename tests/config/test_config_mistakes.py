@@ -207,6 +207,7 @@ def test_an_alias_bomb_is_refused_before_it_expands(tmp_path: Path) -> None:
     assert (len(found), found[-1].message) == (101, f"and {30 + 29 * 9 - 100} more mistakes")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "text",
     [

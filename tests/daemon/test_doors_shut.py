@@ -55,6 +55,7 @@ def refusal(answer: httpx.Response, status: int, words: str = "") -> None:
     assert re.search(words, document["error"]["message"]), document
 
 
+@pytest.mark.slow
 def test_nothing_answers_without_a_token_but_health_and_stop(daemon: Asked) -> None:
     tried = 0
     daemon.headers.clear()
@@ -73,6 +74,7 @@ def test_a_token_that_is_nobodys_opens_nothing(daemon: Asked, secret: str) -> No
     refusal(daemon.get("/api/v1/arms", headers={"Authorization": f"Bearer {secret}".encode("latin-1")}), 401)
 
 
+@pytest.mark.slow
 def test_a_viewer_changes_nothing(daemon: Asked, viewer: str) -> None:
     daemon.as_token(viewer)
     bodies = {
@@ -376,6 +378,7 @@ def test_a_session_survives_a_restart_and_ends_in_time(state: Path, monkeypatch:
         assert gate.known(None, session[0]) is None
 
 
+@pytest.mark.slow
 def test_stop_needs_no_token_here_and_any_token_from_elsewhere(daemon: Asked, viewer: str, state: Path) -> None:
     with ControlFile.take(control_path(state, "planar2"), None) as mover:
         daemon.headers.clear()

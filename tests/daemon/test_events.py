@@ -71,6 +71,7 @@ def test_who_is_far_behind_reads_the_registry(daemon: Asked, watch: Watch, monke
     assert watch.begin(10**6).line == told[-1]
 
 
+@pytest.mark.slow
 def test_how_arms_and_jobs_stand_is_told_to_whoever_comes(daemon: Asked, watch: Watch) -> None:
     state = daemon.service.state
     fault_file(state, "planar2").latch("overspeed", "too fast")

@@ -106,6 +106,7 @@ def test_a_full_registry_has_no_room(daemon: Asked, caplog: pytest.LogCaptureFix
     assert daemon.post(*MAINTENANCE).status_code == 201
 
 
+@pytest.mark.slow
 def test_a_full_disk_has_no_room(
     daemon: Asked, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -20,6 +20,7 @@ def body(kind: str, text: str) -> dict[str, object]:
     return {"description": ARM.format(kind=kind), "files": {"arm.xml": text}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "text", "message"),
     [
@@ -73,6 +74,7 @@ def test_a_description_has_its_own_limit_of_size(daemon: Asked, state: Path) -> 
         assert "262144" in answer.json()["error"]["message"]
 
 
+@pytest.mark.slow
 def test_few_descriptions_are_checked_at_a_time(daemon: Asked) -> None:
     good = {"description": "extends: planar2\nname: other\n"}
     with ExitStack() as taken:

@@ -123,6 +123,7 @@ def test_a_computation_that_is_asked_for_twice_is_one_job(daemon: Asked, viewer:
     assert "idempotent-replayed" not in post("second").headers
 
 
+@pytest.mark.slow
 def test_a_name_that_is_taken_is_replaced_where_that_is_asked_for(daemon: Asked) -> None:
     def post(text: str, **more: object) -> Any:
         return daemon.post("/api/v1/arms", {"description": text, **more})

@@ -29,6 +29,7 @@ def of(daemon: Asked, name: str, **labels: str) -> float:
     return figures(daemon.get("/metrics").text)[name, frozenset(labels.items())]
 
 
+@pytest.mark.slow
 def test_what_is_done_is_counted(daemon: Asked) -> None:
     assert daemon.get("/metrics").headers["content-type"].startswith("text/plain; version=0.0.4")
     assert of(daemon, "ident_up") == 1

@@ -20,6 +20,7 @@ from ident_service.service.api.doors import MOST_BODY
 FAILURE = {"$ref": "#/components/schemas/Failure"}
 
 
+@pytest.mark.slow
 def test_every_answer_has_a_type_and_every_failure_the_one_shape(daemon: Asked) -> None:
     document = daemon.get("/api/v1/openapi.json").json()
     names = []
@@ -41,6 +42,7 @@ def test_every_answer_has_a_type_and_every_failure_the_one_shape(daemon: Asked) 
     assert "HTTPValidationError" not in json.dumps(document["paths"])
 
 
+@pytest.mark.slow
 def test_every_operation_is_explained_by_examples_that_are_good(daemon: Asked) -> None:
     document = daemon.get("/api/v1/openapi.json").json()
     shapes = document["components"]
@@ -66,6 +68,7 @@ def test_every_operation_is_explained_by_examples_that_are_good(daemon: Asked) -
     assert len(set(summaries)) >= len(summaries) - 2, sorted(summaries)
 
 
+@pytest.mark.slow
 def test_what_an_example_asks_for_is_understood(daemon: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patched:
         patched.setattr(daemon.service.engine, "_look", lambda: None)  # nothing begins

@@ -45,6 +45,7 @@ def verbs() -> dict[str, Parser]:
     return dict(below(parser()))
 
 
+@pytest.mark.slow
 def test_every_verb_is_done_by_a_daemon_or_says_why_not() -> None:
     done, carried = table()
     assert len(verbs()) > 45
@@ -245,14 +246,15 @@ def test_a_zeroing_that_nobody_asks_for_any_more_is_not_done(
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_a_rehearsal_elsewhere_ends_with_the_key_here(
-    state: Path, commissioned: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    state: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("ident_service.cli.moving.RELEASED", 2.0)  # a busy machine is no hand that lets go
     master, slave = pty.openpty()
     texts = {"patient": patient_text("patient"), "short": quick_text("short", 1)}
     for text in texts.values():
         checked_before(state, text)
-    with served(state, commissioned) as (client, server):
+    with daemon_process(state) as (_, client):
+        server = ["--server", client.url, "--state", str(state)]
         for text in texts.values():
             client.post("/api/v1/arms", {"description": text})
         rehearse = ["rehearse", "patient", "--confirm", "patient", *server]

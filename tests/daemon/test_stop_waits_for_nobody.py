@@ -66,6 +66,7 @@ def test_a_stop_and_what_is_read_do_not_wait_for_who_writes(daemon: Asked, state
     assert max(line["at"] for line in lines) - min(line["at"] for line in lines) < SOON
 
 
+@pytest.mark.slow
 def test_a_stop_needs_no_thread_that_others_may_keep(daemon: Asked, state: Path) -> None:
     with (
         ControlFile.take(control_path(state, "planar2"), None) as mover,

@@ -174,6 +174,7 @@ def test_viewers_upload_nothing(daemon: Asked, viewer: str) -> None:
     assert daemon.get(f"/api/v1/uploads/{upload}").json()["received"] == 0
 
 
+@pytest.mark.slow
 def test_a_backup_without_recordings_has_none_of_ones_own(daemon: Asked, tmp_path: Path) -> None:
     upload = daemon.post("/api/v1/uploads", announced(b"mine")).json()["id"]
     sent(daemon, upload, 0, b"mine")

@@ -149,6 +149,7 @@ def transmissions(draw: st.DrawFn, joints: int = 3) -> Transmission:
 VALUES = arrays(np.float64, (5, 3), elements=st.integers(-(10**8), 10**8).map(lambda n: n * 1e-6))
 
 
+@pytest.mark.slow
 @given(transmissions(), VALUES, VALUES, VALUES)
 def test_power_is_kept_and_motors_come_back(transmission: Transmission, q, dq, tau) -> None:
     motors = MadeRecording(np.arange(5), q, tau, dq)

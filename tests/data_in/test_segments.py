@@ -97,6 +97,7 @@ def test_stamps_taken_as_regular_would_be_worse_by_far() -> None:
     assert np.abs(block.position - SMOOTH(block.stamp_ns * 1e-9)).max() < 3e-6
 
 
+@pytest.mark.slow
 @given(
     st.integers(0, 10_000),
     st.integers(40, 200),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from estimation.synthetic import random_information
 from helpers.random_arms import model_around, random_chain, random_delta
 
@@ -13,6 +14,7 @@ from ident_service.estimation.least_squares import ordinary_least_squares
 from ident_service.model.base import base_parameters
 
 
+@pytest.mark.slow
 def test_they_hold_the_truth_and_end_at_a_bound() -> None:
     arm = model_around(random_chain(np.random.default_rng(2), 2, branches=False, prismatic=False))
     base = base_parameters(arm.chain, arm.layout)

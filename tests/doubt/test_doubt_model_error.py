@@ -68,6 +68,7 @@ def judged(fit: Fit) -> np.ndarray:
     return np.asarray(((fit.fit.beta - base.K @ truth) / fit.deviations)[identified])
 
 
+@pytest.mark.slow
 def test_more_periods_do_not_make_an_error_of_the_model_smaller(wam7_data: Path) -> None:
     one, nine = (fitted(made(wam7_data, "traj1", periods, error=0.1, seed=0)) for periods in (1, 9))
     assert one.noise is None
@@ -83,6 +84,7 @@ def test_more_periods_do_not_make_an_error_of_the_model_smaller(wam7_data: Path)
         assert np.sum(np.abs(errors) > 3.0) <= 1
 
 
+@pytest.mark.slow
 def test_more_periods_make_noise_smaller(wam7_data: Path) -> None:
     one, nine = (fitted(made(wam7_data, "traj1", periods, error=0.0, seed=0)) for periods in (1, 9))
     known = np.isfinite(one.deviations) & np.isfinite(nine.deviations)

@@ -179,6 +179,7 @@ def test_a_custom_penalty_counts_as_a_prior_does(setting: Setting, kind: Any) ->
     np.testing.assert_allclose(found.beta, wanted.beta, rtol=0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_knowledge_about_base_parameters_and_every_replicate(setting: Setting, tmp_path: Path) -> None:
     expression = setting.plain.base.expressions[-3]
     assert expression == "fv2"
@@ -202,6 +203,7 @@ def test_knowledge_about_base_parameters_and_every_replicate(setting: Setting, t
 # The second opinion.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "rel"),
     [
@@ -342,6 +344,7 @@ def test_a_file_beside_a_description_hides_no_library(tmp_path: Path) -> None:
         load_custom("textwrap:known", tmp_path)
 
 
+@pytest.mark.slow
 def test_a_module_on_the_path_and_one_beside_an_extended_description(
     setting: Setting, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

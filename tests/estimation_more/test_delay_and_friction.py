@@ -57,6 +57,7 @@ def test_a_delay_is_found_to_a_fraction_of_a_sample(seconds: float) -> None:
     assert 0.0 < found.deviation < 0.05 / RATE
 
 
+@pytest.mark.slow
 def test_the_deviation_is_that_of_many_recordings() -> None:
     model, base, _ = two_links()
     found = [estimate_delay([late(0.003, noise=0.5, seed=seed)], model, base) for seed in range(6)]
@@ -101,6 +102,7 @@ def test_with_delay_changes_nothing_else() -> None:
     assert model.config.identification.delay == 0.0
 
 
+@pytest.mark.slow
 def test_torque_of_another_motion_has_no_delay() -> None:
     model, base, _ = two_links()
     foreign = replace(late(0.0), torque=late(0.0, seed=9).torque[::-1].copy())

@@ -78,6 +78,7 @@ def drawn(setting: Setting, kind: str, weight: float | str) -> Estimate:
 # The prior.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["euclidean", "entropic"])
 def test_a_prior_draws_as_strongly_as_its_weight(setting: Setting, plain: Estimate, kind: str) -> None:
     assert setting.model.prior is not None
@@ -252,6 +253,7 @@ def ident_json(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, 
     return dict(document)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["wls", "huber", "iv"])
 def test_methods_by_the_command(
     setting: Setting, capsys: pytest.CaptureFixture[str], tmp_path: Path, method: str
@@ -266,6 +268,7 @@ def test_methods_by_the_command(
     assert np.all(np.abs(off) < 0.15)
 
 
+@pytest.mark.slow
 def test_columns_of_a_foreign_header(setting: Setting, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     foreign = tmp_path / "foreign.csv"
     own = list(csv.reader(setting.path.read_text().splitlines()))[1:]
@@ -291,6 +294,7 @@ def test_columns_of_a_foreign_header(setting: Setting, capsys: pytest.CaptureFix
     assert "no column for tau1" in mistake["error"]["message"]
 
 
+@pytest.mark.slow
 def test_delay_by_the_command(setting: Setting, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     path = written(made(setting.model, setting.delta, 2, late=0.0061), tmp_path / "late.csv")
     words = ("identify", path, "--arm", setting.arm, "--out")
@@ -308,6 +312,7 @@ def test_delay_by_the_command(setting: Setting, capsys: pytest.CaptureFixture[st
     assert off["0.0061"] < 0.7 * off["0"]
 
 
+@pytest.mark.slow
 def test_a_prior_by_the_command(setting: Setting, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     words = ("identify", setting.path, "--arm", setting.arm, "--out", tmp_path / "out")
     assert ident_json(capsys, *words, "--prior", "entropic", "--prior-weight", "1e9")["exit_code"] == 0

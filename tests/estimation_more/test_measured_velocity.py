@@ -54,6 +54,7 @@ def identified(velocity: str, recording: SampledRecording, **more: object) -> Es
     return identify(with_options(model, options), [recording])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["butterworth", "savitzky_golay"])
 def test_fine_velocities_beside_coarse_positions_are_chosen(method: str) -> None:
     recording = noisy(*arm())
@@ -66,6 +67,7 @@ def test_fine_velocities_beside_coarse_positions_are_chosen(method: str) -> None
     assert errors["measured"] < 0.5 * errors["position"]
 
 
+@pytest.mark.slow
 def test_velocities_that_lag_are_not_chosen() -> None:
     recording = noisy(*arm(), late=0.15)
     fine = replace(recording, position=recorded(*arm(), waves(4, 2), rate=RATE, seconds=40.0).position)

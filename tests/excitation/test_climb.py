@@ -41,6 +41,7 @@ def after(calls: int) -> Callable[[], None]:
     return check
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(seed=SEEDS, size=st.sampled_from([0.0, 1e-3, 1.0, 10.0, 1e3, 1e6]))
 def test_what_is_kept_keeps_all_limits_even_from_absurd_motions(seed: int, size: float) -> None:
@@ -51,6 +52,7 @@ def test_what_is_kept_keeps_all_limits_even_from_absurd_motions(seed: int, size:
     assert np.isfinite(candidate.value)
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(seed=SEEDS, size=st.sampled_from([0.3, 1.0, 3.0]))
 def test_what_is_kept_is_the_largest_motion_that_keeps_the_limits(seed: int, size: float) -> None:
@@ -109,6 +111,7 @@ def test_a_polish_makes_nothing_worse_however_early_it_ends(good: Candidate, cal
     assert polished.value <= good.value + 1e-9
 
 
+@pytest.mark.slow
 def test_the_same_start_climbs_the_same_way_twice() -> None:
     x = random_variables(PROBLEM, np.random.default_rng(4), SAFE)
     one, other = (climbed(PROBLEM, x.copy(), SAFE, 4, lambda: None) for _ in range(2))

@@ -155,6 +155,7 @@ def test_shipped_motions_stay_inside_the_limits(arm: str, purpose: Any) -> None:
     assert (motion.name, motion.arm_sha256) == (purpose, model.config.motion_sha256)
 
 
+@pytest.mark.slow
 def test_the_two_motions_of_an_arm_differ() -> None:
     for arm in MOVABLE:
         model = arm_model(load_arm(arm))

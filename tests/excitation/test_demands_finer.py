@@ -98,6 +98,7 @@ def assert_bounds(asked: Demands, found: dict[str, Array]) -> None:
         assert (bound >= found[name] - ROUNDING * (1.0 + np.abs(found[name]))).all(), name
 
 
+@pytest.mark.slow
 @settings(max_examples=6)
 @given(seed=SEEDS, joints=st.integers(1, 3))
 def test_a_thousand_times_finer_nothing_exceeds_the_bounds(seed: int, joints: int) -> None:

@@ -96,6 +96,7 @@ def test_more_starts_are_never_worse(starts: int) -> None:
     assert better <= worse + 0.02  # a proof may cost the better one a little
 
 
+@pytest.mark.slow
 def test_an_arm_whose_home_is_the_end_of_its_range_can_stand_still_too() -> None:
     model = small(joints={"shoulder": {"position": [0.0, 1.8]}, "elbow": {"position": [-2.0, 0.0]}})
     designed = design_motion(model, quick(), budget=NOTHING)
@@ -103,6 +104,7 @@ def test_an_arm_whose_home_is_the_end_of_its_range_can_stand_still_too() -> None
     assert unproven(designed, model, limits) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["planar2", "threelink"])
 def test_without_a_single_start_the_arm_stands_still_and_that_is_proven(name: str) -> None:
     model, design = small(name), quick()
@@ -115,6 +117,7 @@ def test_without_a_single_start_the_arm_stands_still_and_that_is_proven(name: st
     assert json.loads(designed.excitation.to_json())["made"]["condition_number"] is None
 
 
+@pytest.mark.slow
 def test_a_design_that_is_cancelled_at_once_is_a_motion_too() -> None:
     designed = design_motion(small(), quick(), budget=ONE_START, cancelled=lambda: True)
     assert excitation_from_json(designed.excitation.to_json()).duration > 0.0

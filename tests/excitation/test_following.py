@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from design_bench import FOURIER, random_task, small
 from helpers.random_arms import bodies_of, reference_model
 from hypothesis import given, settings
@@ -21,6 +22,7 @@ Array = np.ndarray
 UNKNOWN = 0.6  # of the friction expected: what 1.4 times as much has beyond the 0.8 that the law feeds forward
 
 
+@pytest.mark.slow
 @settings(max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 4))
 def test_the_forecast_is_friction_through_the_mass_matrix_and_the_gains(seed: int, joints: int) -> None:

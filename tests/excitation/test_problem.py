@@ -39,6 +39,7 @@ def slope_and_difference(problem: Problem, x: Array, rng: np.random.Generator) -
     return float(gradient @ direction), (above - below) / (2.0 * step), float(np.linalg.norm(gradient))
 
 
+@pytest.mark.slow
 @BASES
 @pytest.mark.parametrize("kind", KINDS)
 @settings(max_examples=8)

@@ -21,6 +21,7 @@ def test_every_simulated_arm_is_here() -> None:
     assert set(SIMULATED) >= {"wam7_sim", "planar2", "sixaxis", "threelink"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("motion", ["identification", "validation"])
 @pytest.mark.parametrize("name", SIMULATED)
 def test_a_shipped_motion_may_be_made_from_home(name: str, motion: str) -> None:

@@ -56,6 +56,7 @@ def as_in(case: int, model: ArmModel) -> dict[str, Any]:
     return {"kind": "simulated", "truth": truth}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [0, 1])
 def test_the_simulated_arm_is_the_one_that_the_loop_drives(case: int) -> None:
     model = small(**SLOW)
@@ -73,6 +74,7 @@ def test_the_simulated_arm_is_the_one_that_the_loop_drives(case: int) -> None:
         np.testing.assert_allclose(report.peak_following_error, alone.error, rtol=0.15)
 
 
+@pytest.mark.slow
 def test_a_motion_that_the_arm_cannot_follow_is_objected_to_and_not_designed() -> None:
     """Soft gains: friction moves the arm farther off than it may be, wherever it moves at all."""
     soft = {name: {"kp": 2.0, "kd": 1.0, "following_error": 0.02} for name in ("shoulder", "elbow")}

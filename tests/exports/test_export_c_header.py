@@ -131,6 +131,7 @@ def test_parameters_that_no_body_has_are_exported_all_the_same(tmp_path: Path) -
     assert_same(run("inverse_dynamics", *states), meant)
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 5), square=st.booleans())
 def test_the_text_of_random_arms_says_what_the_regressor_says(seed: int, joints: int, square: bool) -> None:
@@ -155,6 +156,7 @@ def test_results_may_overwrite_arguments(tmp_path: Path) -> None:
         np.testing.assert_array_equal(row[place], run("inverse_dynamics", *states)[0])
 
 
+@pytest.mark.slow
 def test_names_that_mean_something_in_c_are_harmless(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     names = ('"quoted" */ int', "a b", "a-b", "int", "3rd", "a_b", "??/", "µ\n#error")

@@ -95,6 +95,7 @@ def test_drives_that_move_several_joints_become_tendons() -> None:
     assert lost == ("torque offset (fo) of every joint", "Stribeck friction (fs) of every joint", "velocity limits")
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 6), square=st.booleans())
 def test_random_trees_agree_in_mujoco_and_pinocchio(seed: int, joints: int, square: bool) -> None:

@@ -91,6 +91,7 @@ def test_weight_trades_the_torques_for_the_prior(kind: Kind) -> None:
     assert distances[-1] < 0.5 * distances[0]
 
 
+@pytest.mark.slow
 @settings(max_examples=15)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(KINDS), st.sampled_from(["inertia", "pseudo_inertia"]))
 def test_a_prior_never_leaves_the_set(seed: int, kind: Kind, name: FeasibleSetName) -> None:

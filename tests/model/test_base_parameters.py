@@ -172,6 +172,7 @@ def test_base_parameters_predict_every_torque_that_link_parameters_do(
     np.testing.assert_array_equal(first_column, base.base)
 
 
+@pytest.mark.slow
 @settings(max_examples=30)
 @given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 5))
 def test_moving_along_what_cannot_be_seen_changes_no_torque(seed: int, joints: int) -> None:

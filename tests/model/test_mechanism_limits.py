@@ -87,6 +87,7 @@ def test_a_file_beyond_the_limits_is_one_clear_error(kind: Kind, text: str, mess
     assert len(str(caught.value)) < 600
 
 
+@pytest.mark.slow
 def test_the_largest_that_may_be_read_is_read() -> None:
     assert len(read_mechanism(TextFile(name="a.urdf", text=chain(DEEPEST_LINKS)), "urdf").names) == DEEPEST_LINKS - 1
     star = urdf(links(MOST_LINKS), *(joint(k, 0, k) for k in range(1, MOST_LINKS)))
@@ -112,6 +113,7 @@ def test_an_mjcf_is_read_in_another_process() -> None:
     assert {name: joint for name, (joint, *_) in found.frames.items()} == {"one": 0, "two": 1}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("work", "deadline", "message"),
     [

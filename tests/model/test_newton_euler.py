@@ -39,6 +39,7 @@ def numbers(delta: Array, columns: Array | None = None) -> dict[int, Value]:
     return {int(k): float(delta[k]) for k in (range(len(delta)) if columns is None else columns)}
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 6), square=st.booleans())
 def test_links_weigh_as_in_pinocchio(seed: int, joints: int, square: bool) -> None:
@@ -76,6 +77,7 @@ def whole(chain: Chain, layout: Layout, parameters: dict[int, Value], states: tu
     return run(tape, [a + b + c for a, b, c in zip(*parts, strict=True)], states)
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 5))
 def test_base_parameters_alone_give_every_torque(seed: int, joints: int) -> None:

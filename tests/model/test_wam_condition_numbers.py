@@ -33,6 +33,7 @@ def target(folder: Path, figure: str, motion: str) -> float:
     return float(targets["our_check_on_the_reference_trajectories"][figure][motion])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("motion", ["traj1", "traj2"])
 def test_along_one_period_of_the_series(wam7: ArmModel, wam7_data: Path, motion: str) -> None:
     series = json.loads((wam7_data / f"{motion}_fourier.json").read_text())

@@ -106,6 +106,7 @@ def test_a_sample_of_the_campaign(some: list[Case], tmp_path: Path) -> None:
     keep_their_promises(some, tmp_path, let_go)
 
 
+@pytest.mark.slow
 def test_a_drive_that_applies_a_share_of_its_torque_is_named() -> None:
     begin, _ = windows("bench canopen", State.EXCITING)[State.EXCITING.value]
     outcome = play(

@@ -120,6 +120,7 @@ def test_limits_are_kept_whenever_a_run_is_finished(cycle: int, speed: float, pa
         arm.close()
 
 
+@pytest.mark.slow
 def test_the_way_back_is_as_slow_as_the_run(make: Callable[..., Bench]) -> None:
     bench = make()
     assert played(bench, Hands(finished=3000), speed=0.4).finished_at is not None
@@ -149,6 +150,7 @@ def test_a_run_is_finished_while_it_pauses_and_while_it_goes_on_again(make: Call
         ended_where_it_began(bench)
 
 
+@pytest.mark.slow
 def test_the_way_back_of_a_finished_run_can_be_paused(make: Callable[..., Bench]) -> None:
     free, bench = make(), make()
     played(free, Hands(finished=MIDWAY))

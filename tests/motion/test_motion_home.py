@@ -110,6 +110,7 @@ def test_a_push_outwards_on_the_way_in_stops_the_arm(make: Callable[..., Bench])
     assert caught.value.code in ("position_limit", "position_envelope")
 
 
+@pytest.mark.slow
 def test_a_stop_on_the_way_home_is_a_stop(make: Callable[..., Bench]) -> None:
     bench, switches = make(**standing(-1.2, 1.0)), Switches()
     bench.arm.before_exchange = lambda cycle: setattr(switches, "stop", cycle > 1500)

@@ -12,6 +12,8 @@ from guard_bench import PERIOD
 from motion_bench import TRUTH, bench_config
 
 from ident_service.config.schema import ArmConfig
+from ident_service.excitation.plan import excitation
+from ident_service.model.arm_model import arm_model
 from ident_service.motion.checks import VELOCITY_OFF
 from ident_service.motion.states import State
 from sim_backend.faults import Fault, FaultKind
@@ -84,7 +86,9 @@ def sticks_and_is_not_taken_for_frozen(which: Subject, speed: float, share: floa
         stop: cycle of the run at full speed at which somebody stops it; None for a whole run.
     """
     if stop is not None:
-        which = replace(which, stop=stop, config=braked(which.config))
+        config = braked(which.config)
+        model = arm_model(config)
+        which = replace(which, stop=stop, config=config, model=model, motion=excitation(model, "identification"))
     outcome = play(which, State.EXCITING if stop is None else State.STOPPING, (), None, speed)
     assert outcome.fault is None
     assert ("returning" in outcome.story.states) == (stop is None)

@@ -90,6 +90,7 @@ def test_a_pause_is_gone_on_from(make: Callable[..., Bench], cycle: int) -> None
     assert (np.abs(bench.truth[-1].position - HOME) < 0.25 * LIMITS.following_error).all()
 
 
+@pytest.mark.slow
 def test_the_whole_motion_is_made_in_spite_of_pauses(make: Callable[..., Bench], healthy: Healthy) -> None:
     bench = make()
     # Short enough that the second one strikes on the way back from the first.
@@ -250,6 +251,7 @@ def test_an_arm_that_is_pushed_while_it_is_held_is_left_to_its_drives(make: Call
     assert bench.story.states[-2:] == ["stopped", "faulted"]
 
 
+@pytest.mark.slow
 def test_an_arm_that_does_not_follow_is_lowered(make: Callable[..., Bench]) -> None:
     bench, latch = make(Fault(700, FaultKind.LOAD_ATTACHED, None, None, 3.0)), Latch()
     with pytest.raises(ArmFault, match="following_lost: ") as caught:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import scipy.stats
+import scipy  # its statistics load for a second where they are used
 from payload.known_arms import ARM, BASE, DELTA, LAST, NOISE, blocks_of, body, known, with_body
 
 from ident_service.errors import ParameterError

@@ -293,6 +293,7 @@ def test_a_parent_that_dies_leaves_writer_and_recorder_to_end_it(tmp_path: Path)
     assert len(read_all(file).stamp_ns) == len(cycles(600))
 
 
+@pytest.mark.slow
 def test_a_writer_elsewhere_that_dies(tmp_path: Path) -> None:
     with actor("split", tmp_path / "run", 1 << 30) as (parent, (pid, motion)), ending(pid):
         await_stream(parent)

@@ -65,6 +65,7 @@ def test_lines_fit_a_terminal() -> None:
     assert max(map(len, wrapped(rows_and_filter(Identification.model_validate(PLAIN))))) <= 100
 
 
+@pytest.mark.slow
 def test_the_words_stand_beside_the_figures_everywhere(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = ["t,q1,q2,tau1,tau2"]
     for t in np.arange(0.0, 20.0, 0.01):

@@ -101,6 +101,7 @@ def test_a_target_that_is_not_reached_lets_the_run_go_on_to_its_end(
     assert report["cycles"] > 2_500  # ten seconds of motion at 250 Hz
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "said"),
     [
