@@ -106,15 +106,15 @@ def delete_arm(db: Database, state: Path, arm: str, who: str, *, anyway: bool = 
         for one in motions:
             _delete_motion(db, state, one, who)
         gone = [_hide(arm_folder(state, arm))]
+        place, own = state / DESCRIPTIONS, re.compile(re.escape(arm) + r"-[0-9a-f]{16}")
         with db.transaction():
+            # In here, so that whoever adds the arm again finds its description, or does not.
+            gone += [_hide(path) for path in (place.iterdir() if place.is_dir() else ()) if own.fullmatch(path.name)]
             for table in ("schedules", "dues", "alarms", "acceptances", "reidentifications", "maintenance_events"):
                 db.write(f"DELETE FROM {table} WHERE arm = ?", arm)  # noqa: S608 - ours
             db.write("DELETE FROM arms WHERE name = ?", arm)
             note(db, who, "arm deleted", arm, with_it=[asdict(one) for one in found[:100]])
             know_shipped(db)
-    place = state / DESCRIPTIONS
-    own = re.compile(re.escape(arm) + r"-[0-9a-f]{16}")
-    gone += [_hide(path) for path in (place.iterdir() if place.is_dir() else ()) if own.fullmatch(path.name)]
     _remove(gone)
     return found
 
