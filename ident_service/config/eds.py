@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import configparser
 from functools import lru_cache
+from typing import Final
+
+LONGEST: Final = 2**19  # characters, which ini readers take a second for
 
 
 @lru_cache(maxsize=8)
@@ -36,6 +39,8 @@ def has_object(eds: str, index: int) -> bool:
 @lru_cache(maxsize=8)
 def eds_mistake(eds: str) -> str | None:
     """Why a text is no EDS (CiA 306-1: an ini file with the section DeviceInfo); None where it may be one."""
+    if len(eds) > LONGEST:
+        return f"longer than {LONGEST} characters"
     parser = configparser.ConfigParser(strict=False, interpolation=None)
     try:
         parser.read_string(eds)

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from ident_service.config import canopen, control, design, recording, simulation, workspace
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.kinematics import DHTable
-from ident_service.config.quantities import MAX_FILE_BYTES, UPLOAD, Section
+from ident_service.config.quantities import UPLOAD, Section
 from ident_service.config.recording import RecordingFormat
 from ident_service.config.schema import ArmConfig, FourierMotion
 from ident_service.config.shipped import shipped_arms as shipped_arms
@@ -19,6 +19,7 @@ from ident_service.config.simulation import SimulatedDriver
 from ident_service.config.source import KeyPath, Tree, first_problems, read_tree
 from ident_service.errors import ConfigError, Problem, UsageError
 
+_MOST_JSON = 8 * 2**20  # bytes: the text, a URDF and an EDS at their limits, and as much again
 _Described = TypeVar("_Described", bound=Section)
 _PER_JOINT = ("encoder_resolution", "torque_resolution", "torque_noise")
 
@@ -66,8 +67,8 @@ def arm_from_json(path: Path) -> ArmConfig:
     """
     if not path.is_file():
         raise UsageError(f"no such file: {path}")
-    if path.stat().st_size > 4 * MAX_FILE_BYTES:
-        raise ConfigError([Problem(path, 1, 1, f"larger than {4 * MAX_FILE_BYTES} bytes")])
+    if path.stat().st_size > _MOST_JSON:
+        raise ConfigError([Problem(path, 1, 1, f"larger than {_MOST_JSON} bytes")])
     try:
         return ArmConfig.model_validate_json(path.read_bytes())
     except ValidationError as error:

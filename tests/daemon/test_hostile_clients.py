@@ -1,4 +1,4 @@
-"""Clients that lie, flood, do not read, were sent away, or delete what others use: no stop waits, nothing stays torn."""
+"""Clients that flood, do not read, were sent away, or delete what others use: no stop waits, nothing stays torn."""
 
 from __future__ import annotations
 
