@@ -19,7 +19,7 @@ from ident_service.config.simulation import SimulatedDriver
 from ident_service.config.source import KeyPath, Tree, first_problems, read_tree
 from ident_service.errors import ConfigError, Problem, UsageError
 
-_MOST_JSON = 8 * 2**20  # bytes: the text, a URDF and an EDS at their limits, and as much again
+_MOST_JSON = 4 * 2**20  # bytes: a text, a URDF and an EDS at their limits
 _Described = TypeVar("_Described", bound=Section)
 _PER_JOINT = ("encoder_resolution", "torque_resolution", "torque_noise")
 

@@ -33,7 +33,7 @@ from ident_service.results.rows_and_filter import how_fitted
 from ident_service.results.schemas import require_schema
 from ident_service.results.strict_json import strict_json
 
-MAX_BYTES = 16 * 2**20
+MAX_BYTES = 8 * 2**20
 MOST_EXPRESSIONS = 1000
 MOST_CHARACTERS = 2**19  # of all expressions
 _TABLE = (

@@ -347,12 +347,15 @@ LARGEST: dict[str, Callable[[], tuple[str, str]]] = {
     "lists": lambda: ("yaml", "a: [" + "1," * 130_000),
     "sums of 200 links": lambda: ("parameters", _table(*(f"m199 + {k + 1}*m{k % 199 + 1}" for k in range(20_000)))),
     "long sums": lambda: ("parameters", _table(*[" + ".join(f"{k}*m{k % 9 + 1}" for k in range(7000))] * 5)),
+    "wrong values": lambda: ("parameters", _table("m1").replace("1.0", "1.0," + "[[]]," * 1_600_000 + "2")),
+    "a wrong format": lambda: ("parameters", _table("m1").replace('"ident-parameters"', "[" + "1," * 4_000_000 + "2]")),
     "columns": lambda: ("csv", _columns(50_000)),
     "as many columns as may be": lambda: ("csv", _columns(2048)),
     "empty lines": lambda: ("eds", "\n" * LONGEST),
+    "lines without a key": lambda: ("eds", "[DeviceInfo]\na=1\n" + "O\n" * (LONGEST // 2 - 20)),
     "more lines": lambda: ("eds", "\n" * 8_000_000),
     "a kind of 2 MB": lambda: ("motion", json.dumps({"format": "ident-excitation", "version": 1, "kind": "x" * 2**21})),
-    "empty lists": lambda: ("arm.json", "[" + "[]," * 2_700_000 + "[]]"),
+    "empty lists": lambda: ("arm.json", "[" + "[]," * 1_390_000 + "[]]"),
     "many empty lists": lambda: ("arm.json", "[" + "[]," * 20_000_000 + "[]]"),
 }
 
