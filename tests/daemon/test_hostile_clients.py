@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import socket
 import threading
 import time
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlsplit
 
 import httpx
 import pytest
-from daemon.conftest import Asked, quick_text, serving
+from daemon.conftest import URL, Asked, quick_text, serving
 from daemon.served import daemon_process
 from daemon.test_connections import FAR, NEAR, Book
 from daemon.test_uploads import announced, sent
 from fastapi.dependencies.models import Dependant
 from fastapi.responses import StreamingResponse
 from fastapi.routing import APIRoute
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from ident_service.client import IdentClient
 from ident_service.service import deletion, uploads
@@ -261,3 +264,42 @@ def test_an_arm_that_is_deleted_while_it_is_read_is_unknown(daemon: Asked, monke
 
     monkeypatch.setattr(arms, "load_arm", meanwhile)
     assert daemon.get("/api/v1/arms/quick").status_code == 404
+
+
+@pytest.mark.parametrize("number", ["x", "-1", "1e3", str(2**62), "\u0663"])
+def test_a_stream_refuses_a_number_that_is_none(daemon: Asked, number: str) -> None:
+    answer = daemon.get("/api/v1/events", headers={"Last-Event-ID": number.encode()})
+    assert (answer.status_code, set(answer.json())) == (422, {"error"})
+    for name in ("events", "live"):
+        assert daemon.get(f"/api/v1/jobs/none/{name}").status_code == 404
+        assert daemon.get(f"/api/v1/jobs/a%00b/{name}").status_code == 422
+
+
+WORDS = ("planar2", "none", "1", "-1", "9" * 30, "a" * 4000, "a\x00b", "\xe9", "{{7*7}}", "nan", "1e999", "", " ", "..")
+FIELDS = ("arm", "name", "confirm", "challenge", "note", "token", "run", "motion", "cron", "hours", "what", "share")
+PAGES = [
+    route
+    for router in ROUTERS
+    for route in router.routes
+    if isinstance(route, APIRoute) and not route.path.startswith("/api")
+]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+@settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
+@given(
+    route=st.sampled_from(PAGES),
+    place=st.lists(st.sampled_from(WORDS[:11]), min_size=3, max_size=3),
+    query=st.dictionaries(st.sampled_from(FIELDS), st.sampled_from(WORDS), max_size=3),
+    form=st.dictionaries(st.sampled_from(FIELDS), st.sampled_from(WORDS), max_size=6),
+)
+def test_no_form_makes_a_page_fail(
+    daemon: Asked, route: APIRoute, place: list[str], query: dict[str, str], form: dict[str, str]
+) -> None:
+    words = iter(place)
+    path = re.sub(r"\{[^}]+\}", lambda _: quote(next(words) or "x", safe=""), route.path)
+    (method,) = route.methods
+    body = {"data": form, "headers": {"Origin": URL}} if method == "POST" else {}
+    answer = daemon.ask(method, path, params=query, **body)
+    assert answer.status_code < 500, (method, path, query, form, answer.text[:500])
