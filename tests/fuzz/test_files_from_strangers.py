@@ -220,8 +220,8 @@ LIMITS = {
     "urdf": mechanism.MOST_BYTES,
     "mjcf": mechanism.MOST_BYTES,
     "eds": LONGEST,
-    "mcap": 2**24,
-    "csv": 2**24,
+    "mcap": 2**22,
+    "csv": 2**22,
     "csv.gz": 2**20,
     "motion": motion_file._MOST_BYTES,
     "parameters": parameter_file.MAX_BYTES,
@@ -312,7 +312,7 @@ def test_a_spoiled_file_is_read_or_refused(readers: dict[str, Reader], kind: str
 @pytest.mark.parametrize("kind", LIMITS)
 def test_no_file_of_very_many_breaks_its_reader(readers: dict[str, Reader], kind: str) -> None:
     @given(seed=st.integers(0, 2**32 - 1))
-    @settings(max_examples=400 if kind == "mjcf" else 2000, deadline=None, suppress_health_check=_QUIET, database=None)
+    @settings(max_examples=400 if kind == "mjcf" else 1000, deadline=None, suppress_health_check=_QUIET, database=None)
     def each(seed: int) -> None:
         spoil, read = readers[kind]
         data = spoil(random.Random(seed), True)  # noqa: S311
