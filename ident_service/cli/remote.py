@@ -215,7 +215,7 @@ def _known(client: IdentClient, arm: str) -> bool:
 def _ask(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     answer = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/{arguments.word}")
     if not answer["reached"]:  # the exit code is that of the same words at the machine itself
-        return USAGE, f"{arguments.arm}: nobody moves an arm of this name there\n", answer
+        raise UsageError(f"{arguments.arm}: nobody moves an arm of this name there")
     return DONE, f"{arguments.arm}: {arguments.word} asked\n", answer
 
 
@@ -223,7 +223,7 @@ def _supported(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     name = typed(arguments)
     answer = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/supported", {"confirm": name})
     if not answer["reached"]:
-        return USAGE, f"{name}: nobody holds an arm of this name there\n", answer
+        raise UsageError(f"{name}: nobody holds an arm of this name there")
     return DONE, f"{name}: supported asked\n", answer
 
 

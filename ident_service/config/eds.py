@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import configparser
+import re
 from functools import lru_cache
+from typing import Final
+
+LONGEST: Final = 2**19  # characters, which ini readers take a second for
 
 
 @lru_cache(maxsize=8)
@@ -36,6 +40,10 @@ def has_object(eds: str, index: int) -> bool:
 @lru_cache(maxsize=8)
 def eds_mistake(eds: str) -> str | None:
     """Why a text is no EDS (CiA 306-1: an ini file with the section DeviceInfo); None where it may be one."""
+    if len(eds) > LONGEST:
+        return f"longer than {LONGEST} characters"
+    if why := _strange_line(eds):
+        return why
     parser = configparser.ConfigParser(strict=False, interpolation=None)
     try:
         parser.read_string(eds)
@@ -43,4 +51,25 @@ def eds_mistake(eds: str) -> str | None:
         return str(error).splitlines()[0].removesuffix(" file: '<string>'")
     if not any(name.lower() == "deviceinfo" for name in parser.sections()):
         return "it has no section [DeviceInfo]"
+    return None
+
+
+def _strange_line(eds: str) -> str | None:
+    """Find the first line that is no ini file's; Python's reader takes the square of their number to list them all."""
+    begun = False
+    level: int | None = None  # of the option that deeper lines continue
+    for number, line in enumerate(eds.split("\n"), 1):
+        text = line.strip()
+        indent = len(line) - len(line.lstrip())
+        if not text or text[0] in "#;" or (level is not None and indent > level):
+            continue
+        section, at = re.match(r"\[.+\]", text), re.search("[=:]", text)
+        begun = begun or section is not None
+        if not begun:
+            return None  # the reader says so at once
+        if section is None and at is None:
+            return f"line {number} is neither a section nor a key with a value: {text[:40]!r}"
+        if at is not None and at.start() == 0:
+            return f"line {number} has no key: {text[:40]!r}"
+        level = None if section else indent
     return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
@@ -11,7 +12,7 @@ from pydantic import ValidationError
 from ident_service.config import canopen, control, design, recording, simulation, workspace
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.kinematics import DHTable
-from ident_service.config.quantities import MAX_FILE_BYTES, UPLOAD, Section
+from ident_service.config.quantities import UPLOAD, Section
 from ident_service.config.recording import RecordingFormat
 from ident_service.config.schema import ArmConfig, FourierMotion
 from ident_service.config.shipped import shipped_arms as shipped_arms
@@ -19,6 +20,8 @@ from ident_service.config.simulation import SimulatedDriver
 from ident_service.config.source import KeyPath, Tree, first_problems, read_tree
 from ident_service.errors import ConfigError, Problem, UsageError
 
+_MOST_JSON = 4 * 2**20  # bytes: a text, a URDF and an EDS at their limits
+_MOST_VALUES = 20_000  # each may be a mistake, which takes a kilobyte
 _Described = TypeVar("_Described", bound=Section)
 _PER_JOINT = ("encoder_resolution", "torque_resolution", "torque_noise")
 
@@ -66,13 +69,28 @@ def arm_from_json(path: Path) -> ArmConfig:
     """
     if not path.is_file():
         raise UsageError(f"no such file: {path}")
-    if path.stat().st_size > 4 * MAX_FILE_BYTES:
-        raise ConfigError([Problem(path, 1, 1, f"larger than {4 * MAX_FILE_BYTES} bytes")])
+    if path.stat().st_size > _MOST_JSON:
+        raise ConfigError([Problem(path, 1, 1, f"larger than {_MOST_JSON} bytes")])
+    data = path.read_bytes()
+    if _count(data) > _MOST_VALUES:
+        raise ConfigError([Problem(path, 1, 1, f"more than {_MOST_VALUES} values")])
     try:
-        return ArmConfig.model_validate_json(path.read_bytes())
+        return ArmConfig.model_validate_json(data)
     except ValidationError as error:
         places = [(".".join(map(str, mistake["loc"])), mistake["msg"]) for mistake in error.errors(include_url=False)]
         raise ConfigError([Problem(path, 1, 1, f"{where}: {said}") for where, said in places[:10]]) from None
+
+
+def _count(data: bytes) -> int:
+    """Count the values of a JSON text; none where it is no such text, as its reader says."""
+    try:
+        left, count = [json.loads(data)], 0
+    except (ValueError, RecursionError):
+        return 0
+    while left:
+        count, value = count + 1, left.pop()
+        left += value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return count
 
 
 def load_recording_format(path: str | Path) -> RecordingFormat:

@@ -18,6 +18,7 @@ from ident_service.model.chain import Array
 
 FORMAT, VERSION = "ident-excitation", 1
 _MOST_BYTES = 4 * 2**20
+_LONGEST_NAME = 200
 LONGEST = 24 * 3600.0  # s
 _LARGEST = 1e6  # of any number in a motion's file
 _SLOWEST, _FASTEST = 1e-5, 1e3  # Hz
@@ -102,8 +103,8 @@ def excitation_from_json(text: str) -> Excitation:
         raise UsageError(f"not JSON: {error}") from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise UsageError(f"not a motion; expected a JSON object whose format is {FORMAT!r}")
-    if content.get("version") != VERSION:
-        raise UsageError(f"version {content.get('version')!r} of the format; this software reads version {VERSION}")
+    if (version := content.get("version")) != VERSION:
+        raise UsageError(f"version {version!r:.40} of the format; this software reads version {VERSION}")
     try:
         path: FourierPath | PosturePath
         if content["kind"] == "fourier":
@@ -122,7 +123,7 @@ def excitation_from_json(text: str) -> Excitation:
         elif content["kind"] == "postures":
             path = PosturePath(_array(content, "points", 2), _array(content, "times", 1), _number(content, "dwell"))
         else:
-            raise UsageError(f"kind {content['kind']!r} is none of fourier, postures")
+            raise UsageError(f"kind {content['kind']!r:.40} is none of fourier, postures")
         name, sha256, made = content["name"], content["arm"]["sha256"], content.get("made", {})
     except KeyError as error:
         raise UsageError(f"{error.args[0]!r} is missing") from None
@@ -132,6 +133,8 @@ def excitation_from_json(text: str) -> Excitation:
         raise UsageError("'arm' must be an object with the arm's sha256") from None
     if not (isinstance(name, str) and isinstance(sha256, str) and isinstance(made, dict)):
         raise UsageError("name and arm.sha256 must be text, made an object")
+    if max(len(name), len(sha256)) > _LONGEST_NAME:
+        raise UsageError(f"name and arm.sha256 have {_LONGEST_NAME} characters at most")
     try:
         json.dumps(made, allow_nan=False)
     except ValueError:

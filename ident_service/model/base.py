@@ -179,17 +179,17 @@ def _independent_columns(matrix: Array) -> tuple[NDArray[np.intp], Array]:
     Numerically null columns are none.
     """
     norms = np.linalg.norm(matrix, axis=0)
-    Q = np.zeros((matrix.shape[0], 0))
+    basis = np.zeros((matrix.shape[0], min(matrix.shape)), order="F")
     chosen: list[int] = []
     lengths: list[float] = []
     # Columns that are only rounding noise must go before any scaling, or the noise looks like rank.
     for column in np.flatnonzero(norms > _RANK_TOLERANCE * norms.max()):
-        residual = matrix[:, column] / norms[column]
+        residual, Q = matrix[:, column] / norms[column], basis[:, : len(chosen)]
         for _ in range(2):
             residual = residual - Q @ (Q.T @ residual)
         length = float(np.linalg.norm(residual))
         if length > _RANK_TOLERANCE:
+            basis[:, len(chosen)] = residual / length
             chosen.append(int(column))
             lengths.append(length)
-            Q = np.column_stack([Q, residual / length])
     return np.array(chosen, dtype=np.intp), np.array(lengths)

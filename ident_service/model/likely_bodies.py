@@ -115,3 +115,23 @@ def _is_body(parameters: Array) -> bool:
     spread = (0.5 * np.trace(L) * np.eye(3) - L) / m - np.outer(center, center)
     size = float(np.linalg.norm(center)) + np.sqrt(max(float(np.trace(spread)), 0.0))
     return bool(np.linalg.eigvalsh(spread)[0] > 1e-8 * size**2)
+
+
+def drawn_about(parameters: Array, rng: np.random.Generator) -> Array:
+    """Draw a real body about another one: A P A^T with A near the identity, so masses within about a tenth.
+
+    Args:
+        parameters: of a real body, shape (10,), see `INERTIAL`.
+        rng: where the draw comes from.
+    """
+    xx, xy, xz, yy, yz, zz, x, y, z, m = parameters
+    L = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    P = np.empty((4, 4))
+    P[:3, :3], P[:3, 3], P[3, :3], P[3, 3] = 0.5 * np.trace(L) * np.eye(3) - L, (x, y, z), (x, y, z), m
+    size = np.sqrt(np.trace(P[:3, :3]) / m)
+    A = np.eye(4) + 0.05 * rng.uniform(-1.0, 1.0, size=(4, 4))
+    A[:3, 3] *= size
+    A[3, :3] = 0.0
+    P = A @ P @ A.T
+    L = np.trace(P[:3, :3]) * np.eye(3) - P[:3, :3]
+    return np.array([L[0, 0], L[0, 1], L[0, 2], L[1, 1], L[1, 2], L[2, 2], *P[:3, 3], P[3, 3]])

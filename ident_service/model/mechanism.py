@@ -29,6 +29,7 @@ from ident_service.model.limited_process import ask_process
 Kind = Literal["urdf", "mjcf"]
 MOST_BYTES: Final = 2 * 2**20
 MOST_ELEMENTS: Final = 20_000
+MOST_ATTRIBUTES: Final = 64  # of one element; a URDF's reader compares each with each
 MOST_LINKS: Final = 256
 DEEPEST_LINKS: Final = 64  # a level takes 2 kB of the stack, of which a thread may have 512 kB
 _DEEPEST_ELEMENTS = 128
@@ -140,6 +141,8 @@ class _Counter:
         self._depth += 1
         if self._elements > MOST_ELEMENTS:
             self._refuse(f"more than {MOST_ELEMENTS} elements")
+        if len(attributes) > MOST_ATTRIBUTES:
+            self._refuse(f"more than {MOST_ATTRIBUTES} attributes of one element")
         if self._depth > _DEEPEST_ELEMENTS:
             self._refuse(f"more than {_DEEPEST_ELEMENTS} elements in one another")
         if tag == self._link:

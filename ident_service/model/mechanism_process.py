@@ -60,13 +60,13 @@ def _document(
     n = model.njoints - 1
     if n == 0:
         return {"error": "no movable joint"}
-    data = model.createData()
     revolute, axes = [], []
     for k in range(1, n + 1):
         joint = model.joints[k].shortname()
         if not joint.startswith(_SUPPORTED) or joint in _UNSUPPORTED:
             return {"error": f"joint {model.names[k]!r} is a {joint}; only revolute and prismatic joints are supported"}
-        screw = np.asarray(data.joints[k].S).reshape(6)
+        # Of the joint alone: data of a whole model hold the cube of its joints.
+        screw = np.asarray(model.joints[k].createData().S).reshape(6)
         turns = bool(np.any(screw[3:]))
         revolute.append(turns)
         axes.append((screw[3:] if turns else screw[:3]).tolist())

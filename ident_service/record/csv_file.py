@@ -143,7 +143,7 @@ class CsvRecording:
         if not text.isascii() or b"_" in text:
             self._explain(rows, first)
         times = fields[columns.time :: columns.fields]
-        bad = ~(np.abs(values[:, columns.time]) * float(columns.nanoseconds) < _MAX_SECONDS * 1e9)
+        bad = ~(np.abs(values[:, columns.time]) < _MAX_SECONDS * 1e9 / float(columns.nanoseconds))
         if bad.any():
             index = int(np.argmax(bad))
             raise RecordingError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from ident_service.config.recording import Column
 from ident_service.errors import RecordingError
 
+_MOST_COLUMNS: Final = 4096
 _NAME: Final = re.compile(r"(q|dq|tau)([1-9]\d{0,3})")
 
 
@@ -67,7 +69,9 @@ def parse_header(path: Path, header: str, columns: Mapping[str, Column] | None =
     names = tuple(name.strip() for name in header.split(","))
     if not header.strip():
         raise RecordingError(path, "is empty; expected a header t,q1..qN,tau1..tauN")
-    problems = [f"column {name!r} appears twice" for name in sorted(set(names)) if names.count(name) > 1]
+    if len(names) > _MOST_COLUMNS:
+        raise RecordingError(path, f"line 1: {len(names)} columns; a recording has {_MOST_COLUMNS} at most")
+    problems = [f"column {name!r} appears twice" for name, count in sorted(Counter(names).items()) if count > 1]
     if columns is None:
         place = {name: index for index, name in enumerate(names)}
     else:

@@ -9,6 +9,7 @@ import json
 from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
+from itertools import islice
 from typing import Any
 
 import jsonschema_rs
@@ -16,6 +17,8 @@ import jsonschema_rs
 from ident_service.errors import ParameterError
 
 _MOST = 10  # mistakes that are told
+# Each mistake holds a copy of what is wrong: 16 MB of them took 5 GB. So they are looked for in so much of a document.
+_VALUES, _ENTRIES, _KEYS, _CHARACTERS = 20_000, 200, 1000, 1000
 
 
 def require_schema(content: Any, name: str, where: object, what: str) -> None:
@@ -30,11 +33,23 @@ def require_schema(content: Any, name: str, where: object, what: str) -> None:
     Raises:
         ParameterError: it does not fit; the first mistakes with their places.
     """
-    mistakes = [(_place(mistake.instance_path), mistake.message) for mistake in _validator(name).iter_errors(content)]
-    mistakes.sort(key=lambda mistake: mistake[0])
-    if mistakes:
-        told = "; ".join(f"{place}: {message[:200]}" for place, message in mistakes[:_MOST])
-        raise ParameterError(f"{where}: not {what}: {told}")
+    validator = _validator(name)
+    if validator.is_valid(content):
+        return
+    found = validator.iter_errors(_first(content, [_VALUES]))
+    mistakes = sorted(((_place(one.instance_path), one.message) for one in found), key=lambda mistake: mistake[0])
+    told = "; ".join(f"{place}: {message[:200]}" for place, message in mistakes[:_MOST])
+    raise ParameterError(f"{where}: not {what}: {told or f'something is wrong beyond its first {_ENTRIES} entries'}")
+
+
+def _first(value: Any, room: list[int]) -> Any:
+    """Copy the first parts of a document; `room` is how many values it may still have."""
+    room[0] -= 1
+    if isinstance(value, list):
+        return [_first(one, room) for one in value[:_ENTRIES] if room[0] > 0]
+    if isinstance(value, dict):
+        return {key: _first(one, room) for key, one in islice(value.items(), _KEYS) if room[0] > 0}
+    return value[:_CHARACTERS] if isinstance(value, str) else value
 
 
 def _place(path: Sequence[str | int]) -> str:

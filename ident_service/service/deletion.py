@@ -106,15 +106,15 @@ def delete_arm(db: Database, state: Path, arm: str, who: str, *, anyway: bool = 
         for one in motions:
             _delete_motion(db, state, one, who)
         gone = [_hide(arm_folder(state, arm))]
+        place, own = state / DESCRIPTIONS, re.compile(re.escape(arm) + r"-[0-9a-f]{16}")
         with db.transaction():
+            # In here, so that whoever adds the arm again finds its description, or does not.
+            gone += [_hide(path) for path in (place.iterdir() if place.is_dir() else ()) if own.fullmatch(path.name)]
             for table in ("schedules", "dues", "alarms", "acceptances", "reidentifications", "maintenance_events"):
                 db.write(f"DELETE FROM {table} WHERE arm = ?", arm)  # noqa: S608 - ours
             db.write("DELETE FROM arms WHERE name = ?", arm)
             note(db, who, "arm deleted", arm, with_it=[asdict(one) for one in found[:100]])
             know_shipped(db)
-    place = state / DESCRIPTIONS
-    own = re.compile(re.escape(arm) + r"-[0-9a-f]{16}")
-    gone += [_hide(path) for path in (place.iterdir() if place.is_dir() else ()) if own.fullmatch(path.name)]
     _remove(gone)
     return found
 
@@ -180,7 +180,9 @@ def _require_idle(db: Database, what: str, busy: list[str]) -> None:
 def _require_none(what: str, found: list[Dependent], *, anyway: bool) -> None:
     if found and not anyway:
         names = ", ".join(f"{one.kind} {one.id}" for one in found[:10]) + (", ..." if len(found) > 10 else "")
-        raise InUse(f"{what} is referred to by {names}; ask for deleting it anyway", found)
+        raise InUse(
+            f"{what} is referred to by {names}; to delete it all the same, say so (`--anyway`, `?anyway=true`)", found
+        )
 
 
 def _delete_run(db: Database, state: Path, row: Row, who: str) -> None:

@@ -27,7 +27,7 @@ from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel, share_touching
-from ident_service.model.likely_bodies import likely_bodies, lines_of
+from ident_service.model.likely_bodies import drawn_about, likely_bodies, lines_of
 from ident_service.model.mechanism import count_mechanism
 from ident_service.model.outline import mesh_capsules
 from ident_service.model.rigid_body import InverseDynamics
@@ -344,26 +344,6 @@ def _drives(draft: Draft, model: ArmModel) -> None:
     delta[layout.term_columns("coulomb")] = _FRICTION * limits.torque * shares[2]
     delta[layout.term_columns("offset")] = 0.1 * _FRICTION * limits.torque * rng.uniform(-1.0, 1.0, chain.joints)
     draft.truth = _table(model, delta)
-
-
-def drawn_about(parameters: Array, rng: np.random.Generator) -> Array:
-    """Draw a real body about another one: A P A^T with A near the identity, so masses within about a tenth.
-
-    Args:
-        parameters: of a real body, shape (10,), see `INERTIAL`.
-        rng: where the draw comes from.
-    """
-    xx, xy, xz, yy, yz, zz, x, y, z, m = parameters
-    L = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    P = np.empty((4, 4))
-    P[:3, :3], P[:3, 3], P[3, :3], P[3, 3] = 0.5 * np.trace(L) * np.eye(3) - L, (x, y, z), (x, y, z), m
-    size = np.sqrt(np.trace(P[:3, :3]) / m)
-    A = np.eye(4) + 0.05 * rng.uniform(-1.0, 1.0, size=(4, 4))
-    A[:3, 3] *= size
-    A[3, :3] = 0.0
-    P = A @ P @ A.T
-    L = np.trace(P[:3, :3]) * np.eye(3) - P[:3, :3]
-    return np.array([L[0, 0], L[0, 1], L[0, 2], L[1, 1], L[1, 2], L[2, 2], *P[:3, 3], P[3, 3]])
 
 
 def _gains(draft: Draft, loaded: Callable[[], ArmModel]) -> None:

@@ -174,7 +174,11 @@ class Watch:
 
     def _read_arms(self) -> None:
         moving, place = set(moving_arms(self._state)), self._state / "arms"
-        for folder in sorted(place.iterdir()) if place.is_dir() else ():
+        folders = [one for one in sorted(place.iterdir()) if not one.name.startswith(".")] if place.is_dir() else []
+        for kind, name in self._standing.keys() - {("arm", folder.name) for folder in folders}:
+            if kind == "arm":  # it was deleted, which is a line of the trail
+                del self._standing[kind, name]
+        for folder in folders:
             try:
                 faults = sorted(fault_file(self._state, folder.name).latched())
             except IdentError:

@@ -126,9 +126,10 @@ def begin_upload(db: Database, state: Path, announced: Announced) -> Upload:
         promised = sum(one.announced.bytes - one.received for one in others)
         if shutil.disk_usage(state).free < announced.bytes + promised + KEPT_FREE:
             raise NoRoom(f"{name} has {announced.bytes} bytes; the disk of the state folder has no room for it")
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        (folder / _DATA).touch(0o600)
-        write_atomically(folder / UPLOAD, json.dumps(asdict(announced)))
+        with _known(announced.id):
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            (folder / _DATA).touch(0o600)
+            write_atomically(folder / UPLOAD, json.dumps(asdict(announced)))
     return known_upload(state, announced.id)
 
 
@@ -143,7 +144,7 @@ def known_upload(state: Path, upload: str) -> Upload:
         announced = Announced(**json.loads((folder / UPLOAD).read_text(encoding="utf-8")))
         return Upload(upload, announced, (folder / _DATA).stat().st_size)
     except (OSError, ValueError, TypeError):
-        raise UnknownId(f"no upload {upload!r} is under way; announce the recording again") from None
+        raise _unknown(upload) from None
 
 
 def uploads(state: Path) -> list[Upload]:
@@ -172,7 +173,10 @@ class Piece:
         """
         seen = known_upload(state, upload)
         self._most = seen.announced.bytes
-        self._fd = os.open(state / UPLOADS / upload / _DATA, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC | os.O_NOFOLLOW)
+        with _known(upload):
+            self._fd = os.open(
+                state / UPLOADS / upload / _DATA, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC | os.O_NOFOLLOW
+            )
         try:
             fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
             self._size = os.fstat(self._fd).st_size
@@ -236,9 +240,9 @@ def complete_upload(db: Database, state: Path, upload: str, who: str) -> Upload:
             write_atomically(built / UPLOAD, json.dumps({"format": "ident-upload", "version": 1, **asdict(announced)}))
             if announced.columns:
                 write_atomically(built / COLUMNS, announced.columns)
-            with (folder / _DATA).open("rb") as stream:
+            with _known(upload), (folder / _DATA).open("rb") as stream:
                 os.fsync(stream.fileno())
-            (folder / _DATA).rename(built / announced.name)
+                (folder / _DATA).rename(built / announced.name)
             write_manifest(built)
             if named_files(built)[announced.name] != announced.sha256:
                 raise RecordingError(announced.name, "arrived with another hash than was announced; send it again")
@@ -246,6 +250,19 @@ def complete_upload(db: Database, state: Path, upload: str, who: str) -> Upload:
     index_run(db, state, run)
     note(db, who, "recording uploaded", run, arm=arm.name, name=announced.name, sha256=announced.sha256)
     return Upload(upload, announced, announced.bytes, run)
+
+
+def _unknown(upload: str) -> UnknownId:
+    return UnknownId(f"no upload {upload!r} is under way; announce the recording again")
+
+
+@contextmanager
+def _known(upload: str) -> Iterator[None]:
+    """Know an upload no more that is deleted in this moment."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise _unknown(upload) from None
 
 
 @contextmanager

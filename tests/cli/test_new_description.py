@@ -17,9 +17,10 @@ from ident_service.config.load import load_arm
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import arm_model
+from ident_service.model.likely_bodies import drawn_about
 from ident_service.model.outline import capsule_around
 from ident_service.model.rigid_body import inertia_from_delta
-from ident_service.service.new_description import _part, drawn_about
+from ident_service.service.new_description import _part
 
 
 def box_stl(x: float, y: float, z: float) -> bytes:

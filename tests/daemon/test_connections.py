@@ -54,7 +54,7 @@ class Book(Connections):
         """Close everything."""
         for end in (*self.theirs.values(), *self.ours.values()):
             end.close()
-        assert (self.count, self.full, self.busy) == (0, False, False)
+        assert (self.count, self.full, self.busy(None)) == (0, False, False)
 
 
 def _ended(theirs: socket.socket) -> bool:
@@ -89,12 +89,12 @@ def test_what_is_answered_stays_and_leaves_places_for_a_stop() -> None:
     for port in range(4):
         assert book.come(FAR, port)
         book.headers_came((FAR, port), body=False)
-        assert not book.busy
+        assert not book.busy((NEAR, 0))
     assert not book.come(FAR, 9)  # nobody of this address can go
     for port in range(2):
         assert book.come(NEAR, port)
         book.headers_came((NEAR, port), body=False)
-    assert book.busy  # three quarters: the doors refuse all but stops and leases
+    assert book.busy((NEAR, 9))  # three quarters: the doors refuse all but stops and leases
     assert book.gone() == [(FAR, 9)]
     book.end()
 
@@ -140,7 +140,7 @@ def test_a_request_that_comes_before_the_last_one_is_told_of_keeps_its_time() ->
 def test_a_busy_service_answers_stops_and_leases_alone(state: Path) -> None:
     with serving(state) as daemon:
         daemon.app.user_middleware[0].kwargs["connections"].__class__ = type(
-            "Busy", (Connections,), {"busy": property(lambda _: True)}
+            "Busy", (Connections,), {"busy": lambda *_: True}
         )
         answer = daemon.get("/api/v1/arms")
         assert (answer.status_code, answer.headers["retry-after"]) == (503, "1")

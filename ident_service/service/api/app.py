@@ -145,8 +145,8 @@ async def _refresh(service: Service) -> None:
                     _LOG.info("an upload was left alone for a day and is deleted", extra={"upload": upload})
             await run_in_threadpool(service.gate.refresh)
             await run_in_threadpool(service.db.rest)
-        except sqlite3.Error as error:
-            _LOG.error("the registry cannot be looked after: %s", error)
+        except (sqlite3.Error, OSError) as error:
+            _LOG.error("the state folder cannot be looked after: %s", error)
 
 
 def _webhook(settings: Settings, db: Database) -> Webhook | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ipaddress
 import math
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
@@ -27,6 +28,9 @@ from ident_service.service.registry.tokens import Access
 
 COOKIE: Final = "ident_session"
 _SAFE = frozenset({"GET", "HEAD"})
+
+
+WhileKnown = Callable[[AsyncIterator[str]], AsyncIterator[str]]
 
 
 @dataclass(frozen=True)
@@ -148,6 +152,19 @@ async def lease_keeper(request: Request, bearer: Bearer = None, cookie: Cookie =
     return await operator(found)
 
 
+async def while_known(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> WhileKnown:
+    """Let a stream end when the token or session with which it was asked for counts no more."""
+    gate, secret = service_of(request).gate, None if bearer is None else bearer.credentials
+
+    async def told(events: AsyncIterator[str]) -> AsyncIterator[str]:
+        async for one in events:
+            if gate.known(secret, cookie) is None:
+                return
+            yield one
+
+    return told
+
+
 def unknown() -> HTTPException:
     """Nobody that we know."""
     return HTTPException(
@@ -171,5 +188,6 @@ Serving = Annotated[Service, Depends(serving)]
 Near = Annotated[str, Depends(anybody_near)]
 LeaseKeeper = Annotated[Access, Depends(lease_keeper)]
 Viewer = Annotated[Access, Depends(viewer)]
+Told = Annotated[WhileKnown, Depends(while_known)]
 Operator = Annotated[Access, Depends(operator)]
 """What routes ask for."""

@@ -2,8 +2,9 @@
 
 A newcomer is always let in. Where there are too many, of one address or of all, the connection goes that has waited
 longest without a whole request: half a request, a TLS handshake that does not go on, an idle line. So a stop finds a
-place, whoever keeps lines open. What is being answered stays; there is less of it than there are places, because
-the doors refuse more (`busy`), a stop and a lease excepted.
+place, whoever keeps lines open. What is being answered stays; there is less of it than there are places, of one
+address and of all, because the doors refuse more (`busy`), a stop and a lease excepted. Who does not read its answer is
+let go, too.
 
 uvicorn's own `limit_concurrency` counts idle lines and would refuse the stop, and it has no deadline for a request.
 Boundary: sockets of the event loop's thread; requests and answers are `doors.py`.
@@ -21,6 +22,7 @@ from typing import Any, Final, Self
 
 HEADER_SECONDS: Final = 10.0  # for a handshake and the headers of a request
 BODY_SECONDS: Final = 60.0  # for 16 MiB over 2.2 Mbit/s
+ANSWER_SECONDS: Final = 60.0  # for the next piece of an answer that the other end does not read
 _MOST, _FEWEST = 512, 16
 _DESCRIPTORS = 4096  # that are asked for, where the limit of the process may be raised so far
 _RESERVE = 256  # descriptors for files, pipes of jobs, and connections that are about to go
@@ -49,9 +51,10 @@ class Connections:
             most: how many there may be; half as many of one address.
             now: clock of the deadlines [s].
         """
-        self._most, self._now = most, now
+        self._most, self._most_of_one, self._now = most, max(most // 2, 1), now
         self._open: dict[Peer, Connection] = {}
         self._waiting: dict[Peer, float] = {}  # to the deadline, the longest waiting first
+        self._sending: dict[Peer, float] = {}  # to the deadline
         self._of_one, self._requests = Counter[str](), Counter[Peer]()
         self._leaving = 0
 
@@ -60,10 +63,14 @@ class Connections:
         """Tell whether even those that are about to go have not gone yet."""
         return len(self._open) + self._leaving >= self._most + _LEAVING
 
-    @property
-    def busy(self) -> bool:
-        """Tell whether as many requests are being answered as may be."""
-        return len(self._open) - len(self._waiting) >= 3 * self._most // 4
+    def busy(self, peer: Peer | None) -> bool:
+        """Tell whether as many requests are being answered as may be, of all or of this one's address."""
+        if len(self._open) - len(self._waiting) >= 3 * self._most // 4:
+            return True
+        most, host = 3 * self._most_of_one // 4, None if peer is None else peer[0]
+        if host is None or self._of_one[host] < most:
+            return False
+        return self._of_one[host] - sum(one[0] == host for one in self._waiting) >= most
 
     @property
     def count(self) -> int:
@@ -73,7 +80,7 @@ class Connections:
     def admit(self, connection: Connection) -> bool:
         """Let a newcomer in, another one go if necessary; False where nobody can go."""
         host = connection.peer[0]
-        if self._of_one[host] >= max(self._most // 2, 1):
+        if self._of_one[host] >= self._most_of_one:
             longest = next((peer for peer in self._waiting if peer[0] == host), None)
         elif len(self._open) >= self._most:
             longest = next(iter(self._waiting), None)
@@ -102,6 +109,16 @@ class Connections:
         if peer is not None:
             self._waiting.pop(peer, None)
 
+    def sending(self, peer: Peer | None) -> None:
+        """Know that a piece of an answer is on its way; the other end has time to read it."""
+        if peer in self._open:
+            self._sending[peer] = self._now() + ANSWER_SECONDS
+
+    def sent(self, peer: Peer | None) -> None:
+        """Know that it has been taken."""
+        if peer is not None:
+            self._sending.pop(peer, None)
+
     def answered(self, peer: Peer | None) -> None:
         """Know that it is answered; the line waits for another one."""
         if peer in self._open:
@@ -120,8 +137,9 @@ class Connections:
     def sweep(self) -> None:
         """Let those go whose time is over."""
         now = self._now()
-        for peer in [peer for peer, deadline in self._waiting.items() if deadline < now]:
-            self._let_go(peer)
+        for table in (self._waiting, self._sending):
+            for peer in [peer for peer, deadline in table.items() if deadline < now]:
+                self._let_go(peer)
 
     def _let_go(self, peer: Peer) -> None:
         connection = self._forget(peer)
@@ -134,6 +152,7 @@ class Connections:
     def _forget(self, peer: Peer) -> Connection:
         connection = self._open.pop(peer)
         self._waiting.pop(peer, None)
+        self._sending.pop(peer, None)
         self._requests.pop(peer, None)
         self._of_one[peer[0]] -= 1
         if not self._of_one[peer[0]]:

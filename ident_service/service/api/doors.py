@@ -58,6 +58,13 @@ class _TooLarge(HTTPException):
         super().__init__(413, f"a request has {most} bytes at most")
 
 
+class _Busy(HTTPException):
+    """As many requests are being answered as may be."""
+
+    def __init__(self) -> None:
+        super().__init__(503, "too many requests are being answered; ask again", {"Retry-After": "1"})
+
+
 class Doors:
     """Wraps the application."""
 
@@ -76,7 +83,8 @@ class Doors:
             return  # there is nothing else here
         began, status, started = time.perf_counter(), 500, False
         peer: Peer | None = scope.get("client")
-        busy = self._connections.busy and not scope["path"].endswith(_URGENT)
+        urgent = scope["path"].endswith(_URGENT)
+        busy = not urgent and self._connections.busy(peer)
         self._connections.headers_came(peer, body=_has_body(scope))
 
         async def answer(message: Message) -> None:
@@ -88,20 +96,23 @@ class Doors:
                 if b"cache-control" not in given:
                     more.append((b"cache-control", b"no-store"))
                 message["headers"] = [*message.get("headers", ()), *more]
+            self._connections.sending(peer)
             await send(message)
+            self._connections.sent(peer)
 
         try:
             if (refused := self._refusal(scope)) is not None:
                 await _refuse(answer, *refused)
                 return
             if busy:
-                await _refuse(answer, 503, "Busy", "too many requests are being answered; ask again")
+                await _refuse(answer, 503, "Busy", _Busy().detail)
                 return
             try:
-                await self._app(scope, self._counted(scope, receive), answer)
-            except _TooLarge as error:
+                await self._app(scope, self._counted(scope, receive, urgent=urgent), answer)
+            except (_TooLarge, _Busy) as error:
                 if not started:
-                    await _refuse(answer, 413, "TooLarge", error.detail)
+                    kind = "TooLarge" if isinstance(error, _TooLarge) else "Busy"
+                    await _refuse(answer, error.status_code, kind, error.detail)
         finally:
             self._connections.answered(peer)
             stop = scope["method"] == "POST" and scope["path"].endswith("/stop")
@@ -132,18 +143,23 @@ class Doors:
             return 403, "WrongOrigin", "a page of another origin may not ask this service for anything"
         return None
 
-    def _counted(self, scope: Scope, receive: Receive) -> Receive:
-        most, seen = _most_body(scope["method"], scope["path"]), 0
+    def _counted(self, scope: Scope, receive: Receive, *, urgent: bool) -> Receive:
+        most, seen, peer = _most_body(scope["method"], scope["path"]), 0, scope.get("client")
+        whole = not _has_body(scope)
 
         async def counted() -> Message:
-            nonlocal seen
+            nonlocal seen, whole
             message = await receive()
             if message["type"] == "http.request":
                 seen += len(message.get("body", b""))
                 if seen > most:
                     raise _TooLarge(most)
-                if not message.get("more_body", False):
-                    self._connections.request_came(scope.get("client"))
+                if not whole and not message.get("more_body", False):
+                    whole = True
+                    # While the body came, others may have taken the places of those that are answered.
+                    if not urgent and self._connections.busy(peer):
+                        raise _Busy
+                    self._connections.request_came(peer)
             return message
 
         return counted

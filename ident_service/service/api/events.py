@@ -12,7 +12,7 @@ from fastapi import APIRouter, Header, Query, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import StreamingResponse
 
-from ident_service.service.api.asking import Service, Serving, Viewer
+from ident_service.service.api.asking import Service, Serving, Told, Viewer
 from ident_service.service.api.live_stream import RECORDED
 from ident_service.service.api.mistakes import failures, failures_of_files
 from ident_service.service.live import LiveRuns
@@ -43,7 +43,7 @@ Samples = Annotated[bool, Query(description="also `samples` and `doubt` of runs 
 
 @router.get("/events", response_class=StreamingResponse, responses=_STREAM)
 async def watch_all(
-    service: Serving, _: Viewer, request: Request, last_event_id: LastEvent = None, samples: Samples = False
+    service: Serving, _: Viewer, told: Told, request: Request, last_event_id: LastEvent = None, samples: Samples = False
 ) -> StreamingResponse:
     """Watch all arms and jobs by server-sent events.
 
@@ -54,7 +54,7 @@ async def watch_all(
     watch: Watch = request.app.state.watch
     seen = await run_in_threadpool(watch.begin, last_event_id)
     live = request.app.state.live if samples else None
-    return StreamingResponse(_events(service, watch, seen, live), media_type="text/event-stream")
+    return StreamingResponse(told(_events(service, watch, seen, live)), media_type="text/event-stream")
 
 
 async def _events(service: Service, watch: Watch, seen: Seen, live: LiveRuns | None) -> AsyncIterator[str]:

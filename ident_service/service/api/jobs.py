@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from ident_service.errors import MotionRefused, UsageError
 from ident_service.service.api.answers import JobAnswer, JobResult, LeaseAnswer, StopAnswer
-from ident_service.service.api.asking import LeaseKeeper, Near, Operator, Service, Serving, Viewer
+from ident_service.service.api.asking import LeaseKeeper, Near, Operator, Service, Serving, Told, Viewer
 from ident_service.service.api.mistakes import failures, failures_of_files
 from ident_service.service.api.paging import PAGES, BeforeNumber, Most, Page
 from ident_service.service.jobs.asked import MOVES, ArmName, Asked, Id
@@ -163,10 +163,10 @@ def get_result(service: Serving, _: Viewer, job: Id) -> JobResult:
 
 
 @router.get("/jobs/{job}/events", response_class=StreamingResponse, responses=_STREAM)
-async def watch_job(service: Serving, _: Viewer, job: Id) -> StreamingResponse:
+async def watch_job(service: Serving, _: Viewer, told: Told, job: Id) -> StreamingResponse:
     """Watch a job by server-sent events; `job` whenever it changes, until it has ended."""
     row = await run_in_threadpool(rows.known_job, service.db, job)
-    return StreamingResponse(_events(service, row["id"]), media_type="text/event-stream")
+    return StreamingResponse(told(_events(service, row["id"])), media_type="text/event-stream")
 
 
 @router.post("/jobs/{job}/cancel")

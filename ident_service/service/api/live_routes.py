@@ -8,7 +8,7 @@ from fastapi import APIRouter, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import StreamingResponse
 
-from ident_service.service.api.asking import Serving, Viewer
+from ident_service.service.api.asking import Serving, Told, Viewer
 from ident_service.service.api.live_stream import live_events
 from ident_service.service.api.mistakes import failures, failures_of_files
 from ident_service.service.jobs.asked import Id
@@ -22,11 +22,11 @@ _STREAM: dict[int | str, dict[str, Any]] = {
 
 
 @router.get("/jobs/{job}/live", response_class=StreamingResponse, responses=_STREAM)
-async def watch_live(service: Serving, _: Viewer, request: Request, job: Id) -> StreamingResponse:
+async def watch_live(service: Serving, _: Viewer, told: Told, request: Request, job: Id) -> StreamingResponse:
     """Watch a job and the run that it records, by server-sent events.
 
     `job` has its state and log; `samples` has time, position, torque and following error of every joint, one every
     20 ms; `doubt` has the standard deviations of the parameters so far.
     """
     row = await run_in_threadpool(rows.known_job, service.db, job)
-    return StreamingResponse(live_events(service, request.app.state.live, row), media_type="text/event-stream")
+    return StreamingResponse(told(live_events(service, request.app.state.live, row)), media_type="text/event-stream")

@@ -88,7 +88,12 @@ def known_arm(db: Database, state: Path, name: str) -> KnownArm:
     path = shipped_arms().get(name) if row["source"] == "shipped" else state / row["folder"] / ARM_FILE
     if path is None:
         raise UsageError(f"the arm {name!r} was shipped with other software than this; upload its description")
-    config = load_arm(path)
+    try:
+        config = load_arm(path)
+    except (ConfigError, UsageError):
+        if db.row("SELECT 1 FROM arms WHERE name = ?", name) is None:  # deleted in this moment
+            raise UnknownId(f"no arm {name!r} is known; the list of arms names them") from None
+        raise
     if row["sha256"] != config.sha256:
         db.write(
             "UPDATE arms SET sha256 = ?, description = ?, resources = ? WHERE name = ?",
@@ -129,20 +134,21 @@ def add_arm(
         folder = state / DESCRIPTIONS / f"{config.name}-{config.sha256[:16]}"
         if not folder.exists():
             judge(path)
-            with appearing_folder(folder) as built:
-                for part in path.parent.iterdir():
-                    shutil.copyfile(part, built / part.name)
-    with db.transaction():
-        _require_free(db, config, replace=replace)
-        db.write(
-            "INSERT INTO arms VALUES (?, ?, ?, 'uploaded', ?, ?, 0, ?, ?) ON CONFLICT (name) DO UPDATE SET "
-            "sha256 = excluded.sha256, description = excluded.description, source = excluded.source, "
-            "folder = excluded.folder, resources = excluded.resources, added = excluded.added, "
-            "added_by = excluded.added_by",
-            *(config.name, config.sha256, config.description, str(folder.relative_to(state))),
-            *(json.dumps(resources(config)), time.time(), by),
-        )
-        note(db, by, "arm added", config.name, sha256=config.sha256)
+        with db.transaction():  # whoever deletes the arm, or adds it too, comes before or after
+            _require_free(db, config, replace=replace)
+            if not folder.exists():
+                with appearing_folder(folder) as built:
+                    for part in path.parent.iterdir():
+                        shutil.copyfile(part, built / part.name)
+            db.write(
+                "INSERT INTO arms VALUES (?, ?, ?, 'uploaded', ?, ?, 0, ?, ?) ON CONFLICT (name) DO UPDATE SET "
+                "sha256 = excluded.sha256, description = excluded.description, source = excluded.source, "
+                "folder = excluded.folder, resources = excluded.resources, added = excluded.added, "
+                "added_by = excluded.added_by",
+                *(config.name, config.sha256, config.description, str(folder.relative_to(state))),
+                *(json.dumps(resources(config)), time.time(), by),
+            )
+            note(db, by, "arm added", config.name, sha256=config.sha256)
     return KnownArm(config.name, folder / ARM_FILE, config, "uploaded")
 
 

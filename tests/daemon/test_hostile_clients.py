@@ -1,0 +1,305 @@
+"""Clients that flood, do not read, were sent away, or delete what others use: no stop waits, nothing stays torn."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+import socket
+import threading
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote, urlsplit
+
+import httpx
+import pytest
+from daemon.conftest import URL, Asked, quick_text, serving
+from daemon.served import daemon_process
+from daemon.test_connections import FAR, NEAR, Book
+from daemon.test_uploads import announced, sent
+from fastapi.dependencies.models import Dependant
+from fastapi.responses import StreamingResponse
+from fastapi.routing import APIRoute
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from ident_service.client import IdentClient
+from ident_service.service import deletion, uploads
+from ident_service.service.api.app import ROUTERS
+from ident_service.service.api.asking import while_known
+from ident_service.service.api.connections import ANSWER_SECONDS, HEADER_SECONDS, Connections
+from ident_service.service.news import LOOK
+from ident_service.service.registry import arms
+from ident_service.service.registry.database import Database
+from ident_service.service.registry.tokens import add_token, revoke_token
+
+
+def test_one_address_leaves_places_for_its_own_stops() -> None:
+    book = Book(32)
+    for port in range(12):
+        assert book.come(FAR, port)
+        assert not book.busy((FAR, port))
+        book.headers_came((FAR, port), body=False)
+    assert book.busy((FAR, 12))  # three quarters of the places of one address
+    assert not book.busy((NEAR, 1))
+    for port in range(12, 40):
+        assert book.come(FAR, port)
+    assert book.gone() == [(FAR, port) for port in range(12, 36)]
+    book.end()
+
+
+def test_who_does_not_read_an_answer_is_let_go() -> None:
+    book = Book(8)
+    for port in range(3):
+        assert book.come(NEAR, port)
+        book.headers_came((NEAR, port), body=False)
+        book.sending((NEAR, port))
+    book.sent((NEAR, 1))
+    book.at += ANSWER_SECONDS - 1.0
+    book.sending((NEAR, 2))  # a stream, of which the last piece was read
+    book.at += 2.0
+    book.sweep()
+    assert book.gone() == [(NEAR, 0)]
+    book.at += 2.0 * HEADER_SECONDS
+    book.sweep()
+    assert book.gone() == [(NEAR, 0)]
+    book.end()
+
+
+def test_the_doors_know_who_does_not_read(state: Path) -> None:
+    book = Book(8)
+    with serving(state) as daemon:
+        daemon.app.user_middleware[0].kwargs["connections"] = book
+        assert book.come(NEAR, 5)
+        read, scope = asyncio.Event(), {"type": "http", "http_version": "1.1", "method": "GET", "path": "/healthz"}
+        scope |= {"raw_path": b"/healthz", "query_string": b"", "scheme": "http", "client": (NEAR, 5)}  # type: ignore[dict-item]
+        scope |= {"headers": [(b"host", b"127.0.0.1")], "root_path": ""}  # type: ignore[dict-item]
+
+        async def receive() -> dict[str, Any]:
+            return {"type": "http.request", "body": b"", "more_body": False}
+
+        async def send(message: Any) -> None:
+            await read.wait()
+
+        answering = asyncio.run_coroutine_threadsafe(daemon.app(scope, receive, send), daemon._loop)
+        until = time.monotonic() + 30.0
+        while not book._sending and time.monotonic() < until:
+            time.sleep(0.01)
+        book.at += ANSWER_SECONDS + 1.0
+        daemon._loop.call_soon_threadsafe(book.sweep)
+        while not book.gone() and time.monotonic() < until:
+            time.sleep(0.01)
+        assert book.gone() == [(NEAR, 5)]
+        daemon._loop.call_soon_threadsafe(read.set)  # as the end of a connection does
+        answering.result(30)
+    assert not book._sending
+    book.end()
+
+
+def test_a_body_that_comes_late_finds_the_service_busy(state: Path) -> None:
+    asked = list[str]()
+
+    def busy(_: Connections, peer: object) -> bool:
+        asked.append(str(peer))
+        return len(asked) > 1
+
+    with serving(state) as daemon:
+        daemon.app.user_middleware[0].kwargs["connections"].__class__ = type("Late", (Connections,), {"busy": busy})
+        answer = daemon.post("/api/v1/login", {"token": "x"})
+        assert (answer.status_code, answer.headers["retry-after"], len(asked)) == (503, "1", 2)
+        assert daemon.post("/api/v1/stop", {"a": "body"}).status_code == 200
+        assert len(asked) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_hundreds_of_streams_keep_no_stop_of_their_address_out(state: Path) -> None:
+    with daemon_process(state) as (_, client), ExitStack() as lines:
+        parts = urlsplit(client.url)
+        token = (state / "token").read_text().strip()
+        asked = f"GET /api/v1/events HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {token}\r\n\r\n".encode()
+        for _ in range(400):
+            line = lines.enter_context(socket.create_connection((str(parts.hostname), int(parts.port or 0)), 60))
+            line.sendall(asked)
+        busy, until = 0, time.monotonic() + 60.0
+        while busy != 503 and time.monotonic() < until:
+            busy = httpx.get(f"{client.url}/healthz").status_code
+        assert busy == 503
+        for _ in range(5):
+            answer = httpx.post(f"{client.url}/api/v1/stop")
+            assert (answer.status_code, answer.json()) == (200, {"arms": [], "jobs": []})
+
+
+def test_every_stream_ends_with_its_token() -> None:
+    def needs(dependant: Dependant) -> bool:
+        return dependant.call is while_known or any(needs(one) for one in dependant.dependencies)
+
+    routes = [route for router in ROUTERS for route in router.routes if isinstance(route, APIRoute)]
+    found = {route.path: needs(route.dependant) for route in routes if route.response_class is StreamingResponse}
+    assert found == dict.fromkeys(("/api/v1/events", "/api/v1/jobs/{job}/events", "/api/v1/jobs/{job}/live"), True)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_revoked_token_is_told_nothing_more(state: Path) -> None:
+    with daemon_process(state) as (_, client), Database(state) as db:
+        told, ended = list[str](), threading.Event()
+        secret = add_token(db, "ann", "viewer", "test")
+
+        def listen() -> None:
+            words = {"Authorization": f"Bearer {secret}"}
+            with (
+                httpx.Client(timeout=60, headers=words) as ann,
+                ann.stream("GET", f"{client.url}/api/v1/events") as one,
+            ):
+                told.extend(one.iter_lines())
+            ended.set()
+
+        threading.Thread(target=listen, daemon=True).start()
+        while client.get("/api/v1/jobs") or not _watched(client, told):
+            time.sleep(0.1)
+        revoke_token(db, "ann", "test")
+        time.sleep(2.5)  # by its copy in memory the daemon knows it for a second
+        client.post("/api/v1/arms/planar2/maintenance", {"what": "the secret belt"})
+        assert ended.wait(30.0)
+        assert not any("secret belt" in line for line in told)
+
+
+def _watched(client: IdentClient, told: list[str]) -> bool:
+    """Let something happen until the listener has heard of it."""
+    client.post("/api/v1/arms/planar2/maintenance", {"what": "oil"})
+    time.sleep(2 * LOOK)
+    return any("oil" in line for line in told)
+
+
+def test_an_arm_that_was_deleted_stands_nowhere(daemon: Asked, state: Path) -> None:
+    watch = daemon.app.state.watch
+    assert daemon.post("/api/v1/arms", {"description": quick_text()}).status_code == 201
+    for name in ("quick", ".quick.deleted"):  # a folder that is being removed is no arm
+        (state / "arms" / name).mkdir(parents=True)
+
+    def standing() -> list[str]:
+        time.sleep(LOOK)
+        watch.look()
+        return [json.loads(one.data)["arm"] for one in watch.since(watch.begin(None)) if one.kind == "arm"]
+
+    assert standing() == ["quick"]
+    assert daemon.ask("DELETE", "/api/v1/arms/quick").status_code == 200
+    assert standing() == []
+
+
+def test_an_upload_that_is_deleted_in_this_moment_is_unknown(daemon: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
+    known, state = uploads.known_upload, daemon.service.state
+
+    def gone_at_once(place: Path, upload: str) -> uploads.Upload:
+        seen = known(place, upload)
+        with monkeypatch.context() as patched:
+            patched.setattr(uploads, "known_upload", known)
+            uploads.delete_upload(state, upload)
+        return seen
+
+    for act in ("piece", "complete"):
+        upload = daemon.post("/api/v1/uploads", announced(b"mine")).json()["id"]
+        assert sent(daemon, upload, 0, b"mine").status_code == 200
+        with monkeypatch.context() as patched:
+            patched.setattr(uploads, "known_upload", gone_at_once)
+            path = f"/api/v1/uploads/{upload}"
+            answer = sent(daemon, upload, 4, b"x") if act == "piece" else daemon.post(f"{path}/complete")
+        assert (act, answer.status_code) == (act, 404)
+    assert daemon.get("/api/v1/uploads").json() == []
+
+
+def test_a_recording_that_is_deleted_while_it_is_completed_is_unknown(
+    daemon: Asked, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    upload, state = daemon.post("/api/v1/uploads", announced(b"mine")).json()["id"], daemon.service.state
+    assert sent(daemon, upload, 0, b"mine").status_code == 200
+    make = uploads.new_id
+
+    def meanwhile(arm: str) -> str:
+        uploads.delete_upload(state, upload)
+        return make(arm)
+
+    monkeypatch.setattr(uploads, "new_id", meanwhile)
+    assert daemon.post(f"/api/v1/uploads/{upload}/complete").status_code == 404
+    assert list((state / "runs").iterdir()) == []
+
+
+def test_an_arm_that_is_added_while_it_is_deleted_is_whole(daemon: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert daemon.post("/api/v1/arms", {"description": quick_text()}).status_code == 201
+    know, adding = deletion.know_shipped, list[threading.Thread]()
+
+    def meanwhile(db: Database) -> None:
+        know(db)
+        # It finds what is there now, and waits for the end of this transaction with what it writes.
+        adding.append(threading.Thread(target=daemon.post, args=("/api/v1/arms", {"description": quick_text()})))
+        adding[0].start()
+        time.sleep(2.0)
+
+    hide = deletion._hide
+
+    def slowly(folder: Path) -> Path:
+        if adding:
+            adding[0].join(30)
+        return hide(folder)
+
+    monkeypatch.setattr(deletion, "know_shipped", meanwhile)
+    monkeypatch.setattr(deletion, "_hide", slowly)
+    assert daemon.ask("DELETE", "/api/v1/arms/quick").status_code == 200
+    adding[0].join(60)
+    assert daemon.get("/api/v1/arms/quick").status_code == 200
+
+
+def test_an_arm_that_is_deleted_while_it_is_read_is_unknown(daemon: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert daemon.post("/api/v1/arms", {"description": quick_text()}).status_code == 201
+    load = arms.load_arm
+
+    def meanwhile(path: Path) -> Any:
+        with monkeypatch.context() as patched:
+            patched.setattr(arms, "load_arm", load)
+            assert deletion.delete_arm(daemon.service.db, daemon.service.state, "quick", "test") == []
+        return load(path)
+
+    monkeypatch.setattr(arms, "load_arm", meanwhile)
+    assert daemon.get("/api/v1/arms/quick").status_code == 404
+
+
+@pytest.mark.parametrize("number", ["x", "-1", "1e3", str(2**62), "\u0663"])
+def test_a_stream_refuses_a_number_that_is_none(daemon: Asked, number: str) -> None:
+    answer = daemon.get("/api/v1/events", headers={"Last-Event-ID": number.encode()})
+    assert (answer.status_code, set(answer.json())) == (422, {"error"})
+    for name in ("events", "live"):
+        assert daemon.get(f"/api/v1/jobs/none/{name}").status_code == 404
+        assert daemon.get(f"/api/v1/jobs/a%00b/{name}").status_code == 422
+
+
+WORDS = ("planar2", "none", "1", "-1", "9" * 30, "a" * 4000, "a\x00b", "\xe9", "{{7*7}}", "nan", "1e999", "", " ", "..")
+FIELDS = ("arm", "name", "confirm", "challenge", "note", "token", "run", "motion", "cron", "hours", "what", "share")
+PAGES = [
+    route
+    for router in ROUTERS
+    for route in router.routes
+    if isinstance(route, APIRoute) and not route.path.startswith("/api")
+]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+@settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
+@given(
+    route=st.sampled_from(PAGES),
+    place=st.lists(st.sampled_from(WORDS[:11]), min_size=3, max_size=3),
+    query=st.dictionaries(st.sampled_from(FIELDS), st.sampled_from(WORDS), max_size=3),
+    form=st.dictionaries(st.sampled_from(FIELDS), st.sampled_from(WORDS), max_size=6),
+)
+def test_no_form_makes_a_page_fail(
+    daemon: Asked, route: APIRoute, place: list[str], query: dict[str, str], form: dict[str, str]
+) -> None:
+    words = iter(place)
+    path = re.sub(r"\{[^}]+\}", lambda _: quote(next(words) or "x", safe=""), route.path)
+    (method,) = route.methods
+    body = {"data": form, "headers": {"Origin": URL}} if method == "POST" else {}
+    answer = daemon.ask(method, path, params=query, **body)
+    assert answer.status_code < 500, (method, path, query, form, answer.text[:500])
