@@ -20,6 +20,7 @@ from ident_service.estimation.doubt import uncertainty, widening
 from ident_service.estimation.equations import Equations, equations
 from ident_service.estimation.feasible.feasibility import constrained_least_squares
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
+from ident_service.estimation.feasible.priors import residual_deviation
 from ident_service.estimation.feasible.torque_scales import constrained_least_squares_with_scales, scale_bounds
 from ident_service.estimation.friction_fit import fit_friction
 from ident_service.estimation.instruments import instrumental_variables
@@ -30,7 +31,10 @@ from ident_service.estimation.standstill import standstill_shares
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
+from ident_service.model.layout import INERTIAL
 from ident_service.record.recording import Recording
+
+SAME = 0.01  # of its deviation: a parameter that changes by less is as good as the same
 
 
 @dataclass(frozen=True)
@@ -210,3 +214,26 @@ def _unsettled(what: str, change: float, settled: float) -> tuple[str, ...]:
 def _doubted(method: Method, fit: LeastSquares, equations: Equations, shares: Array) -> Fit:
     found = uncertainty(equations, fit)
     return Fit(fit, equations, found.covariance, found.deviations, found.degrees, found.noise, shares, method)
+
+
+def as_good_as_the_same(fit: LeastSquares, base: BaseParameters, deviations: Array) -> Array:
+    """Give N of `central.py`: changes of the links' base parameters by less than a hundredth of their deviations.
+
+    In the metric of eq. 81 a change of length 1 moves each parameter by at most its white deviation, which is no
+    larger than the one that is told; so no torque changes by what could be seen.
+
+    Args:
+        fit: unconstrained.
+        base: grouping of the parameters.
+        deviations: that are told, shape (base,).
+
+    Returns:
+        Shape (rows, base); columns of zeros for what does not change.
+    """
+    seen = np.isfinite(fit.standard_deviations) & np.isfinite(deviations) & (fit.standard_deviations > 0.0)
+    of_links = [name.rstrip("0123456789") in INERTIAL for name in (base.names[column] for column in base.base)]
+    moves = seen & np.array(of_links)
+    if not moves.any():
+        return np.zeros((0, base.size))
+    least = float(np.min(deviations[moves] / fit.standard_deviations[moves]))
+    return np.where(moves, fit.R1, 0.0) / (SAME * least * residual_deviation(fit))

@@ -24,8 +24,8 @@ from ident_service.estimation.feasible.feasibility import (
     feasibility_test,
 )
 from ident_service.estimation.feasible.feasible_set import FeasibleSet, SetName, feasible_set
-from ident_service.estimation.feasible.priors import Prior, choose_weight, residual_deviation
-from ident_service.estimation.fit import Fit, Prepared, prepare, unconstrained
+from ident_service.estimation.feasible.priors import Prior, choose_weight
+from ident_service.estimation.fit import Fit, Prepared, as_good_as_the_same, prepare, unconstrained
 from ident_service.estimation.friction_fit import at_the_edge
 from ident_service.estimation.least_squares import (
     LeastSquares,
@@ -38,13 +38,11 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters, base_parameters, remarks_on_angles
 from ident_service.model.chain import Array
 from ident_service.model.information import Information
-from ident_service.model.layout import INERTIAL
 from ident_service.model.likely_bodies import Source, likely_bodies
 from ident_service.model.threads import one_blas_thread
 from ident_service.record.part import overlap
 from ident_service.record.recording import Recording
 
-SAME = 0.01  # of its deviation: a parameter that changes by less is as good as the same
 _HELD_OUT = 1.0 / 3.0
 _WEIGHTS = (0.0, *(10.0**k for k in range(-3, 5)))
 _SETS: tuple[FeasibleSetName, ...] = ("inertia", "pseudo_inertia")
@@ -249,7 +247,7 @@ def identify(
     if prior is None and custom is None:
         likely = likely_bodies(prepared.model)
         nearest_to = likely.source
-        near = _as_good_as_the_same(found.fit, base, deviations) if held[kind].tight else None
+        near = as_good_as_the_same(found.fit, base, deviations) if held[kind].tight else None
         held[kind] = held[kind].centred(base, conditions, likely, near)
 
     everything, moving = prepared.equations.everything, prepared.equations.moving
@@ -315,21 +313,6 @@ def identify(
         custom=None if free else knowledge,
         second=second,
     )
-
-
-def _as_good_as_the_same(fit: LeastSquares, base: BaseParameters, deviations: Array) -> Array:
-    """N of `central.py`: changes of the links' base parameters by less than a hundredth of their deviations.
-
-    In the metric of eq. 81 a change of length 1 moves each parameter by at most its white deviation, which is no
-    larger than the one that is told; so no torque changes by what could be seen.
-    """
-    seen = np.isfinite(fit.standard_deviations) & np.isfinite(deviations) & (fit.standard_deviations > 0.0)
-    of_links = [name.rstrip("0123456789") in INERTIAL for name in (base.names[column] for column in base.base)]
-    moves = seen & np.array(of_links)
-    if not moves.any():
-        return np.zeros((0, base.size))
-    least = float(np.min(deviations[moves] / fit.standard_deviations[moves]))
-    return np.where(moves, fit.R1, 0.0) / (SAME * least * residual_deviation(fit))
 
 
 def _remarks_on_friction(described: ArmModel, fitted: ArmModel) -> tuple[str, ...]:

@@ -311,9 +311,7 @@ class _Preflight:
             session.follow(hold(home), SETTLE)
             half = DWELL + 0.5 * stroke.there.duration
             session.follow(stroke, half)
-            moving = watchdog_check(
-                self.arm, self.model, session, lambda elapsed: stroke.at(half + elapsed), stroke.joint
-            )
+            moving = watchdog_check(self.arm, self.model, session, lambda time: stroke.at(half + time), stroke.joint)
         except (MotionRefused, ArmFault) as error:
             self.arm.stop(StopKind.TORQUE_OFF)
             return failed(CODE, f"in motion: {error}", REST_REMEDY, at_rest.measures)
