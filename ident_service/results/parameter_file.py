@@ -33,9 +33,9 @@ from ident_service.results.rows_and_filter import how_fitted
 from ident_service.results.schemas import require_schema
 from ident_service.results.strict_json import strict_json
 
-MAX_BYTES = 8 * 2**20
+MAX_BYTES = 4 * 2**20
 MOST_EXPRESSIONS = 1000
-MOST_CHARACTERS = 2**19  # of all expressions
+MOST_CHARACTERS = 2**18  # of all expressions
 _TABLE = (
     'a table from a paper is typed as {"format": "ident-parameters", "version": 1, "base_parameters": {"expressions": '
     '["Lzz1 + 0.25*m2", "lx2"], "values": [0.9, 0.4]}}, as the README has it'
