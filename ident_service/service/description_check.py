@@ -5,14 +5,16 @@ Boundary: the work is `config/load.py`, `service/bus.py` and `motion/preflight/s
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from drivers.canopen.budget import Budget
 from ident_service.config.limits import motion_limits
-from ident_service.config.load import load_arm
-from ident_service.errors import MotionRefused
+from ident_service.config.load import load_arm, mistake
+from ident_service.config.quantities import ParameterTable
+from ident_service.errors import ModelError, MotionRefused, ParameterError
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base import base_parameters, remarks_on_angles
 from ident_service.motion.after_stop import AfterStop, after_stop
@@ -52,10 +54,16 @@ def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescri
         upload: whether somebody has sent it (`load_arm`).
 
     Raises:
-        ConfigError: every mistake in it, each with line and column; a bus budget that does not fit is one.
-        ModelError: its mechanism cannot be computed with.
+        ConfigError: every mistake in it, each with line and column; a mechanism that cannot be computed with, and a bus
+            budget that does not fit, are one.
     """
-    model = arm_model(load_arm(arm, upload=upload))
+    config = load_arm(arm, upload=upload)
+    try:
+        model = arm_model(config)
+    except (ModelError, ParameterError) as error:
+        raise mistake(arm, _place(str(error)), str(error)) from None
+    for where in (("driver", "truth"), ("driver", "emulation", "truth")):
+        _require_names(arm, model, where)
     budget = require_budget(arm, model.config)
     warnings = remarks_on_angles(base_parameters(model.chain, model.layout))
     try:
@@ -67,6 +75,26 @@ def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescri
     except MotionRefused as refusal:
         follows = str(refusal)
     return CheckedDescription(model, budget, stability(model, limits, delay_of(model.config)), follows, warnings)
+
+
+def _place(message: str) -> tuple[str, ...]:
+    """The keys that a model's complaint is about."""
+    if named := re.search(r"kinematics\.(\w+)", message):
+        return ("kinematics", named.group(1))
+    about = {"joints are configured as": "joints", "columns": "recording", "parameters this arm does not have": "prior"}
+    return (next((key for words, key in about.items() if words in message), "kinematics"),)
+
+
+def _require_names(arm: str | Path, model: ArmModel, where: tuple[str, ...]) -> None:
+    """See that a simulated plant's parameters are those of this arm."""
+    section: Any = model.config
+    for key in where:
+        section = getattr(section, key, None)
+    if isinstance(section, ParameterTable):
+        try:
+            model.layout.vector(section)
+        except ParameterError as error:
+            raise mistake(arm, where, str(error)) from None
 
 
 def description_document(checked: CheckedDescription) -> dict[str, Any]:

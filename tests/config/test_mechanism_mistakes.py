@@ -1,0 +1,58 @@
+"""What only shows when the mechanism is computed is told with its place too, and is a mistake of the description."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from model.test_locked_joints import PANDA
+
+from ident_service.cli import main
+
+ARM = """\
+format: ident-arm
+version: 1
+name: panda
+kinematics: {urdf: panda.urdf, tip: panda_hand}
+joints:
+""" + "".join(f"  panda_joint{k}: {{home: 0}}\n" for k in range(1, 8))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "panda.urdf").write_text(PANDA)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("change", "place", "words"),
+    [
+        (("tip: panda_hand", "tip: nowhere"), "4:32: kinematics.tip: ", "no link 'nowhere'"),
+        (
+            ("tip: panda_hand", "tip: panda_hand, lock: {panda_joint3: 9}"),
+            "4:49: kinematics.lock: ",
+            "panda_joint3 at 9 is outside its limits",
+        ),
+        (("panda_joint7:", "elbow:"), "5:1: joints: ", "but the mechanism has panda_joint1"),
+        (
+            ("joints:", "driver: {kind: simulated, truth: {m1: 1, m99: 2}}\njoints:"),
+            "5:27: driver.truth: ",
+            "parameters this arm does not have: m99",
+        ),
+        (("joints:", "prior: {m1: 1, Q4: 2}\njoints:"), "5:1: prior", "parameters this arm does not have: Q4"),
+    ],
+)
+def test_it_has_a_place(
+    folder: Path, change: tuple[str, str], place: str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = folder / "arm.yaml"
+    path.write_text(ARM.replace(*change))
+    assert main(["config", "check", str(path)]) == 2
+    err = capsys.readouterr().err
+    assert f"arm.yaml:{place}" in err
+    assert words in err
+
+
+def test_without_a_mistake_it_is_good(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "arm.yaml").write_text(ARM)
+    assert main(["config", "check", str(folder / "arm.yaml")]) == 0, capsys.readouterr().err
