@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from ident_service.service.api.connections import most_connections
+
 UNITS = Path(__file__).parents[2] / "configs" / "systemd"
 NAMES = ("ident.service", "ident-motion.socket", "ident-motion@.service")
 # Of 10: what `systemd-analyze security` may find open at most.
@@ -92,3 +94,8 @@ def test_the_daemon_can_reach_the_door_of_motions() -> None:
     (owner,) = re.findall(r"^SocketUser=(.+)$", socket, re.M)
     assert f"\nUser={owner}\n" in daemon
     assert "SocketMode=0600" in socket
+
+
+def test_the_daemons_unit_has_descriptors_for_all_its_connections_and_as_many_to_spare() -> None:
+    (limit,) = re.findall(r"^LimitNOFILE=(\d+)$", (UNITS / "ident.service").read_text(encoding="utf-8"), re.MULTILINE)
+    assert int(limit) >= 2 * most_connections()
