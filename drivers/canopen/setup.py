@@ -100,7 +100,7 @@ class Setup:
         period_us = round(1e6 / self.profile.rate)
         power = next(power for power in (-3, -4, -5, -6) if period_us % 10 ** (6 + power) == 0)
         number = period_us // 10 ** (6 + power)
-        todo = [Write(od.SYNC_PERIOD, period_us), Write(od.SYNC_WINDOW, round(0.9 * period_us))]
+        todo = [Write(od.SYNC_PERIOD, period_us), Write(od.SYNC_WINDOW, 0)]
         if number <= 0xFF:
             todo += [Write(od.PERIOD_POWER, power), Write(od.PERIOD_NUMBER, number)]
         return todo
