@@ -25,6 +25,7 @@ from ident_service.config.quantities import (
     Section,
     Seed,
     TextBeside,
+    TextFile,
 )
 from ident_service.config.recording import Transmission
 from ident_service.config.simulation import SimulatedFault, WindingsOff
@@ -241,7 +242,11 @@ class CanopenDriver(GrownSection):
     @property
     def sheets(self) -> tuple[DataSheet, ...]:
         """Return what the data sheet of each drive lists."""
-        return tuple(data_sheet((self.eds if drive.eds is None else drive.eds).text) for drive in self.drives)
+        return tuple(data_sheet(self.sheet_file(number).text) for number in range(len(self.drives)))
+
+    def sheet_file(self, number: int) -> TextFile:
+        """Return the data sheet of a drive: its own, or that of all."""
+        return self.drives[number].eds or self.eds
 
     @property
     def shares_by_sheet(self) -> bool:

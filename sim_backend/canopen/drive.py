@@ -81,7 +81,7 @@ class CanopenDrive:
         self._pdos = Pdos(node, self.emergency, self._arrived, self._late)
         self._torque = TorqueLoop(self.objects, motor, self._personality)
         self._firmware = Firmware(node, self._personality, self._control)
-        self._makers = MakersWatchdogs(node, self.emergency, self._late)
+        self._makers = MakersWatchdogs(node, self.emergency, self._late, there=like.shipped)
         self._failure = 0
         self._warned = self._evaluated = False
         self._ears: set[int] = set()
@@ -346,7 +346,7 @@ class CanopenDrive:
     def _veto(self, key: int, value: int) -> None:
         check_write(self.objects, key, value)
         index = key >> 8
-        if index in _PDO_PARAMETERS and not self._personality.prompt and self.nmt.state is State.OPERATIONAL:
+        if index in _PDO_PARAMETERS and not self._personality.shipped and self.nmt.state is State.OPERATIONAL:
             raise SdoAbort(WRONG_STATE)
         if key == 0x100300 and value:
             raise SdoAbort(WRONG_VALUE)

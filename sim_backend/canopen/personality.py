@@ -41,7 +41,8 @@ class Personality:
         limits: keys of what limits it, in counts, or in thousandths of the second key's value.
         rated: key of what a thousandth is of; None where a count is `scale`.
         scale: N m per unit of `rated`, or per count.
-        prompt: whether it does at once what frames ask for.
+        shipped: whether it is the shipped data sheet's drive: it does at once what frames ask for, and has the
+            watchdogs of `makers.py`.
         motor: values that its maker's tool has entered, by key.
     """
 
@@ -50,7 +51,7 @@ class Personality:
     limits: tuple[tuple[int, int | None], ...] = ((0x607200, None), (0x607300, None))
     rated: int | None = 0x607600
     scale: float = 1e-3
-    prompt: bool = True
+    shipped: bool = True
     motor: tuple[tuple[int, int], ...] = ()
 
     def reach(self, objects: Objects) -> int:
@@ -99,7 +100,7 @@ def personality_of(text: str, drive: CanopenDrive, families: Sequence[Family] = 
         limits=tuple(sorted(limits, key=str)),
         rated=None if unit.rated is None else _key(unit.rated),
         scale=scale,
-        prompt=False,
+        shipped=False,
         motor=(*_unspecified(sheet, [key for key, _ in limits]), *motor.items()),
     )
 
@@ -122,9 +123,8 @@ class Firmware:
 
     def arrived(self, keys: tuple[int, ...]) -> None:
         """Note that frames have set these entries."""
-        prompt = self._personality.prompt
         for key, name, delay in ((0x606000, _MODE, _MODE_NS), (0x604000, _CONTROL, _LOOP_NS)):
-            if key in keys and prompt:
+            if key in keys and self._personality.shipped:
                 self.due(name)
             elif key in keys and name not in self._node.timers:
                 self._node.after(name, delay)

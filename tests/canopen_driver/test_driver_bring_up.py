@@ -124,7 +124,8 @@ def test_a_speed_limit_that_only_the_drive_decides_must_leave_the_joints_their_v
 
 
 def test_a_drive_that_maps_no_dummies_says_so_in_words_whatever_its_data_sheet_says() -> None:
-    real = weightless_config(eds=eds_with("DummyUsage", Dummy0003="0"), torque_frames="single")
+    none = {f"Dummy000{k}": "0" for k in range(1, 8)}
+    real = weightless_config(eds=eds_with("DummyUsage", **none), torque_frames="single")
     bench = Bench(weightless_config(), real)
     with pytest.raises(DriverError, match=r"node 1: setting 1600h:0\d .*: 06\w{6}h object") as refused:
         bench.arm.open()
@@ -177,8 +178,8 @@ def test_drives_that_do_not_answer_are_named(silent: tuple[int, ...]) -> None:
         (0x605A, 0, "605Ah"),
         (0x605E, 0, "605Eh"),
         (0x6007, 0, "6007h"),
-        (0x1400, 5, "would not stop by itself"),
-        (0x1016, 1, "would not stop by itself"),
+        (0x1400, 5, "1400h:05"),
+        (0x1016, 1, "1016h:01"),
     ],
 )
 def test_a_protection_that_does_not_hold_is_found_by_reading_it_back(index: int, subindex: int, words: str) -> None:
@@ -191,6 +192,7 @@ def test_a_protection_that_does_not_hold_is_found_by_reading_it_back(index: int,
             objects.put(index, 9, subindex)
         written(key)
 
+    objects.put(index, 7, subindex)  # what a drive has already is not written
     objects.written = forgetful
     with pytest.raises(DriverError, match=rf"node 2: .*{words}"):
         bench.arm.open()
@@ -323,3 +325,29 @@ def test_an_arm_whose_bus_is_gone_can_be_stopped_closed_and_opened_again() -> No
     assert not any("enabled" in state for state in bench.states)
     with bench.arm as arm:
         arm.exchange(None)
+
+
+def test_unused_pdos_are_off_before_any_other_is_on() -> None:
+    """Out of the box RPDO3 listens to the very COB-ID that the torques of both drives get."""
+    config = weightless_config(eds=eds_with("1402sub1", DefaultValue="0x201"))
+    bench = Bench(config)
+    with bench.arm:
+        written = [frame.data for frame in bench.taps[0].sent if frame.identifier == 0x602 and frame.data[0] == 0x23]
+    downloads = [struct.unpack_from("<HBI", data, 1) for data in written]
+    off = downloads.index((0x1402, 1, 0x8000_0402))
+    on = downloads.index((0x1400, 1, 0x0000_0201))
+    assert off < on
+    assert bench.drive(1).objects.number(0x1402, 1) >> 31
+
+
+def test_what_a_drive_has_already_is_not_written_again() -> None:
+    bench = Bench(weightless_config())
+    downloads = []
+    for _ in range(2):
+        with bench.arm:
+            sent = bench.taps[0].sent
+            ours = [frame.data for frame in sent if 0x600 < frame.identifier < 0x680 and frame.data[0] & 0xE0 == 0x20]
+            downloads.append([struct.unpack_from("<HB", data, 1) for data in ours])
+    assert len(downloads[0]) > 40
+    # Only what `close` took back, so that the drives forget their host.
+    assert set(downloads[1]) == {(0x6007, 0), (0x1016, 1)}
