@@ -27,6 +27,7 @@ DRIVE_PROFILE = 402  # low word of 1000h
 _UNITS = {"mNm": 1e-3, "uNm": 1e-6, "mA": 1e-3}
 _SAME = 0.01  # of a torque's unit: rounding, not another unit
 _ABSURD = 5.0  # between two sayings of one rated torque
+_MOST_TIMES = 20.0  # the rated torque, which no drive's peak torque comes near
 _POWERS = range(1, 7)
 
 # Why a drive without these cannot be driven.
@@ -354,6 +355,9 @@ def _unit_changes(family: Family, found: Found, drive: CanopenDrive, count: floa
     if factor := _factor(thousand, drive.rated_torque, _SAME):
         words = f"{drive.rated_torque:g} N m, but a thousand counts are {thousand:g} N m by the drive{factor}"
         yield Problem("drives.rated_torque", words)
+    if drive.max_torque > _MOST_TIMES * thousand:
+        words = f"{drive.max_torque:g} N m are {drive.max_torque / thousand:.3g} times what a thousand counts are"
+        yield Problem("drives.max_torque", f"{words}, more than any drive gives; is it of the motor, in N m?")
     current = found.get(od.RATED_CURRENT)
     if unit.unit != "mA" and current and drive.torque_constant is not None:
         by_current = 1e-3 * current * drive.torque_constant

@@ -124,6 +124,12 @@ def test_a_drive_that_shares_no_frame_says_what_to_write_instead() -> None:
         ("maxon_epos4_50-8_0110h.eds", {"rated_torque": 0.001, "max_torque": 0.002}, "by 1000, which is another unit"),
         ("maxon_epos4_50-8_0110h.eds", {"rated_torque": 10.0}, "by 10, which is another unit"),
         ("maxon_epos4_50-8_0110h.eds", {"rated_torque": 1.3}, "wrong by 1.3"),
+        ("maxon_epos4_50-8_0110h.eds", {"max_torque": 30.0}, r"30 N m are 30 times what a thousand counts are"),
+        (
+            "e35.eds",
+            {"torque_constant": 50.0},
+            r"drives.torque_constant: with 6075h it makes .* by 1000, which is another",
+        ),
         ("elmo_gold_V002.dcf", {"torque_constant": None}, r"drives.torque_constant: 6075h is of a current"),
         ("elmo_gold_V002.dcf", {"torque_constant": 1.0}, "by 10, which is another unit"),
         ("e35.eds", {"watchdog": "heartbeat"}, r"heartbeat: this drive lacks it; it has node_guarding"),
@@ -140,3 +146,23 @@ def test_a_unit_or_a_watchdog_that_is_another_is_noticed_before_anything_is_writ
     with pytest.raises(DriverError, match=rf"node 1: cannot be driven .*{words}"):
         bench.arm.open()
     assert bench.downloads() == []
+
+
+@pytest.mark.parametrize("name", CAPABLE)
+def test_a_fault_is_reset_by_an_edge_that_slow_firmware_sees(name: str) -> None:
+    """At 1 kHz, where a drive with a loop of 1 ms may read one of two words that follow each other."""
+    config = arm_of(name)
+    fast = ArmConfig.model_validate(config.model_dump(mode="json", by_alias=True) | {"control": {"rate": 1000.0}})
+    bench = Bench(fast)
+    with bench.arm as arm:
+        arm.enable()
+        face = bench.behind.emulator.faces[0]
+        face.fail(0x4310, bench.behind.clock.now_ns())
+        arm.stop(StopKind.TORQUE_OFF)
+        for _ in range(200):
+            arm.exchange(None)
+        assert bench.states[0] == "fault"
+        arm.reset()
+        assert bench.states == ["switch on disabled"] * 2
+        arm.enable()
+        assert bench.states == ["operation enabled"] * 2
