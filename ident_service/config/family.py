@@ -15,6 +15,8 @@ from ident_service.errors import DriverError
 
 EntryText = Annotated[str, Field(pattern=r"^[0-9A-F]{4}:[0-9A-F]{1,2}/[iu](8|16|32)$")]
 Unsigned32 = Annotated[int, Field(strict=True, ge=0, le=0xFFFF_FFFF)]
+TargetText = Annotated[str, Field(pattern=r"^[0-9A-F]{4}:[0-9A-F]{1,2}/i16$")]  # as torque frames carry it
+_MOST_MODE = 127
 _NEEDS_NO_SOURCE = frozenset({"name", "proved", "sources", "notes"})
 
 
@@ -37,9 +39,15 @@ class TorquePath(Section):
 
     mode: Annotated[int, Field(strict=True, ge=-128, le=0xFFFF)]
     supported: Annotated[int, Field(strict=True, ge=0, le=31)] | None = None
-    target: EntryText
+    target: TargetText
     by: ModeEntry | None = None
     slope: EntryText | None = None
+
+    @model_validator(mode="after")
+    def _fits(self) -> TorquePath:
+        if self.by is None and self.mode > _MOST_MODE:
+            raise ValueError(f"mode {self.mode} does not fit 6060h; `by` names the maker's own entry")
+        return self
 
 
 class TorqueUnit(Section):

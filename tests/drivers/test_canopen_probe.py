@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import random
 import struct
+import threading
 from pathlib import Path
 
 import pytest
+import yaml
 from helpers.emulated_arms import weightless_config
 from helpers.makers import CAPABLE, REFUSED, SHEETS, Bench, arm_of, sheet
 
@@ -22,6 +24,7 @@ from ident_service.config.schema import ArmConfig
 from ident_service.errors import ConfigError, DriverError, UsageError
 from ident_service.service.bus_probe import Probe, bus_probe, probe_document, probe_text
 from sim_backend.canopen.drive import CanopenDrive
+from sim_backend.pucks.process import emulate
 
 needs_sheets = pytest.mark.skipif(not SHEETS.is_dir(), reason="the makers' data sheets are not beside this checkout")
 
@@ -195,6 +198,11 @@ def test_families_are_found_by_vendor_and_product_and_the_users_come_first() -> 
         ("{name: x, proved: no, match: {vendor: 1}, sources: {}}", "sources are needed for match"),
         ("{name: x, proved: no, unit: {unit: mNm}, sources: {unit: y}}", "either `rated` names an entry"),
         ("{name: x, proved: no, torque: [{mode: 4, target: 6071}], sources: {torque: y}}", "target"),
+        (
+            "{name: x, proved: no, torque: [{mode: 200, target: '6071:0/i16'}], sources: {torque: y}}",
+            "does not fit 6060h",
+        ),
+        ("{name: x, proved: no, torque: [{mode: 4, target: '201C:0/i32'}], sources: {torque: y}}", "should match"),
         ("{name: x, proved: no, surprise: 1, sources: {}}", "surprise"),
         ("[", "no family of drives"),
     ],
@@ -209,3 +217,54 @@ def test_a_family_with_a_mistake_is_refused_in_words(text: str, words: str, tmp_
     arm.write_text(tree)
     with pytest.raises(ConfigError, match=r"driver\.profiles"):
         load_arm(arm)
+
+
+def arm_file(folder: Path, *, rated: float) -> Path:
+    """A small arm with drives of two makers on a bus of python-can in this process."""
+    drive = {"rated_torque": rated, "max_torque": 4.0 * rated, "max_speed": 3000.0}
+    epos, e35 = (str(SHEETS / name) for name in ("maxon_epos4_50-8_0110h.eds", "e35.eds"))
+    tree = {
+        "extends": str(shipped_arms()["planar2"]),
+        "name": "mixed",
+        "transmission": {"ratios": [40.0, 20.0], "drive_terms": "joints"},
+        "driver": {
+            "kind": "canopen",
+            "eds": epos,
+            "torque_frames": "single",
+            "buses": [{"interface": "virtual", "channel": f"probe-{folder.name}"}],
+            "drives": [
+                drive | {"node": 1, "watchdog": "heartbeat"},
+                drive | {"node": 2, "watchdog": "node_guarding", "eds": e35},
+            ],
+            "emulation": {"eds": [epos, e35]},
+        },
+    }
+    path = folder / f"arm{rated:g}.yaml"
+    path.write_text(yaml.safe_dump(tree))
+    return path
+
+
+@needs_sheets
+@pytest.mark.slow
+def test_the_command_probes_a_bus_of_python_can(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    there, other = arm_file(tmp_path, rated=0.5), arm_file(tmp_path, rated=0.0005)
+    end = threading.Event()
+    thread = threading.Thread(target=lambda: emulate(load_arm(there), stop_requested=end.is_set))
+    thread.start()
+    try:
+        assert main(["bus", "probe", str(there)]) == DONE
+        assert capsys.readouterr().out.startswith("mixed: every drive can be driven; nothing was written\n")
+        assert main(["bus", "probe", str(other), "--json"]) == VERDICT_NO
+    finally:
+        end.set()
+        thread.join()
+    document = json.loads(capsys.readouterr().out)
+    for drive in document["drives"]:
+        (change,) = drive["can"]["changes"]
+        assert change["where"] == "drives.rated_torque"
+        assert "wrong by 1000, which is another unit" in change["why"]
+
+
+def test_emulated_drives_need_files_that_are_there(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["emulate", "wam7_canopen", "--eds", "no.eds"]) == USAGE
+    assert "no such file" in capsys.readouterr().err
