@@ -52,7 +52,7 @@ _OPTIONAL: Sequence[tuple[Entry, str]] = (
     (od.PERIOD_NUMBER, "it is not told the interpolation period"),
     (od.EMERGENCY_COB_ID, "emergencies are taken to be 080h + node"),
     (od.EMERGENCY_INHIBIT, "a storm of emergencies is not held back"),
-    (od.ERROR_BEHAVIOUR, "a lost host may end `operational`, and with it its status reports"),
+    (od.ERROR_BEHAVIOUR, "a lost host may end `operational`: without status reports its watchdog cannot be proven"),
     (od.ABORT_CONNECTION, "what it does when its host is gone is its maker's"),
     (od.QUICK_STOP_OPTION, "`disable voltage` is the only stop that is known"),
     (od.FAULT_OPTION, "what it does in a fault is its maker's"),

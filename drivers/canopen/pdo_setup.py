@@ -45,7 +45,13 @@ def configure_pdos(objects: Objects, pdos: Sequence[Pdo], unused: Sequence[Pdo],
                 objects.ensure_if_there(write)
             else:
                 objects.ensure(write)
-        objects.ensure(pdo.on)
+        try:
+            objects.ensure(pdo.on)
+        except SdoRefused as refused:
+            if refused.code not in READ_ONLY:
+                raise
+            words = "where COB-IDs are fixed, driver.torque_frames must be single"
+            raise SdoRefused(f"{refused}; {words}", refused.code) from None
     for pdo in pdos:
         if not pdo.sent and not pdo.timer:
             objects.ensure_if_there(pdo.timing)  # a deadline of somebody else's would end a silence that is none

@@ -7,13 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.makers import CAPABLE, REFUSED, SHEETS, Bench, arm_of
+from test_driver_watchdogs import Bench as HeldBench
 
 from drivers.arm import StopKind
 from drivers.status import AxisStatus
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError
+from ident_service.motion.preflight.check import Verdict
 
 ZERO = np.zeros(2)
+PROVEN = {"maxon_epos4_50-5_0170h.eds", "elmo_gold_V002.dcf", "elmo_simpliq.dcf"}
 MS = 1_000_000
 pytestmark = pytest.mark.skipif(not SHEETS.is_dir(), reason="the makers' data sheets are not beside this checkout")
 
@@ -112,9 +115,13 @@ def test_foreign_slots_take_the_dummies_that_a_drive_has(name: str) -> None:
         np.testing.assert_allclose(torques, sample.torque, atol=1e-9)
 
 
-def test_a_drive_that_shares_no_frame_says_what_to_write_instead() -> None:
-    bench = Bench(arm_of("e35.eds", "maxon_epos4_50-8_0110h.eds", torque_frames="shared"))
-    with pytest.raises(DriverError, match=r"node 2: setting 1600h.*torque_frames must be single"):
+@pytest.mark.parametrize(
+    ("second", "entry"), [("maxon_epos4_50-8_0110h.eds", "1600h"), ("elmo_simpliq.dcf", "1400h:01")]
+)
+def test_a_drive_that_shares_no_frame_says_what_to_write_instead(second: str, entry: str) -> None:
+    """One maps no dummies, the other's COB-IDs are fixed."""
+    bench = Bench(arm_of("e35.eds", second, torque_frames="shared"))
+    with pytest.raises(DriverError, match=rf"node 2: setting {entry}.*torque_frames must be single"):
         bench.arm.open()
 
 
@@ -166,3 +173,16 @@ def test_a_fault_is_reset_by_an_edge_that_slow_firmware_sees(name: str) -> None:
         assert bench.states == ["switch on disabled"] * 2
         arm.enable()
         assert bench.states == ["operation enabled"] * 2
+
+
+@pytest.mark.parametrize("name", CAPABLE)
+def test_a_watchdog_is_proven_where_the_drive_goes_on_telling_its_state(name: str) -> None:
+    """Drives without 1029h:01 leave `operational`; nobody hears that they have stopped, and so it is not believed."""
+    bench = HeldBench(arm_of(name, status={"period": 0.1, "inhibit": 0.005}))
+    told = bench.behind.emulator.faces[0].objects.entries.keys() >= {0x102901}  # type: ignore[attr-defined]
+    for _ in range(50):
+        bench.arm.exchange(ZERO)
+    check = bench.check()
+    assert (check.verdict is Verdict.PASSED) == told == (name in PROVEN), check.reason
+    bench.arm.close()
+    assert "operation enabled" not in " ".join(bench.behind.emulator.states)
