@@ -261,8 +261,14 @@ def _largest_torque(objects: Objects, setup: Setup) -> None:
     if limit.per is not None:
         value = value * objects.read(entry_of(limit.per, "what the largest torque is per mille of")) // 1000
     for text in (limit.entry, limit.negative):
-        if text is not None:
-            objects.ensure(Write(entry_of(text, "largest torque"), value))
+        try:
+            if text is not None:
+                objects.ensure(Write(entry_of(text, "largest torque"), value))
+        except SdoRefused as refused:
+            words = f"drives.max_torque is {setup.drive.max_torque:g} N m"
+            raise SdoRefused(
+                f"{refused}; {words}, which the drive must be able to limit itself to", refused.code
+            ) from None
     if setup.torque.slope is not None:  # mode 4 would turn a step into a ramp: the whole torque within 1 ms
         objects.ensure(Write(entry_of(setup.torque.slope, "torque slope"), 1000 * setup.limit_counts))
 
