@@ -24,7 +24,7 @@ from ident_service.config.watchdogs import WatchdogKind
 from ident_service.errors import DriverError
 
 DRIVE_PROFILE = 402  # low word of 1000h
-_UNITS = {"mNm": 1e-3, "uNm": 1e-6, "mA": 1e-3}
+TORQUE_UNITS = {"mNm": 1e-3, "uNm": 1e-6, "mA": 1e-3}
 _SAME = 0.01  # of a torque's unit: rounding, not another unit
 _ABSURD = 5.0  # between two sayings of one rated torque
 _MOST_TIMES = 20.0  # the rated torque, which no drive's peak torque comes near
@@ -240,14 +240,16 @@ def judged(
         sheet: its data sheet, None where none is known.
     """
     problems = [Problem(where(entry), f"missing; {why}") for entry, why in _INDISPENSABLE if not found.has(entry)]
-    kind = found.get(od.DEVICE_TYPE)
-    if kind is not None and kind & 0xFFFF != DRIVE_PROFILE:
-        problems.insert(0, Problem("1000h", f"is {kind:08X}h, which is no drive of CiA 402"))
     notes = [f"{where(entry)} is missing: {words}" for entry, words in _OPTIONAL if not found.has(entry)]
     notes += [f"cannot be read: {why}" for why in found.unread.values()]
     torque = next((path for path in family.torque if _streams(path, found)), None)
-    if torque is None:
+    kind = found.get(od.DEVICE_TYPE)
+    if kind is not None and kind & 0xFFFF != DRIVE_PROFILE:
+        problems = [Problem("1000h", f"is {kind:08X}h, which is no drive of CiA 402")]
+    elif torque is None:
         problems = [Problem("6502h", family.refuse or _no_torque(family, found))]
+    elif kind is None and found.asked:
+        problems.insert(0, Problem("1000h", "does not tell that it is a drive of CiA 402"))
     count = _count(family, found, drive)
     limit = next((one for one in family.torque_limit if _limits(one, found)), None)
     speeds = [entry_of(text, "largest speed", "turns per minute") for text in family.speed_limit]
@@ -325,7 +327,7 @@ def _count(family: Family, found: Found, drive: CanopenDrive) -> float | None:
     unit = family.unit
     if unit is None or (unit.unit == "mA" and drive.torque_constant is None):
         return None
-    factor = _UNITS[unit.unit] * (drive.torque_constant or 1.0 if unit.unit == "mA" else 1.0)
+    factor = TORQUE_UNITS[unit.unit] * (drive.torque_constant or 1.0 if unit.unit == "mA" else 1.0)
     if unit.rated is None:
         return factor * (unit.count or 0.0)
     held = found.get(entry_of(unit.rated, ""))

@@ -40,6 +40,10 @@ class SdoRefused(DriverError):
         self.code = code
 
 
+class NotHeld(DriverError):
+    """An entry was set without an abort, and holds something else."""
+
+
 def optional(do: Callable[[Any], T], what: Any) -> T | None:
     """Do something about an entry, and return what that gives; None where the drive has no such entry."""
     try:
@@ -127,11 +131,11 @@ class Objects:
             self.set(write)
 
     def set(self, write: Write) -> None:
-        """Set an entry and read it back; raises as `read`, and DriverError when it holds something else."""
+        """Set an entry and read it back; raises as `read`, and NotHeld when it holds something else."""
         self.write(write)
         held = self.read(write.entry)
         if not write.same(held):
-            raise DriverError(f"node {self.node}: {write.entry} was set to {write.value} but holds {held}")
+            raise NotHeld(f"node {self.node}: {write.entry} was set to {write.value} but holds {held}")
 
     def _asked(self, what: str, ask: Callable[..., Any], *arguments: Any) -> Any:
         try:

@@ -15,13 +15,13 @@ import numpy as np
 
 from drivers.arm import Watchdog
 from drivers.canopen import dictionary as od
-from drivers.canopen.capabilities import DRIVE_PROFILE, Capabilities
+from drivers.canopen.capabilities import DRIVE_PROFILE, TORQUE_UNITS, Capabilities, where
 from drivers.canopen.coordinates import Coordinates, torque_limit_counts
 from drivers.canopen.dictionary import Entry, Kind
 from drivers.canopen.families import entry_of
 from drivers.canopen.pdo_setup import configure_pdos
 from drivers.canopen.profile import BusProfile, Pdo, Write
-from drivers.canopen.sdo import DOES_NOT_EXIST, READ_ONLY, Objects, SdoRefused, optional
+from drivers.canopen.sdo import DOES_NOT_EXIST, READ_ONLY, NotHeld, Objects, SdoRefused, optional
 from drivers.canopen.words import POWER_OFF, state_of
 from drivers.canopen.zero import Zeros
 from ident_service.config.canopen import (
@@ -41,6 +41,7 @@ _FIRMWARE = 0x100A
 _COUNTS_PER_LINE = (1.0, 4.0)
 _GENTLER = 0.5  # of the wanted deceleration, that a drive's own may be: the ramp takes twice as long
 _MODE_PATIENCE, _MODE_AGAIN_NS = 5.0, 10_000_000  # s in all, ns between two looks
+_ROUNDING = 1e-6
 _LETS_GO, _STAYS = 2, 6  # values of 605Ah: a ramp, then power off, or hold on
 IDENTITY = {"vendor": od.VENDOR, "product": od.PRODUCT, "revision": od.REVISION, "serial": od.SERIAL}
 
@@ -228,16 +229,13 @@ def configure(objects: Objects, setup: Setup) -> int:
         objects.ensure_if_there(write)
     objects.ensure(setup.profile.heartbeat(setup.drive.node))
     # What makes it miss its host comes last: from then on somebody must be there.
-    needed = {"heartbeat": od.HEARTBEAT_CONSUMER}.get(setup.drive.watchdog)
+    spare = (od.ERROR_BEHAVIOUR, *(() if setup.drive.watchdog == "heartbeat" else (od.HEARTBEAT_CONSUMER,)))
     for write in setup.profile.watched(setup.drive.node):
-        if write.entry in (od.HEARTBEAT_CONSUMER, od.ERROR_BEHAVIOUR) and write.entry != needed:
-            objects.ensure_if_there(write)
-        else:
-            objects.ensure(write)
+        (objects.ensure_if_there if write.entry in spare else objects.ensure)(write)
     for write in setup.watchdog():
         objects.ensure(write)
     for write in setup.hints():
-        with suppress(SdoRefused):
+        with suppress(SdoRefused, NotHeld):
             objects.ensure_if_there(write)
     _mode(objects, setup)
     return setup.torque.mode if setup.torque.by is None else objects.read(od.MODE)
@@ -277,7 +275,8 @@ def _mode(objects: Objects, setup: Setup) -> None:
     """Set the mode of operation, and wait until it is in effect: drives may take their time to say so."""
     by, clock = setup.torque.by, objects.clock
     entry, display = (od.MODE, od.MODE_DISPLAY) if by is None else map(_mode_entry, (by.entry, by.display))
-    objects.ensure(Write(entry, setup.torque.mode))
+    if not objects.holds(wanted := Write(entry, setup.torque.mode)):
+        objects.write(wanted)  # the display is what reads it back; 6060h itself may be write-only
     last = clock.now_ns() + round(_MODE_PATIENCE * 1e9)
     while (mode := objects.read(display)) != setup.torque.mode:
         if clock.now_ns() > last:
@@ -340,21 +339,23 @@ def _encoder(objects: Objects, drive: CanopenDrive) -> None:
 
 def _rated_torque(objects: Objects, setup: Setup) -> None:
     """Set what a thousandth is of where the family lets it be set, or make sure that it is so where it does not."""
-    if setup.can.family.unit is None or not setup.can.family.unit.writable:
+    unit, rated = setup.can.family.unit, setup.drive.rated_torque
+    if unit is None or unit.rated is None or not unit.writable:
         return  # compared already
-    drive = setup.drive
-    wanted = Write(od.RATED_TORQUE, round(1e3 * drive.rated_torque))
+    entry, size = entry_of(unit.rated, "rated torque"), TORQUE_UNITS[unit.unit]
+    wanted = Write(entry, round(rated / size))
+    if wanted.value < 1 or abs(wanted.value * size - rated) > _ROUNDING * rated:
+        words = f"rated_torque {rated:g} N m is not whole {unit.unit}, which is what {where(entry)} holds"
+        raise DriverError(f"node {objects.node}: {words}")
     try:
         objects.ensure(wanted)
     except SdoRefused as refused:
         if refused.code not in READ_ONLY:
             raise
-        held = objects.read(od.RATED_TORQUE)
-        if held != wanted.value:
-            raise DriverError(
-                f"node {objects.node}: its rated torque is {held} mN m and cannot be set; "
-                f"the configuration says rated_torque: {drive.rated_torque:g}"
-            ) from None
+        raise DriverError(
+            f"node {objects.node}: its rated torque is {objects.read(entry) * size:g} N m and cannot be set; "
+            f"the configuration says rated_torque: {rated:g}"
+        ) from None
 
 
 def _max_speed(objects: Objects, setup: Setup) -> None:

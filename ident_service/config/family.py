@@ -62,6 +62,8 @@ class TorqueUnit(Section):
     def _one_of_both(self) -> TorqueUnit:
         if (self.rated is None) == (self.count is None):
             raise ValueError("either `rated` names an entry, or `count` is a number")
+        if self.writable and (self.rated is None or self.unit == "mA"):
+            raise ValueError("only a rated torque in mNm or uNm is written")
         return self
 
 
@@ -104,6 +106,8 @@ class Family(Section):
     @model_validator(mode="after")
     def _every_fact_has_a_source(self) -> Family:
         told = self.model_fields_set - _NEEDS_NO_SOURCE
+        if empty := [key for key in sorted(told) if getattr(self, key) is None]:
+            raise ValueError(f"{', '.join(empty)}: leave out what is not known")
         if told != self.sources.keys():
             raise ValueError(f"sources are needed for {', '.join(sorted(told))}; there are {', '.join(self.sources)}")
         return self

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from drivers.canopen.capabilities import TORQUE_UNITS
 from drivers.canopen.families import entry_of, family_of
 from ident_service.config.canopen import CanopenDrive
 from ident_service.config.eds import DataSheet, data_sheet
@@ -19,7 +20,6 @@ from sim_backend.canopen.objects import Objects
 
 _MODE, _CONTROL = "mode of operation", "control word"
 _LOOP_NS, _MODE_NS = 1_000_000, 20_000_000
-_UNITS = {"mNm": 1e-3, "uNm": 1e-6, "mA": 1e-3}
 _SOME_CONSTANT = 0.05  # N m/A, of a motor whose description has none
 # Objects without which a mode makes no sense, by the mode's number (CiA 402-2).
 _MODES = {1: (0x607A,), 3: (0x60FF,), 4: (0x6071, 0x6087), 6: (0x6098,), 10: (0x6071,)}
@@ -88,7 +88,7 @@ def personality_of(text: str, drive: CanopenDrive, families: Sequence[Family] = 
     paths = [path for path in family.torque if sheet.has(_key(path.target) >> 8)]
     unit = family.unit or TorqueUnit(rated="6076:0/u32", unit="mNm")
     constant = drive.torque_constant or _SOME_CONSTANT
-    scale = _UNITS[unit.unit] * (constant if unit.unit == "mA" else 1.0) * (unit.count or 1.0)
+    scale = TORQUE_UNITS[unit.unit] * (constant if unit.unit == "mA" else 1.0) * (unit.count or 1.0)
     limits = {(_key(one.entry), None if one.per is None else _key(one.per)) for one in family.torque_limit}
     amperes = drive.rated_torque / constant
     motor = {0x607500: round(1e3 * amperes), 0x607600: round(1e3 * drive.rated_torque)}

@@ -96,7 +96,7 @@ def test_another_drive_than_the_configuration_names_is_refused(key: str, asked: 
 def test_a_rated_torque_that_only_the_drive_decides_must_be_the_configured_one() -> None:
     fixed = eds_with("6076", AccessType="ro", DefaultValue="1200")
     bench = Bench(weightless_config(), weightless_config(eds=fixed))
-    with pytest.raises(DriverError, match=r"node 1: its rated torque is 1200 mN m and cannot be set.*rated_torque: 1"):
+    with pytest.raises(DriverError, match=r"node 1: its rated torque is 1.2 N m and cannot be set.*rated_torque: 1"):
         bench.arm.open()
     check_nothing_is_open(bench)
     same = eds_with("6076", AccessType="ro", DefaultValue="1000")
@@ -351,3 +351,36 @@ def test_what_a_drive_has_already_is_not_written_again() -> None:
     assert len(downloads[0]) > 40
     # Only what `close` took back, so that the drives forget their host.
     assert set(downloads[1]) == {(0x6007, 0), (0x1016, 1)}
+
+
+def test_a_rated_torque_that_the_entry_cannot_hold_is_refused_before_the_drive_has_another() -> None:
+    fine = [one | {"rated_torque": 0.0005, "max_torque": 0.01} for one in drives()]
+    bench = Bench(weightless_config(drives=fine))
+    with pytest.raises(
+        DriverError, match=r"node 1: rated_torque 0.0005 N m is not whole mNm, which is what 6076h holds"
+    ):
+        bench.arm.open()
+    check_nothing_is_open(bench)
+
+
+def test_a_mode_that_can_only_be_written_is_read_back_by_its_display() -> None:
+    bench = Bench(weightless_config(eds=eds_with("6060", AccessType="wo")))
+    with bench.arm as arm:
+        arm.enable()
+        assert arm.exchange(ZERO).valid.all()
+
+
+def test_a_hint_that_a_drive_rounds_is_left_as_it_is() -> None:
+    bench = Bench(weightless_config())
+    objects = bench.drive(0).objects
+    written = objects.written
+
+    def rounds(key: int) -> None:
+        if key == 0x100600:
+            objects.put(0x1006, 1000)
+        written(key)
+
+    objects.written = rounds
+    with bench.arm as arm:
+        assert arm.exchange(None).valid.all()
+    assert objects.number(0x1006) == 1000

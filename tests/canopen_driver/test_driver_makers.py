@@ -186,3 +186,25 @@ def test_a_watchdog_is_proven_where_the_drive_goes_on_telling_its_state(name: st
     assert (check.verdict is Verdict.PASSED) == told == (name in PROVEN), check.reason
     bench.arm.close()
     assert "operation enabled" not in " ".join(bench.behind.emulator.states)
+
+
+def test_a_family_of_the_users_has_its_rated_torque_written_in_its_own_unit() -> None:
+    mine = """
+name: mine
+proved: no
+match: {vendor: 0xFB, product: [0x65510000]}
+unit: {rated: 6076:0/u32, unit: uNm, writable: yes}
+torque_limit: [{entry: 3001:2/u32, per: 3001:1/u32}]
+sources: {match: a test, unit: a test, torque_limit: a test}
+"""
+    config = arm_of("maxon_epos4_50-8_0110h.eds", profiles=[{"name": "mine.yaml", "text": mine}])
+    document = config.model_dump(mode="json", by_alias=True)
+    for drive in document["driver"]["drives"]:
+        drive.update(rated_torque=0.25, max_torque=0.5)
+    bench = Bench(ArmConfig.model_validate(document), config)
+    with bench.arm as arm:
+        arm.enable()
+        sample = arm.exchange(np.array([0.1, 0.1]))
+        held = [face.objects.number(0x6076) for face in bench.behind.emulator.faces]  # type: ignore[attr-defined]
+    assert held == [250_000, 250_000]
+    np.testing.assert_allclose(sample.torque, 0.1, atol=3e-4)
