@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector, Watchdog
 from drivers.canopen import dictionary as od
 from drivers.canopen.buses import Buses
+from drivers.canopen.capabilities import required
 from drivers.canopen.codec import Drive, Emergency
 from drivers.canopen.coordinates import Coordinates, coordinates, unwrapped
 from drivers.canopen.enabling import Enabling, Resetting, hold
@@ -316,9 +317,9 @@ class CanopenArm(Arm):
         for number, drive in enumerate(self._driver.drives):
             objects = buses.objects(number)
             identity = identify(objects, drive.identity)
+            own = self._driver.reactions, self._quick_stop, motors[number], required(objects, self._driver, number)
             self._begun = number + 1
-            reactions = self._driver.reactions, self._quick_stop
-            configure(objects, Setup(drive, buses.profile(number), *reactions, motors[number]))
+            buses.modes[number] = configure(objects, Setup(drive, buses.profile(number), *own))
             if self._zeros is not None:
                 counts = self._coordinates.zero[number]
                 if not self._zeros.keep_on(objects, number, counts, buses.restarted(number)):

@@ -38,7 +38,6 @@ from drivers.canopen.profile import (
 )
 from drivers.canopen.words import NmtState
 from ident_service.config.canopen import CanBus, CanopenDriver
-from ident_service.config.eds import maps_dummies
 
 MOST_WORST, MOST_TYPICAL = 1.0, 0.9  # of a bus
 ROUND_RATES = (1000, 800, 500, 400, 250, 200, 125, 100, 50)  # Hz
@@ -270,7 +269,7 @@ def _remedies(driver: CanopenDriver, rate: float, plain: Budget) -> Iterator[str
 
 
 def _variants(driver: CanopenDriver) -> Iterator[tuple[str, CanopenDriver]]:
-    if driver.torque_frames == "single" and maps_dummies(driver.eds.text):
+    if driver.torque_frames == "single" and driver.shares_by_sheet:
         words = "let up to four drives share a torque frame (driver.torque_frames: shared)"
         yield words, driver.model_copy(update={"torque_frames": "shared"})
     if len(driver.buses) == 1 and len(driver.drives) > 1:

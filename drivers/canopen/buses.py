@@ -54,6 +54,7 @@ class Buses:
         clock: of the links.
         complete: whether every drive answered in the last cycle.
         lost: positions that did not come in their cycle, so far.
+        modes: of operation, that control words of each drive come with.
         withheld: kinds of watchdogs that are not fed, so that they can be seen to act.
     """
 
@@ -77,6 +78,7 @@ class Buses:
             for number, drive in zip(codec.profile.drives, codec.drives, strict=True):
                 drives[number], self._at[number] = drive, (codec, link)
         self.drives = [drives[number] for number in range(len(drives))]
+        self.modes = [CST] * len(self.drives)
         self._period_ns = period_ns
         wire = max(_on_the_wire(profile) for profile in profiles)
         self._least_ns = round(min(max(LEAST * period_ns, 1e9 * wire), RECEIVE * period_ns))
@@ -110,7 +112,7 @@ class Buses:
     def control(self, number: int, word: int) -> None:
         """A control word for one drive."""
         codec, link = self._at[number]
-        link.send(codec.control_word(self.drives[number].node, word, CST))
+        link.send(codec.control_word(self.drives[number].node, word, self.modes[number]))
 
     def objects(self, number: int) -> Objects:
         """The object dictionary of one drive, for as long as nothing streams."""

@@ -50,6 +50,11 @@ class Entry:
         """The word that maps it into a PDO: index, sub-index, bits (CiA 301, 1600h)."""
         return self.index << 16 | self.sub << 8 | 8 * self.kind.size
 
+    @property
+    def key(self) -> int:
+        """Index and sub-index in one number."""
+        return self.index << 8 | self.sub
+
     def at(self, sub: int) -> Entry:
         """The same entry at another sub-index."""
         return replace(self, sub=sub)

@@ -149,10 +149,10 @@ class Resetting:
         words = []
         for number, drive in enumerate(self._drives):
             if drive.state is DriveState.FAULT:
-                # First low, in the next cycle high; then again, in case that one of them was lost.
+                # Two cycles low, two high, since some drives read one of two words within a millisecond; then again.
                 phase = self._edge.get(number, 0)
                 self._edge[number] = phase + 1
-                words.append((number, RESET_FAULT if phase % 2 else DISABLE_VOLTAGE))
+                words.append((number, RESET_FAULT if phase // 2 % 2 else DISABLE_VOLTAGE))
         return words
 
 

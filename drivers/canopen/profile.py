@@ -39,6 +39,7 @@ _NOT_VALID, _NO_REMOTE = 1 << 31, 1 << 30  # bits of a PDO's COB-ID entry
 _EVERY_SYNC, _ON_RECEPTION, _ON_CHANGE = 1, 255, 255
 _UNUSED = (3, 4)  # some drives command their axis by these out of the box
 _MOST_16 = 0xFFFF
+_MOST_SYNCS = 240  # of a synchronous transmission type
 _STAYS_OPERATIONAL = 1  # 1029h:01 (CiA 301, 7.5.2.32)
 _STATUS_PATIENCE = 2.5  # periods without a status report: one was lost, and the next one is late as well
 
@@ -54,10 +55,15 @@ def restricted(cob_id: int) -> bool:
 
 @dataclass(frozen=True)
 class Write:
-    """One SDO download: the value of an entry."""
+    """One SDO download: the value of an entry, and the bits of it in which another value is as good."""
 
     entry: Entry
     value: int
+    ignored: int = 0
+
+    def same(self, held: int) -> bool:
+        """Return whether a value is as good as this one."""
+        return not (held ^ self.value) & ~self.ignored
 
     @property
     def data(self) -> bytes:
@@ -109,20 +115,40 @@ class Pdo:
 
     def writes(self) -> list[Write]:
         """What to write, in this order (CiA 301, 7.5.2.36): off, no mapping, mapping, type and times, on."""
-        cob_id, kind, count, slot, timer = _TPDO if self.sent else _RPDO
+        clear, *mapping = self.mapping
+        return [self.off, clear, *mapping, *self.parameters, self.on]
 
-        def entry(of: Entry, sub: int | None = None) -> Entry:
-            return pdo_entry(of, self.number, sub)
+    @property
+    def on(self) -> Write:
+        """What makes it exist."""
+        return Write(self._entry(0), self.cob_id | (_NO_REMOTE if self.sent else 0), _NO_REMOTE)
 
-        value = self.cob_id | (_NO_REMOTE if self.sent else 0)
-        todo = [Write(entry(cob_id), value | _NOT_VALID), Write(entry(count), 0)]
-        todo += [Write(entry(slot, sub), mapped.mapping) for sub, mapped in enumerate(self.slots, 1)]
-        todo += [Write(entry(count), len(self.slots)), Write(entry(kind), self.type)]
+    @property
+    def off(self) -> Write:
+        """What ends it."""
+        return Write(self._entry(0), self.on.value | _NOT_VALID, _NO_REMOTE)
+
+    @property
+    def mapping(self) -> list[Write]:
+        """No entries, the entries, their number."""
+        slots = [Write(self._entry(3, sub), mapped.mapping) for sub, mapped in enumerate(self.slots, 1)]
+        return [Write(self._entry(2), 0), *slots, Write(self._entry(2), len(self.slots))]
+
+    @property
+    def parameters(self) -> list[Write]:
+        """Type and times."""
+        todo = [Write(self._entry(1), self.type)]
         if self.sent and self.type == _ON_CHANGE:
-            todo.append(Write(entry(od.TPDO_INHIBIT), self.inhibit))
-        if self.timer:
-            todo.append(Write(entry(timer), self.timer))
-        return [*todo, Write(entry(cob_id), value)]
+            todo.append(Write(pdo_entry(od.TPDO_INHIBIT, self.number), self.inhibit))
+        return [*todo, self.timing] if self.timer else todo
+
+    @property
+    def timing(self) -> Write:
+        """The timer, which may be left at 0 where the drive has none."""
+        return Write(self._entry(4), self.timer)
+
+    def _entry(self, which: int, sub: int | None = None) -> Entry:
+        return pdo_entry((_TPDO if self.sent else _RPDO)[which], self.number, sub)
 
 
 _RPDO = (od.RPDO_COB_ID, od.RPDO_TYPE, od.RPDO_COUNT, od.RPDO_MAPPING, od.RPDO_DEADLINE)
@@ -214,24 +240,22 @@ class BusProfile:
             Pdo(2, True, TPDO2 + node, _ON_CHANGE, self.status_slots, inhibit, period),
         ]
 
-    def writes(self, node: int) -> list[Write]:
-        """All that makes one drive speak this profile, in order; the drive must be pre-operational.
+    def identifiers(self, node: int) -> list[Write]:
+        """What SYNC and emergencies are; where a drive lacks an entry, it is so by CiA 301."""
+        return [
+            Write(od.SYNC_COB_ID, SYNC, _NO_REMOTE),
+            Write(od.EMERGENCY_COB_ID, EMERGENCY + node, _NO_REMOTE),
+            Write(od.EMERGENCY_INHIBIT, _whole(EMERGENCY_INHIBIT, 1e-4)),
+        ]
 
-        Unused PDOs go first, so that none shares a COB-ID with a new one even for a moment. Their bit "not valid" is
-        written with COB-IDs that they have by default; a drive that lacks one of them answers with an abort.
+    def heartbeat(self, node: int) -> Write:
+        """How often a drive says that it lives; one that is guarded cannot (CiA 301, 7.2.8.3.1)."""
+        return Write(od.HEARTBEAT_PRODUCER, 0 if node in self.guarded else _whole(self.heartbeat_drives, 1e-3))
 
-        Raises:
-            KeyError: the node is not on this bus.
-        """
-        todo = [Write(od.SYNC_COB_ID, SYNC), Write(od.SYNC_OVERFLOW, 0)]
-        todo += [Write(od.EMERGENCY_COB_ID, EMERGENCY + node)]
-        todo += [Write(od.EMERGENCY_INHIBIT, _whole(EMERGENCY_INHIBIT, 1e-4))]
-        todo += self.silenced(node)
-        for pdo in self.pdos(node):
-            todo += pdo.writes()
-        guarded = node in self.guarded  # which a node that sends heartbeats cannot be (CiA 301, 7.2.8.3.1)
-        todo.append(Write(od.HEARTBEAT_PRODUCER, 0 if guarded else _whole(self.heartbeat_drives, 1e-3)))
-        return [*todo, *self.watched(node)]
+    @property
+    def status_syncs(self) -> int:
+        """SYNCs from one status report to the next, of drives without a timer for it (1801h:05)."""
+        return min(max(1, round(self.status_inhibit * self.rate)), _MOST_SYNCS)
 
     def watched(self, node: int) -> list[Write]:
         """Return what makes the drive miss its host, by heartbeat and by guarding; torque frames are in `pdos`."""
@@ -245,14 +269,13 @@ class BusProfile:
             todo += [Write(od.GUARD_TIME, _whole(period, 1e-3)), Write(od.LIFE_FACTOR, factor)]
         return todo
 
-    def silenced(self, node: int) -> list[Write]:
-        """What switches the PDOs off that this profile does not use."""
-        off = []
-        for number in _UNUSED:
-            base = (number - 1) * 0x100 + node
-            off.append(Write(pdo_entry(od.RPDO_COB_ID, number), RPDO1 + base | _NOT_VALID))
-            off.append(Write(pdo_entry(od.TPDO_COB_ID, number), TPDO1 + base | _NOT_VALID | _NO_REMOTE))
-        return off
+    def silenced(self, node: int) -> list[Pdo]:
+        """The PDOs that this profile does not use, with COB-IDs that they have by default."""
+        return [
+            Pdo(number, sent, (TPDO1 if sent else RPDO1) + (number - 1) * 0x100 + node, _ON_RECEPTION, ())
+            for number in _UNUSED
+            for sent in (False, True)
+        ]
 
 
 def bus_profiles(driver: CanopenDriver, rate: float) -> list[BusProfile]:

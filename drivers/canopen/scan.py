@@ -8,21 +8,22 @@ Boundary: what nodes say. Whether they are the configured ones is the service's 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import TypeVar
 
 from drivers.canopen import dictionary as od
 from drivers.canopen.bits import worst
 from drivers.canopen.bus_errors import BusError
+from drivers.canopen.capabilities import DRIVE_PROFILE
 from drivers.canopen.frame import Frame
 from drivers.canopen.link import Link, open_links
 from drivers.canopen.lock import BusLock
 from drivers.canopen.overheard import Overheard
 from drivers.canopen.polling import BURST, Place, poll
 from drivers.canopen.sdo import DOES_NOT_EXIST, TIMEOUT, Objects, SdoRefused
-from drivers.canopen.setup import DRIVE_PROFILE, IDENTITY
+from drivers.canopen.setup import IDENTITY
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError
@@ -85,6 +86,23 @@ def scan(config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_l
     Raises:
         DriverError: another driver, a bus that is in use, by another host too, or that cannot be had.
     """
+    with asking(config, open_bus) as (driver, links, heard):
+        return _found(driver, links, heard)
+
+
+@contextmanager
+def asking(
+    config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_links
+) -> Iterator[tuple[CanopenDriver, list[Link], Overheard]]:
+    """Have the buses for oneself, to ask on; who is heard in a second has been heard then.
+
+    Args:
+        config: with a CANopen driver.
+        open_bus: gives the links, in the order of the buses.
+
+    Raises:
+        DriverError: another driver, a bus that is in use, by another host too, or that cannot be had.
+    """
     driver = config.driver
     if not isinstance(driver, CanopenDriver):
         raise DriverError(f"{config.name}: the driver is not CANopen's")
@@ -94,7 +112,12 @@ def scan(config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_l
         if all(bus.interface != "lock_step" for bus in driver.buses):
             locks += [BusLock(bus) for bus in driver.buses]
         links += open_bus(config)
-        return _found(driver, links)
+        heard = Overheard()
+        heard.listen(links, LISTEN)
+        if heard.streaming:
+            buses = ", ".join(driver.buses[bus].channel for bus in sorted(heard.streaming))
+            raise DriverError(f"another host sends SYNC on {buses}; a scan would delay its frames: stop it first")
+        yield driver, links, heard
     finally:
         for link in links:
             with suppress(Exception):
@@ -103,12 +126,8 @@ def scan(config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_l
             lock.close()
 
 
-def _found(driver: CanopenDriver, links: list[Link]) -> list[FoundNode]:
-    heard, clock = Overheard(), links[0].clock
-    heard.listen(links, LISTEN)
-    if heard.streaming:
-        buses = ", ".join(driver.buses[bus].channel for bus in sorted(heard.streaming))
-        raise DriverError(f"another host sends SYNC on {buses}; a scan would delay its frames: stop it first")
+def _found(driver: CanopenDriver, links: list[Link], heard: Overheard) -> list[FoundNode]:
+    clock = links[0].clock
 
     def asked(places: set[Place], patience: float) -> dict[Place, int | None]:
         answers = poll(links, places, od.DEVICE_TYPE, clock.now_ns() + round(patience * 1e9), heard.take)
@@ -128,12 +147,13 @@ def _found(driver: CanopenDriver, links: list[Link]) -> list[FoundNode]:
         words = heard.nmt_words(place, clock.now_ns(), patience_ns)
         node = FoundNode(bus, number, words, place in kinds, kinds.get(place))
         if node.answers:
-            _read(node, Objects(links[bus], number, _hearing(heard, bus)))
+            _read(node, Objects(links[bus], number, hearing(heard, bus)))
         found.append(node)
     return found
 
 
-def _hearing(heard: Overheard, bus: int) -> Callable[[Frame], None]:
+def hearing(heard: Overheard, bus: int) -> Callable[[Frame], None]:
+    """Return what takes the frames of a bus that are no answers."""
     return lambda frame: heard.take(bus, frame)
 
 

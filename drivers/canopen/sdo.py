@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 from canopen.objectdictionary import ObjectDictionary
 from canopen.sdo import SdoAbortedError, SdoClient, SdoCommunicationError
@@ -19,14 +19,17 @@ from drivers.canopen.frame import Frame
 from drivers.canopen.link import Link
 from drivers.canopen.profile import SDO_REPLY, SDO_REQUEST, Write
 from drivers.canopen.words import abort_words
+from drivers.clock import Clock
 from ident_service.errors import DriverError
 
 TIMEOUT = 0.3  # s for one reply
 # What the library logs as an error is in the errors raised here, or was tried again.
 logging.getLogger("canopen.sdo").setLevel(logging.CRITICAL)
 _ABORT = 0x80
+T = TypeVar("T")
 DOES_NOT_EXIST = (0x06020000, 0x06090011)
 READ_ONLY = (0x06010000, 0x06010002)
+WRITE_ONLY = (0x06010001,)
 
 
 class SdoRefused(DriverError):
@@ -35,6 +38,20 @@ class SdoRefused(DriverError):
     def __init__(self, message: str, code: int) -> None:
         super().__init__(message)
         self.code = code
+
+
+class NotHeld(DriverError):
+    """An entry was set without an abort, and holds something else."""
+
+
+def optional(do: Callable[[Any], T], what: Any) -> T | None:
+    """Do something about an entry, and return what that gives; None where the drive has no such entry."""
+    try:
+        return do(what)
+    except SdoRefused as refused:
+        if refused.code not in DOES_NOT_EXIST:
+            raise
+        return None
 
 
 class Objects:
@@ -53,6 +70,11 @@ class Objects:
         self._client = SdoClient(SDO_REQUEST + node, SDO_REPLY + node, ObjectDictionary())
         self._client.network = self
         self._client.RESPONSE_TIMEOUT = 0.0  # what has not come while we received will not come any more
+
+    @property
+    def clock(self) -> Clock:
+        """Of the link."""
+        return self._link.clock
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
         """Send a request and hand the reply to the client (the library calls this)."""
@@ -89,12 +111,31 @@ class Objects:
         what = f"setting {entry} to {write.value}"
         self._asked(what, self._client.download, entry.index, entry.sub, write.data)
 
+    def holds(self, write: Write) -> bool:
+        """Whether an entry holds a value already; one that only can be written is taken not to. Raises as `read`."""
+        try:
+            return write.same(self.read(write.entry))
+        except SdoRefused as refused:
+            if refused.code not in WRITE_ONLY:
+                raise
+            return False
+
+    def ensure(self, write: Write) -> None:
+        """Have an entry hold a value: it is compared, written where it differs, and read back; raises as `set`."""
+        if not optional(self.holds, write):  # setting one that is missing says so
+            self.set(write)
+
+    def ensure_if_there(self, write: Write) -> None:
+        """As `ensure`, but nothing where the drive has no such entry."""
+        if optional(self.holds, write) is False:
+            self.set(write)
+
     def set(self, write: Write) -> None:
-        """Set an entry and read it back; raises as `read`, and DriverError when it holds something else."""
+        """Set an entry and read it back; raises as `read`, and NotHeld when it holds something else."""
         self.write(write)
         held = self.read(write.entry)
-        if held != write.value:
-            raise DriverError(f"node {self.node}: {write.entry} was set to {write.value} but holds {held}")
+        if not write.same(held):
+            raise NotHeld(f"node {self.node}: {write.entry} was set to {write.value} but holds {held}")
 
     def _asked(self, what: str, ask: Callable[..., Any], *arguments: Any) -> Any:
         try:

@@ -1,22 +1,27 @@
 """What every drive is told before anything moves: who it must be, what it protects by itself, which frames it speaks.
 
-Everything that protects is written and read back (FIELDBUS.md 2.5). Entries that a drive may lack are left out where
-it does: position limits, SYNC's period and window, the interpolation period, PDOs that are only switched off.
+Everything is compared first, written where it differs, and read back (FIELDBUS.md 2.5; DRIVES.md 2 and 4). What a drive
+lacks of it was judged before (`capabilities.py`): what is indispensable has been refused, what may be missing is left
+out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from drivers.arm import Watchdog
 from drivers.canopen import dictionary as od
+from drivers.canopen.capabilities import DRIVE_PROFILE, TORQUE_UNITS, Capabilities, where
 from drivers.canopen.coordinates import Coordinates, torque_limit_counts
 from drivers.canopen.dictionary import Entry, Kind
-from drivers.canopen.profile import BusProfile, Write
-from drivers.canopen.sdo import DOES_NOT_EXIST, READ_ONLY, Objects, SdoRefused
+from drivers.canopen.families import entry_of
+from drivers.canopen.pdo_setup import configure_pdos
+from drivers.canopen.profile import BusProfile, Pdo, Write
+from drivers.canopen.sdo import DOES_NOT_EXIST, READ_ONLY, NotHeld, Objects, SdoRefused, optional
 from drivers.canopen.words import POWER_OFF, state_of
 from drivers.canopen.zero import Zeros
 from ident_service.config.canopen import (
@@ -27,14 +32,16 @@ from ident_service.config.canopen import (
     motor_speeds,
     quick_stop_decelerations,
 )
+from ident_service.config.family import TorquePath
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import AnotherDrive, DriverError
 
 LIMIT_SLACK = 0.05  # rad or m beyond the joints' limits that the drives are told of
-DRIVE_PROFILE = 402  # low word of 1000h
 _FIRMWARE = 0x100A
 _COUNTS_PER_LINE = (1.0, 4.0)
 _GENTLER = 0.5  # of the wanted deceleration, that a drive's own may be: the ramp takes twice as long
+_MODE_PATIENCE, _MODE_AGAIN_NS = 5.0, 10_000_000  # s in all, ns between two looks
+_ROUNDING = 1e-6
 _LETS_GO, _STAYS = 2, 6  # values of 605Ah: a ramp, then power off, or hold on
 IDENTITY = {"vendor": od.VENDOR, "product": od.PRODUCT, "revision": od.REVISION, "serial": od.SERIAL}
 
@@ -64,6 +71,7 @@ class Setup:
         reactions: to what it finds by itself.
         quick_stop: 605Ah, in place of what `reactions` leaves open.
         motor: what the joints' limits mean for it.
+        can: what it can.
     """
 
     drive: CanopenDrive
@@ -72,16 +80,18 @@ class Setup:
     quick_stop: int
     motor: MotorLimits
 
-    def protections(self) -> list[Write]:
-        """What the drive keeps to by itself."""
-        drive = self.drive
-        return [
-            Write(od.MAX_TORQUE, torque_limit_counts(drive.max_torque, drive.rated_torque)),
-            Write(od.QUICK_STOP_OPTION, self.quick_stop),
-            Write(od.FAULT_OPTION, self.reactions.fault),
-            Write(od.ABORT_CONNECTION, self.reactions.abort_connection),
-            *self.watchdog(),
-        ]
+    can: Capabilities
+
+    @property
+    def torque(self) -> TorquePath:
+        """Return how its torques are streamed."""
+        assert self.can.torque is not None  # noqa: S101 - else it has been refused
+        return self.can.torque
+
+    @property
+    def limit_counts(self) -> int:
+        """Return the largest torque [counts of the target]."""
+        return torque_limit_counts(self.drive.max_torque, self.drive.rated_torque)
 
     def watchdog(self) -> list[Write]:
         """Return what sets a watchdog of the maker's."""
@@ -89,21 +99,42 @@ class Setup:
             return []
         return [Write(Entry(own.index, own.sub, Kind[own.type.upper()], "watchdog of the drive's maker"), own.value)]
 
-    def positions(self) -> list[Write]:
-        """Return the position limits: no protection, since drives in torque mode give torque beyond them."""
-        if self.motor.positions is None:
-            return []
-        return [Write(od.LOWER_LIMIT, self.motor.positions[0]), Write(od.UPPER_LIMIT, self.motor.positions[1])]
+    def options(self) -> list[Write]:
+        """Return the reactions, for drives that let them be chosen."""
+        return [
+            Write(od.QUICK_STOP_OPTION, self.quick_stop),
+            Write(od.FAULT_OPTION, self.reactions.fault),
+            Write(od.ABORT_CONNECTION, self.reactions.abort_connection),
+        ]
 
-    def timing(self) -> list[Write]:
-        """The cycle, for drives that want to know it."""
-        period_us = round(1e6 / self.profile.rate)
-        power = next(power for power in (-3, -4, -5, -6) if period_us % 10 ** (6 + power) == 0)
-        number = period_us // 10 ** (6 + power)
-        todo = [Write(od.SYNC_PERIOD, period_us), Write(od.SYNC_WINDOW, round(0.9 * period_us))]
-        if number <= 0xFF:
-            todo += [Write(od.PERIOD_POWER, power), Write(od.PERIOD_NUMBER, number)]
-        return todo
+    def hints(self) -> list[Write]:
+        """Return the cycle and the position limits, for drives that want to know them.
+
+        They protect nothing: drives in torque mode give torque beyond the position limits.
+        """
+        todo = [Write(od.SYNC_PERIOD, self.period_us)]
+        if self.motor.positions is not None:
+            lowest, highest = self.motor.positions
+            todo += [Write(od.LOWER_LIMIT, lowest), Write(od.UPPER_LIMIT, highest)]
+        power = next(power for power in (-3, -4, -5, -6) if self.period_us % 10 ** (6 + power) == 0)
+        number = self.period_us // 10 ** (6 + power)
+        return [*todo, Write(od.PERIOD_POWER, power), Write(od.PERIOD_NUMBER, number)] if number <= 0xFF else todo
+
+    @property
+    def period_us(self) -> int:
+        """Return the cycle's period [us]."""
+        return round(1e6 / self.profile.rate)
+
+    def pdos(self) -> list[Pdo]:
+        """Return the PDOs that the drive shall have; without a timer it tells its status at every n-th SYNC."""
+        target = entry_of(self.torque.target, "target torque", "counts")
+        found = []
+        for pdo in self.profile.pdos(self.drive.node):
+            own = tuple(target if slot == od.TARGET_TORQUE else slot for slot in pdo.slots)
+            found.append(replace(pdo, slots=own))
+            if od.STATUS_WORD in pdo.slots and not self.can.event:
+                found[-1] = replace(pdo, type=self.profile.status_syncs, inhibit=0, timer=0)
+        return found
 
 
 def motor_limits(config: ArmConfig, found: Coordinates) -> list[MotorLimits]:
@@ -177,41 +208,85 @@ def identify(objects: Objects, wanted: DriveIdentity) -> str:
     return f"node {objects.node}: {words}, firmware {firmware}"
 
 
-def configure(objects: Objects, setup: Setup) -> None:
-    """Make a pre-operational drive speak the profile and protect itself.
+def configure(objects: Objects, setup: Setup) -> int:
+    """Make a pre-operational drive speak the profile and protect itself; what it has already is not written.
+
+    Returns:
+        What 6060h is, which is sent with every control word.
 
     Raises:
-        DriverError: it refuses or forgets something; the message names the entry and says why.
+        DriverError: it lacks, refuses or forgets something; the message names the entry and says why.
     """
     _encoder(objects, setup.drive)
-    _rated_torque(objects, setup.drive)
+    _timing(objects, setup)
+    unused = setup.profile.silenced(setup.drive.node)
+    configure_pdos(objects, setup.pdos(), unused, setup.can.dummies)
+    _rated_torque(objects, setup)
+    _largest_torque(objects, setup)
     _max_speed(objects, setup)
     _deceleration(objects, setup)
-    for write in setup.protections():
-        objects.set(write)
-    for write in (*setup.positions(), *setup.timing()):
-        _if_there(objects, write)
-    if not objects.read(od.SUPPORTED_MODES) & od.CST_SUPPORTED:
-        raise DriverError(f"node {objects.node}: does not support cyclic synchronous torque mode (6502h, bit 9)")
-    objects.write(Write(od.MODE, od.CST))
-    silenced = setup.profile.silenced(setup.drive.node)
-    writes = setup.profile.writes(setup.drive.node)
-    kind = setup.drive.watchdog
-    # Who neither waits for heartbeats nor has a torque frame's deadline may have no 1016h at all.
-    spare = (od.ERROR_BEHAVIOUR, *(() if kind in ("rpdo_timer", "heartbeat") else (od.HEARTBEAT_CONSUMER,)))
-    for write in writes:
-        if write in silenced or write.entry in spare:
-            _if_there(objects, write)
-        else:
-            objects.write(write)
-    for write in writes:
-        guarded = write.entry in (od.RPDO_DEADLINE, od.HEARTBEAT_CONSUMER, od.GUARD_TIME, od.LIFE_FACTOR)
-        if guarded and write.entry not in spare and objects.read(write.entry) != write.value:
-            raise DriverError(
-                f"node {objects.node}: {write.entry} does not hold {write.value}: it would not stop by itself"
-            )
-    if (mode := objects.read(od.MODE_DISPLAY)) != od.CST:
-        raise DriverError(f"node {objects.node}: is in mode {mode} (6061h) although {od.CST} was set")
+    for write in setup.options():
+        objects.ensure_if_there(write)
+    objects.ensure(setup.profile.heartbeat(setup.drive.node))
+    # What makes it miss its host comes last: from then on somebody must be there.
+    spare = (od.ERROR_BEHAVIOUR, *(() if setup.drive.watchdog == "heartbeat" else (od.HEARTBEAT_CONSUMER,)))
+    for write in setup.profile.watched(setup.drive.node):
+        (objects.ensure_if_there if write.entry in spare else objects.ensure)(write)
+    for write in setup.watchdog():
+        objects.ensure(write)
+    for write in setup.hints():
+        with suppress(SdoRefused, NotHeld):
+            objects.ensure_if_there(write)
+    _mode(objects, setup)
+    return setup.torque.mode if setup.torque.by is None else objects.read(od.MODE)
+
+
+def _timing(objects: Objects, setup: Setup) -> None:
+    """Have SYNC be without counter and window; 1019h is only written while 1006h is 0 (CiA 301, 7.5.2.22)."""
+    for write in setup.profile.identifiers(setup.drive.node):
+        objects.ensure_if_there(write)
+    counter = Write(od.SYNC_OVERFLOW, 0)
+    if optional(objects.holds, counter) is False:
+        objects.ensure_if_there(Write(od.SYNC_PERIOD, 0))
+        objects.ensure(counter)
+    objects.ensure_if_there(Write(od.SYNC_WINDOW, 0))  # torques come just before the next SYNC
+
+
+def _largest_torque(objects: Objects, setup: Setup) -> None:
+    """Set the largest torque that the drive gives, in its own entry and unit."""
+    limit, value = setup.can.limit, setup.limit_counts
+    assert limit is not None  # noqa: S101 - else it has been refused
+    if limit.per is not None:
+        value = value * objects.read(entry_of(limit.per, "what the largest torque is per mille of")) // 1000
+    for text in (limit.entry, limit.negative):
+        try:
+            if text is not None:
+                objects.ensure(Write(entry_of(text, "largest torque"), value))
+        except SdoRefused as refused:
+            words = f"drives.max_torque is {setup.drive.max_torque:g} N m"
+            raise SdoRefused(
+                f"{refused}; {words}, which the drive must be able to limit itself to", refused.code
+            ) from None
+    if setup.torque.slope is not None:  # mode 4 would turn a step into a ramp: the whole torque within 1 ms
+        objects.ensure(Write(entry_of(setup.torque.slope, "torque slope"), 1000 * setup.limit_counts))
+
+
+def _mode(objects: Objects, setup: Setup) -> None:
+    """Set the mode of operation, and wait until it is in effect: drives may take their time to say so."""
+    by, clock = setup.torque.by, objects.clock
+    entry, display = (od.MODE, od.MODE_DISPLAY) if by is None else map(_mode_entry, (by.entry, by.display))
+    if not objects.holds(wanted := Write(entry, setup.torque.mode)):
+        objects.write(wanted)  # the display is what reads it back; 6060h itself may be write-only
+    last = clock.now_ns() + round(_MODE_PATIENCE * 1e9)
+    while (mode := objects.read(display)) != setup.torque.mode:
+        if clock.now_ns() > last:
+            words = f"is in mode {mode} ({display.index:04X}h) although {setup.torque.mode} was set"
+            raise DriverError(f"node {objects.node}: {words}")
+        clock.sleep_until_ns(clock.now_ns() + _MODE_AGAIN_NS)
+
+
+def _mode_entry(text: str) -> Entry:
+    return entry_of(text, "mode of operation of the maker's")
 
 
 def released(objects: Objects, zeros: Zeros | None, number: int, restarted: Callable[[], bool]) -> Iterator[None]:
@@ -236,9 +311,8 @@ def released(objects: Objects, zeros: Zeros | None, number: int, restarted: Call
     if zeros is not None:
         counts = zeros.held(objects, number)
         yield
-    objects.write(Write(od.ABORT_CONNECTION, 0))
-    for entry in (od.HEARTBEAT_CONSUMER, od.GUARD_TIME):  # or 8130h would follow every session
-        _if_there(objects, Write(entry, 0))
+    for entry in (od.ABORT_CONNECTION, od.HEARTBEAT_CONSUMER, od.GUARD_TIME):  # or 8130h would follow every session
+        optional(objects.write, Write(entry, 0))
     if zeros is not None and counts is not None:
         yield
         zeros.keep_on(objects, number, counts, restarted)
@@ -251,7 +325,7 @@ def _encoder(objects: Objects, drive: CanopenDrive) -> None:
     which each has four counts.
     """
     counts, turns, motor, shaft = (
-        _perhaps(objects, entry) for entry in (od.ENCODER_COUNTS, od.ENCODER_TURNS, od.GEAR_MOTOR, od.GEAR_SHAFT)
+        optional(objects.read, entry) for entry in (od.ENCODER_COUNTS, od.ENCODER_TURNS, od.GEAR_MOTOR, od.GEAR_SHAFT)
     )
     if not counts or not turns or motor != shaft:
         return
@@ -263,30 +337,25 @@ def _encoder(objects: Objects, drive: CanopenDrive) -> None:
         )
 
 
-def _perhaps(objects: Objects, entry: Entry) -> int | None:
-    """Read an entry; None where the drive has no such entry."""
+def _rated_torque(objects: Objects, setup: Setup) -> None:
+    """Set what a thousandth is of where the family lets it be set, or make sure that it is so where it does not."""
+    unit, rated = setup.can.family.unit, setup.drive.rated_torque
+    if unit is None or unit.rated is None or not unit.writable:
+        return  # compared already
+    entry, size = entry_of(unit.rated, "rated torque"), TORQUE_UNITS[unit.unit]
+    wanted = Write(entry, round(rated / size))
+    if wanted.value < 1 or abs(wanted.value * size - rated) > _ROUNDING * rated:
+        words = f"rated_torque {rated:g} N m is not whole {unit.unit}, which is what {where(entry)} holds"
+        raise DriverError(f"node {objects.node}: {words}")
     try:
-        return objects.read(entry)
-    except SdoRefused as refused:
-        if refused.code not in DOES_NOT_EXIST:
-            raise
-        return None
-
-
-def _rated_torque(objects: Objects, drive: CanopenDrive) -> None:
-    """Set what a thousandth is of, or make sure that it is so where the drive alone decides."""
-    wanted = Write(od.RATED_TORQUE, round(1e3 * drive.rated_torque))
-    try:
-        objects.set(wanted)
+        objects.ensure(wanted)
     except SdoRefused as refused:
         if refused.code not in READ_ONLY:
             raise
-        held = objects.read(od.RATED_TORQUE)
-        if held != wanted.value:
-            raise DriverError(
-                f"node {objects.node}: its rated torque is {held} mN m and cannot be set; "
-                f"the configuration says rated_torque: {drive.rated_torque:g}"
-            ) from None
+        raise DriverError(
+            f"node {objects.node}: its rated torque is {objects.read(entry) * size:g} N m and cannot be set; "
+            f"the configuration says rated_torque: {rated:g}"
+        ) from None
 
 
 def _max_speed(objects: Objects, setup: Setup) -> None:
@@ -294,17 +363,19 @@ def _max_speed(objects: Objects, setup: Setup) -> None:
 
     Above it a drive takes its torque back, in the middle of a motion.
     """
-    wanted = Write(od.MAX_SPEED, round(setup.drive.max_speed))
+    if (entry := setup.can.speed) is None:
+        return
     try:
-        objects.set(wanted)
+        objects.ensure(Write(entry, round(setup.drive.max_speed)))
     except SdoRefused as refused:
         if refused.code not in READ_ONLY:
             raise
-        held = objects.read(od.MAX_SPEED)
+        held = objects.read(entry)
         if held < round(setup.motor.speed):
             raise DriverError(
-                f"node {objects.node}: gives no torque above {held} turns per minute (6080h, which cannot be set), "
-                f"but its motor turns at {setup.motor.speed:.0f} at the joints' limits; lower joints.NAME.velocity"
+                f"node {objects.node}: gives no torque above {held} turns per minute ({entry.index:04X}h, which cannot"
+                f" be set), but its motor turns at {setup.motor.speed:.0f} at the joints' limits; lower"
+                " joints.NAME.velocity"
             ) from None
 
 
@@ -314,7 +385,7 @@ def _deceleration(objects: Objects, setup: Setup) -> None:
         return
     wanted = Write(od.QUICK_STOP_DECELERATION, setup.motor.deceleration)
     try:
-        objects.set(wanted)
+        objects.ensure(wanted)
     except SdoRefused as refused:
         if refused.code in DOES_NOT_EXIST and setup.drive.quick_stop_deceleration is None:
             return
@@ -326,11 +397,3 @@ def _deceleration(objects: Objects, setup: Setup) -> None:
                 f"node {objects.node}: brakes by {held} in a quick stop (6085h, which cannot be set), {wanted.value} "
                 "wanted; give its drives.quick_stop_deceleration where its unit is not counts per square second"
             ) from None
-
-
-def _if_there(objects: Objects, write: Write) -> None:
-    try:
-        objects.write(write)
-    except SdoRefused as refused:
-        if refused.code not in DOES_NOT_EXIST:
-            raise

@@ -1,6 +1,7 @@
-"""Verbs about fieldbuses: `bus load`, `bus scan`.
+"""Verbs about fieldbuses: `bus load`, `bus scan`, `bus probe`.
 
-Boundary: words to requests, results to words; the work is `service/bus.py` and `service/bus_scan.py`.
+Boundary: words to requests, results to words; the work is `service/bus.py`, `service/bus_scan.py` and
+`service/bus_probe.py`.
 """
 
 from __future__ import annotations
@@ -23,6 +24,14 @@ def add(verbs: Verbs) -> None:
     sub = bus.add("scan", _scan, text)
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
 
+    text = (
+        "what each drive can, what it lacks, its watchdogs, torque unit and rate; writes nothing (exit code 3: refused)"
+    )
+    sub = bus.add("probe", _probe, text)
+    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    help_eds = "EDS or DCF files to judge in place of the drives, without a bus"
+    sub.add_argument("--eds", nargs="+", default=[], metavar="FILE", help=help_eds)
+
 
 def _load(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
@@ -40,3 +49,12 @@ def _scan(arguments: argparse.Namespace) -> Answer:
     config = load_arm(arguments.arm)
     found = bus_scan(config)
     return DONE if found.complete else VERDICT_NO, scan_text(config, found), scan_document(config, found)
+
+
+def _probe(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.load import load_arm, sheet_file
+    from ident_service.service.bus_probe import bus_probe, probe_document, probe_text
+
+    config = load_arm(arguments.arm)
+    found = bus_probe(config, [sheet_file(name) for name in arguments.eds])
+    return DONE if found.good else VERDICT_NO, probe_text(config, found), probe_document(config, found)

@@ -31,15 +31,22 @@ def add(verbs: Verbs) -> None:
         metavar="FAULT",
         help="'KIND [joint=NAME] [at=S] [duration=S] [size=X] [offset=X,Y,Z]', counted from the first SYNC; repeatable",
     )
+    sub.add_argument(
+        "--eds",
+        nargs="+",
+        default=[],
+        metavar="FILE",
+        help="EDS or DCF files of real drives, which the drives are emulated by, one after the other",
+    )
     sub.add_argument("--seconds", type=seconds, metavar="S", help="stop by itself after this time")
 
 
 def _emulate(arguments: argparse.Namespace) -> Answer:
-    from ident_service.config.load import load_arm
+    from ident_service.config.load import load_arm, with_sheets
     from ident_service.motion.realtime import asked
     from sim_backend.pucks.process import emulate
 
-    config = load_arm(arguments.arm)
+    config = with_sheets(load_arm(arguments.arm), arguments.eds)
     tell(arguments, f"{config.name}: emulated drives; Ctrl-C ends")
     stopping = StopOnSignal()
     # On another core than the motion process, if there is one.

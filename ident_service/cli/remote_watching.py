@@ -62,6 +62,10 @@ def _bus_scan(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     return {"kind": "bus_scan", "arm": arguments.arm}
 
 
+def _bus_probe(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
+    return {"kind": "bus_probe", "arm": arguments.arm}
+
+
 def _known(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     return {"kind": "config_check", "arm": word_of_address(arguments.file)}
 
@@ -134,6 +138,7 @@ VERBS: dict[str, Verb] = {
     "preview": asked(_preview, in_words),
     "bus load": asked(_bus_load, in_words),
     "bus scan": asked(_bus_scan, in_words),
+    "bus probe": asked(_bus_probe, in_words),
     "config check": _config_check,
     "rehearse": _rehearse,
 }
@@ -144,6 +149,7 @@ CARRIED: dict[str, frozenset[str]] = {
     "preview": frozenset({"arm", "motion"}),
     "bus load": frozenset({"arm", "rate"}),
     "bus scan": frozenset({"arm"}),
+    "bus probe": frozenset({"arm"}),
     "config check": frozenset({"file"}),
     "rehearse": frozenset({"arm", "motion", "confirm", "speed", "no_key"}),
 }

@@ -7,14 +7,16 @@ Boundary: data only. Frames and their cost on the wire are `drivers/canopen`, ge
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from ident_service.config.eds import eds_mistake, has_object, maps_dummies
+from ident_service.config.eds import DataSheet, data_sheet
+from ident_service.config.family import Family, family_from
 from ident_service.config.quantities import (
+    AnyTextBeside,
     Count,
     GrownSection,
     ParameterTable,
@@ -23,11 +25,11 @@ from ident_service.config.quantities import (
     Section,
     Seed,
     TextBeside,
+    TextFile,
 )
 from ident_service.config.recording import Transmission
 from ident_service.config.simulation import SimulatedFault, WindingsOff
 from ident_service.config.watchdogs import (
-    ABORTING,
     Heartbeats,
     NodeGuarding,
     NodeId,
@@ -38,9 +40,7 @@ from ident_service.config.watchdogs import (
 
 InhibitTime = Annotated[float, Field(strict=True, ge=0.0001, le=6.5)]  # 100 us of 16 bits
 _KERNELS = ("raw", "socketcan")  # two ways to the same interfaces
-_ASKED = 0.7  # of the guard time, after which a drive is asked again
-_WHOLE_TURNS = 0.999  # 6080h holds whole turns per minute
-_LEAST_DEADLINE = 2.0  # cycles: one frame may be late
+_DUMMIES = frozenset({2, 3, 5, 6})  # that fit the 16 bits of a torque, alone or twice
 _MOST_PER_MILLE = 32_767  # of a torque of 16 bits
 EmergencyCode = Annotated[int, Field(strict=True, ge=1, le=0xFFFF)]
 # CiA 301, table 26: CAN controller in error passive; no heartbeat, or no torque frame, of the host.
@@ -96,6 +96,9 @@ class CanopenDrive(GrownSection):
     maker's that watches torque frames. For `sync_loss` and `vendor`, `watchdog_time` [s] is when, by the maker, and
     `watchdog_entry` what sets it. `quick_stop_deceleration` is what 6085h is set to, in the drive's unit; left
     out, it stops the joints at their acceleration limits, in counts per square second.
+
+    `eds` is this drive's own, where it is another type than the others. `torque_constant` [N m/A] is for drives whose
+    thousandths are of a current.
     """
 
     node: NodeId
@@ -111,7 +114,11 @@ class CanopenDrive(GrownSection):
     watchdog_time: Seconds | None = None
     watchdog_entry: WatchdogEntry | None = None
     quick_stop_deceleration: Annotated[Unsigned32, Field(ge=1)] | None = None
-    later = frozenset({"watchdog", "watchdog_time", "watchdog_entry", "quick_stop_deceleration"})
+    eds: AnyTextBeside | None = None
+    torque_constant: Positive | None = None
+    later = frozenset(
+        {"watchdog", "watchdog_time", "watchdog_entry", "quick_stop_deceleration", "eds", "torque_constant"}
+    )
 
     @model_validator(mode="after")
     def _watchdog_is_described(self) -> CanopenDrive:
@@ -134,9 +141,9 @@ class CanopenDrive(GrownSection):
 
     @model_validator(mode="after")
     def _fits_the_objects(self) -> CanopenDrive:
-        milli = 1000.0 * self.rated_torque
-        if round(milli) < 1 or abs(milli - round(milli)) > 1e-6:
-            raise ValueError(f"rated_torque {self.rated_torque:g} is not whole mN m, which is what 6076h holds")
+        micro = 1e6 * self.rated_torque
+        if round(micro) < 1 or abs(micro - round(micro)) > 1e-3:
+            raise ValueError(f"rated_torque {self.rated_torque:g} is not whole uN m, the finest that drives hold")
         share = 1000.0 * self.max_torque / self.rated_torque
         if not 1.0 <= share <= _MOST_PER_MILLE + 1e-6:
             raise ValueError(
@@ -170,7 +177,8 @@ class StatusReports(Section):
 class Emulation(GrownSection):
     """Describe the arm behind emulated drives: one with true parameters, noise and faults, as `SimulatedDriver` has.
 
-    A drive whose power stage is off leaves its motor coasting, or braked where `windings_off` is `shorted`.
+    A drive whose power stage is off leaves its motor coasting, or braked where `windings_off` is `shorted`. `eds` are
+    data sheets of makers: the drives are emulated by them, one after the other and then from the first again.
     """
 
     seed: Seed = 0
@@ -178,7 +186,8 @@ class Emulation(GrownSection):
     torque_noise: PerJoint = 0.0
     braking: PerJoint | None = None
     windings_off: WindingsOff = "open"
-    later = frozenset({"windings_off"})
+    eds: tuple[AnyTextBeside, ...] = ()
+    later = frozenset({"windings_off", "eds"})
     faults: tuple[SimulatedFault, ...] = ()
 
 
@@ -193,11 +202,12 @@ class CanopenDriver(GrownSection):
     says so, `ident home ARM --zero`, after every loss of power. `measured_torque` says whether drives report the torque
     that they measure (6077h): with their positions, in every cycle (`cyclic`), with their status (`status`), or not at
     all; left out, with their status where the EDS has the object. `watchdog_reason` says why drives of an arm that can
-    fall may take longer than 0.1 s to notice that the host is gone.
+    fall may take longer than 0.1 s to notice that the host is gone. `profiles` are files of families of drives, which
+    count before the shipped ones.
     """
 
     kind: Literal["canopen"]
-    eds: TextBeside
+    eds: AnyTextBeside
     buses: Annotated[tuple[CanBus, ...], Field(min_length=1, max_length=4)] = (CanBus(),)
     drives: Annotated[tuple[CanopenDrive, ...], Field(min_length=1)]
     torque_frames: Literal["shared", "single"] = "shared"
@@ -208,7 +218,8 @@ class CanopenDriver(GrownSection):
     measured_torque: Literal["cyclic", "status", "none"] | None = None
     watchdog_reason: Annotated[str, Field(max_length=200)] = ""
     guarding: NodeGuarding = NodeGuarding()
-    later = frozenset({"measured_torque", "watchdog_reason", "guarding"})
+    profiles: tuple[TextBeside, ...] = ()
+    later = frozenset({"measured_torque", "watchdog_reason", "guarding", "profiles"})
     heartbeats: Heartbeats = Heartbeats()
     reactions: Reactions = Reactions()
     status: StatusReports = StatusReports()
@@ -229,11 +240,30 @@ class CanopenDriver(GrownSection):
         return times[drive.watchdog] if drive.watchdog_time is None else drive.watchdog_time
 
     @property
+    def sheets(self) -> tuple[DataSheet, ...]:
+        """Return what the data sheet of each drive lists."""
+        return tuple(data_sheet(self.sheet_file(number).text) for number in range(len(self.drives)))
+
+    def sheet_file(self, number: int) -> TextFile:
+        """Return the data sheet of a drive: its own, or that of all."""
+        return self.drives[number].eds or self.eds
+
+    @property
+    def shares_by_sheet(self) -> bool:
+        """Return whether every drive's data sheet lets the torques of others be left out of a frame."""
+        return all(sheet.dummies & _DUMMIES for sheet in self.sheets)
+
+    @property
+    def families(self) -> tuple[Family, ...]:
+        """Return the families that the description brings; raises DriverError for a file that is none."""
+        return tuple(family_from(one.name, one.text) for one in self.profiles)
+
+    @property
     def torque_reports(self) -> Literal["cyclic", "status", "none"]:
         """With what drives report the torque that they measure."""
         if self.measured_torque is not None:
             return self.measured_torque
-        return "status" if has_object(self.eds.text, 0x6077) else "none"
+        return "status" if all(sheet.has(0x6077) for sheet in self.sheets) else "none"
 
     @property
     def report_delay(self) -> float:
@@ -293,81 +323,3 @@ def quick_stop_decelerations(
         own = drive.quick_stop_deceleration
         found.append(own if own is not None else min(counts, 0xFFFF_FFFF) if counts else None)
     return found
-
-
-def disagreements(
-    driver: CanopenDriver,
-    transmission: Transmission | None,
-    joints: Sequence[str],
-    rate: float,
-    homeless: Sequence[str] = (),
-    velocities: Sequence[float | None] = (),
-) -> Iterator[tuple[tuple[str | int, ...], str]]:
-    """What does not fit an arm of these joints: the place in the arm's file, and what is wrong.
-
-    Args:
-        driver: the section `driver`.
-        transmission: the arm's.
-        joints: names of the arm's joints; none where the file does not name them.
-        rate: cycles per second.
-        homeless: those without a `home`.
-        velocities: of the joints [rad/s or m/s], None where one has no limit; none where the file names no joints.
-    """
-    if driver.zero == "at_home" and homeless:
-        yield (
-            ("driver", "zero"),
-            "driver.zero: at_home needs every joint's home, the posture in which a person zeroes the arm; missing: "
-            + ", ".join(f"joints.{name}.home" for name in homeless),
-        )
-    if driver.reactions.abort_connection == 0 and any(drive.watchdog in ABORTING for drive in driver.drives):
-        yield (
-            ("driver", "reactions"),
-            "driver.reactions.abort_connection: 0 has drives do nothing when the host is gone (6007h); take what the"
-            " drive's manual calls a quick stop or a fault",
-        )
-    guarded = sum(drive.watchdog == "node_guarding" for drive in driver.drives)
-    if guarded / rate > _ASKED * driver.guarding.period:
-        yield (
-            ("driver", "guarding"),
-            f"driver.guarding.period: {driver.guarding.period:g} s is too short to ask {guarded} drives, one a cycle"
-            f" at {rate:g} Hz; at least {guarded / rate / _ASKED:.3g} s",
-        )
-    if guarded and any(b.data_bitrate for b in driver.buses):
-        yield ("driver", "buses"), "driver.buses: CAN FD has no remote frames, which node guarding asks with"
-    if driver.torque_deadline * rate < _LEAST_DEADLINE:
-        yield (
-            ("driver", "torque_deadline"),
-            f"driver.torque_deadline: {driver.torque_deadline:g} s at {rate:g} Hz has no room for a late torque frame;"
-            f" at least {_LEAST_DEADLINE:g} cycles are needed, {_LEAST_DEADLINE / rate:g} s",
-        )
-    if transmission is None:
-        yield ("driver",), "CANopen drives need the section transmission: gear ratios from joints to motors"
-    elif len(transmission.ratios) != len(driver.drives):
-        yield ("driver", "drives"), f"{len(driver.drives)} drives but {len(transmission.ratios)} ratios in transmission"
-    elif len(velocities) == len(driver.drives):
-        for k, (drive, speed) in enumerate(zip(driver.drives, motor_speeds(transmission, velocities), strict=True)):
-            if drive.max_speed < _WHOLE_TURNS * speed:
-                yield (
-                    ("driver", "drives", k),
-                    f"driver.drives: node {drive.node} would give no torque above max_speed {drive.max_speed:g} turns"
-                    f" per minute (6080h), but its motor turns at {speed:.0f} when joints move at their limits:"
-                    " raise max_speed, or lower joints.NAME.velocity",
-                )
-    shares = driver.torque_frames == "shared" and any(
-        sum(drive.bus == bus for drive in driver.drives) > 1 for bus in range(len(driver.buses))
-    )
-    if why := eds_mistake(driver.eds.text):
-        yield ("driver", "eds"), f"driver.eds: {driver.eds.name} is not an EDS (CiA 306): {why}; take the drive maker's"
-    elif shares and not maps_dummies(driver.eds.text):
-        yield (
-            ("driver", "eds"),
-            f"driver.eds: {driver.eds.name} has no Dummy0003=1 under [DummyUsage], so that these drives cannot share"
-            " torque frames; set driver.torque_frames to single, at a rate that it fits",
-        )
-    elif driver.measured_torque in ("cyclic", "status") and not has_object(driver.eds.text, 0x6077):
-        yield (
-            ("driver", "measured_torque"),
-            f"driver.measured_torque: {driver.eds.name} has no 6077h, so that these drives do not tell their torque",
-        )
-    if joints and len(joints) != len(driver.drives):
-        yield ("driver", "drives"), f"{len(driver.drives)} drives for {len(joints)} joints"

@@ -1,57 +1,129 @@
-"""Read what an EDS (CiA 306-1) says of a drive, as far as a description must know it."""
+"""Read what an EDS or DCF (CiA 306-1) lists, as far as it can be read: makers' files have oddities of every kind."""
 
 from __future__ import annotations
 
 import configparser
 import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Final
 
 LONGEST: Final = 2**19  # characters, which ini readers take a second for
 
+_OBJECT = re.compile(r"^([0-9a-f]{4})(?:sub([0-9a-f]{1,2}))?$", re.IGNORECASE)
+_NODE = re.compile(r"\+?\$NODEID\+?", re.IGNORECASE)
+_NUMBER_OF_ENTRIES = 0x05  # type of sub-index 0
+_MOST_SUBS = 0xFE
 
-@lru_cache(maxsize=8)
-def maps_dummies(eds: str) -> bool:
-    """Tell whether a drive lets 16 bits of a torque frame be another's: `Dummy0003=1` of its EDS (CiA 306-1).
 
-    Args:
-        eds: the EDS's text; one that cannot be read says no.
+@dataclass(frozen=True)
+class Listed:
+    """One entry of a data sheet.
+
+    Attributes:
+        kind: code of its data type (CiA 301, table 44); 0 where the file says none.
+        access: `ro`, `wo`, `rw`, `rww`, `rwr` or `const`.
+        mappable: into a PDO.
+        low: least value, None where the file says none.
+        high: greatest value, likewise.
+        text: its value as the file has it, None where it says none; that of a DCF before the default.
     """
-    parser = configparser.ConfigParser(strict=False, interpolation=None)
+
+    kind: int
+    access: str = "ro"
+    mappable: bool = False
+    low: int | None = None
+    high: int | None = None
+    text: str | None = None
+
+    @property
+    def writable(self) -> bool:
+        """Whether a host may write it."""
+        return self.access in ("rw", "rww", "rwr", "wo")
+
+    def number(self, node: int) -> int | None:
+        """Return its value as a number, None where it is none.
+
+        Args:
+            node: that COB-IDs are relative to.
+        """
+        return None if self.text is None else _number(self.text, node)
+
+
+@dataclass(frozen=True)
+class DataSheet:
+    """What a file lists.
+
+    Attributes:
+        entries: by `index << 8 | sub-index`.
+        dummies: indices of the dummies that can be mapped (CiA 306-1, `DummyUsage`).
+        identity: what 1018h answers by sub-index, where the file tells it.
+        mistake: why the text is no EDS; None where it may be one.
+    """
+
+    entries: Mapping[int, Listed] = field(default_factory=dict)
+    dummies: frozenset[int] = frozenset()
+    identity: Mapping[int, int] = field(default_factory=dict)
+    mistake: str | None = None
+
+    def has(self, index: int, sub: int | None = None) -> bool:
+        """Return whether it lists an object, or an entry of it."""
+        return any(key >> 8 == index for key in self.entries) if sub is None else index << 8 | sub in self.entries
+
+
+@lru_cache(maxsize=32)
+def data_sheet(text: str) -> DataSheet:
+    """Read the text of an EDS or DCF; never raises. What cannot be read of it is left out."""
+    if len(text) > LONGEST:
+        return DataSheet(mistake=f"longer than {LONGEST} characters")
+    if why := _strange_line(text):
+        return DataSheet(mistake=why)
+    parser = configparser.RawConfigParser(strict=False, inline_comment_prefixes=(";",))
     try:
-        parser.read_string(eds)
-        section = next((name for name in parser.sections() if name.lower() == "dummyusage"), None)
-        return section is not None and int(parser.get(section, "Dummy0003", fallback="0"), 0) == 1
-    except (configparser.Error, ValueError):
-        return False
-
-
-@lru_cache(maxsize=8)
-def has_object(eds: str, index: int) -> bool:
-    """Return whether an EDS (CiA 306-1) lists an object; one that cannot be read lists none."""
-    parser = configparser.ConfigParser(strict=False, interpolation=None)
-    try:
-        parser.read_string(eds)
-    except configparser.Error:
-        return False
-    return any(name.upper() == f"{index:04X}" for name in parser.sections())
-
-
-@lru_cache(maxsize=8)
-def eds_mistake(eds: str) -> str | None:
-    """Why a text is no EDS (CiA 306-1: an ini file with the section DeviceInfo); None where it may be one."""
-    if len(eds) > LONGEST:
-        return f"longer than {LONGEST} characters"
-    if why := _strange_line(eds):
-        return why
-    parser = configparser.ConfigParser(strict=False, interpolation=None)
-    try:
-        parser.read_string(eds)
+        parser.read_string(text)
     except configparser.Error as error:
-        return str(error).splitlines()[0].removesuffix(" file: '<string>'")
-    if not any(name.lower() == "deviceinfo" for name in parser.sections()):
-        return "it has no section [DeviceInfo]"
-    return None
+        return DataSheet(mistake=str(error).splitlines()[0].removesuffix(" file: '<string>'"))
+    sections = {name.lower(): parser[name] for name in parser.sections()}
+    entries: dict[int, Listed] = {}
+    for name, section in sections.items():
+        if match := _OBJECT.match(name):
+            index, sub = int(match[1], 16), match[2]
+            if sub is not None or "subnumber" not in section:
+                entries.update((index << 8 | at, one) for at, one in _listed(section, int(sub or "0", 16)))
+    usage: Mapping[str, str] = sections.get("dummyusage", {})
+    dummies = frozenset(k for k in range(1, 8) if _number(usage.get(f"dummy{k:04d}", "0"), 0) == 1)
+    told = {1: "vendornumber", 2: "productnumber", 3: "revisionnumber"}
+    info: Mapping[str, str] = sections.get("deviceinfo", {})
+    mistake = None if "deviceinfo" in sections else "it has no section [DeviceInfo]"
+    identity = {sub: _number(info.get(key, ""), 0) for sub, key in told.items()}
+    identity |= {s: n for s in told if (one := entries.get(0x1018 << 8 | s)) and (n := one.number(0)) is not None}
+    return DataSheet(entries, dummies, {sub: value for sub, value in identity.items() if value is not None}, mistake)
+
+
+def _listed(section: Mapping[str, str], sub: int) -> Iterator[tuple[int, Listed]]:
+    """Return the entries of one section: one, or many of a compact array."""
+    text = section.get("defaultvalue") or None
+    own = section.get("parametervalue") or None
+    if own is not None and not (text is not None and _NODE.search(text)):  # which would be another node's
+        text = own
+    low, high = (_number(section.get(key, ""), 0) for key in ("lowlimit", "highlimit"))
+    kind = _number(section.get("datatype", ""), 0) or 0
+    access = section.get("accesstype", "ro").strip().lower()
+    found = Listed(kind, access, bool(_number(section.get("pdomapping", ""), 0)), low, high, text)
+    if many := min(_number(section.get("compactsubobj", ""), 0) or 0, _MOST_SUBS):
+        yield 0, Listed(_NUMBER_OF_ENTRIES, text=str(many))
+        yield from ((number, found) for number in range(1, many + 1))
+    else:
+        yield sub, found
+
+
+def _number(text: str, node: int) -> int | None:
+    plain, relative = _NODE.subn("", text.replace(" ", ""))
+    try:
+        return int(plain or "0" if relative else plain, 0) + (node if relative else 0)
+    except ValueError:
+        return None
 
 
 def _strange_line(eds: str) -> str | None:

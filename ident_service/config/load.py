@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
-from ident_service.config import canopen, control, design, recording, simulation, workspace
+from ident_service.config import canopen_checks, control, design, recording, simulation, workspace
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.kinematics import DHTable
-from ident_service.config.quantities import UPLOAD, Section
+from ident_service.config.quantities import UPLOAD, AnyTextBeside, Section, TextFile
 from ident_service.config.recording import RecordingFormat
 from ident_service.config.schema import ArmConfig, FourierMotion
 from ident_service.config.shipped import shipped_arms as shipped_arms
@@ -58,6 +58,33 @@ def load_arm(arm: str | Path, *, upload: bool = False) -> ArmConfig:
     if problems:
         raise ConfigError(first_problems(problems))
     return config
+
+
+def with_sheets(config: ArmConfig, files: Sequence[str]) -> ArmConfig:
+    """Return an arm whose drives are emulated by data sheets of makers.
+
+    Args:
+        config: of the arm.
+        files: EDS or DCF files, for the drives one after the other; none for the arm as it is.
+
+    Raises:
+        UsageError: one cannot be read, or the drives are not CANopen's.
+    """
+    if not files:
+        return config
+    if not isinstance(config.driver, CanopenDriver):
+        raise UsageError(f"{config.name}: the driver is not CANopen's, so that no data sheet describes its drives")
+    driver = config.driver
+    emulation = driver.emulation.model_copy(update={"eds": tuple(map(sheet_file, files))})
+    return config.model_copy(update={"driver": driver.model_copy(update={"emulation": emulation})})
+
+
+def sheet_file(name: str) -> TextFile:
+    """Read an EDS or DCF of any encoding; raises UsageError."""
+    try:
+        return TypeAdapter(AnyTextBeside).validate_python(name)
+    except ValidationError as error:
+        raise UsageError("; ".join(one["msg"].removeprefix("Value error, ") for one in error.errors())) from None
 
 
 def arm_from_json(path: Path) -> ArmConfig:
@@ -187,7 +214,7 @@ def _disagreements(config: ArmConfig) -> Iterator[tuple[KeyPath, str]]:
     if isinstance(config.driver, CanopenDriver):
         homeless = [name for name in names if (joint := config.joints.get(name)) is None or joint.home is None]
         velocities = [joint.velocity if (joint := config.joints.get(name)) else None for name in names]
-        yield from canopen.disagreements(
+        yield from canopen_checks.disagreements(
             config.driver, config.transmission, names, config.control.rate, homeless, velocities
         )
     yield from recording.disagreements(config.recording, config.transmission, names)

@@ -102,11 +102,19 @@ class TextFile(Section):
 
 
 def read_beside(value: Any, info: ValidationInfo) -> Any:
-    """Read the file a `LocatedStr` names, relative to the YAML file it stands in; bounded in size.
+    """Read the file a `LocatedStr` names, relative to the YAML file it stands in; bounded in size, and UTF-8.
 
     Where the validation's context names that folder as `upload`, only files in it are read, and none is looked for
     elsewhere: who sends a description learns nothing about other files.
     """
+    return _read(value, info, None)
+
+
+def _read_any(value: Any, info: ValidationInfo) -> Any:
+    return _read(value, info, "latin-1")
+
+
+def _read(value: Any, info: ValidationInfo, otherwise: str | None) -> Any:
     if not isinstance(value, str):
         return value
     folder = value.folder if isinstance(value, LocatedStr) else Path.cwd()
@@ -126,10 +134,14 @@ def read_beside(value: Any, info: ValidationInfo) -> Any:
     try:
         return {"name": path.name, "text": path.read_text(encoding="utf-8")}
     except UnicodeDecodeError:
+        if otherwise is not None:
+            return {"name": path.name, "text": path.read_text(encoding=otherwise)}
         raise ValueError(f"{path} is not UTF-8 text") from None
 
 
 TextBeside = Annotated[TextFile, BeforeValidator(read_beside)]
+AnyTextBeside = Annotated[TextFile, BeforeValidator(_read_any)]
+"""Text of any encoding: makers' data sheets are often not UTF-8."""
 
 
 class ParameterTable(Section):

@@ -21,8 +21,9 @@ from sim_backend.canopen.makers import MakersWatchdogs
 from sim_backend.canopen.mapping import COMMUNICATION, MAPPING, check_write
 from sim_backend.canopen.nmt import Nmt, State
 from sim_backend.canopen.node import Node
-from sim_backend.canopen.objects import WRONG_VALUE, Objects, SdoAbort
+from sim_backend.canopen.objects import WRONG_STATE, WRONG_VALUE, Objects, SdoAbort
 from sim_backend.canopen.pdo import RPDO_TIMEOUT, Pdos
+from sim_backend.canopen.personality import LIKE_NEW, Firmware, Personality
 from sim_backend.canopen.power import PowerStage, PowerState
 from sim_backend.canopen.sdo_server import SdoServer
 from sim_backend.canopen.torque import TorqueLoop
@@ -33,7 +34,7 @@ BOOT_NS = 20_000_000  # from a reset to the boot-up message
 NO_HEARTBEAT, SYNC_LENGTH, NO_VOLTAGE, POWER_STAGE = 0x8130, 0x8240, 0x3220, 0x5400
 _PDO_PARAMETERS = {index for group in (*COMMUNICATION, *MAPPING) for index in group}
 _DRIVE_OBJECTS = 0x6000
-_FAULT, _DISABLE_VOLTAGE, _QUICK_STOP = 1, 2, 3
+_FAULT = 1  # of 6007h
 _WARNING, _REMOTE, _LIMITED, _FOLLOWS, _VOLTAGE = 0x0080, 0x0200, 0x0800, 0x1000, 0x0010
 # What tells where the motor is; anything else that is sent is no feedback.
 _POSITION = 0x606400
@@ -52,21 +53,24 @@ class CanopenDrive:
         deaf: whether a defect has it go on, whatever stays away.
     """
 
-    def __init__(self, eds: str, number: int, motor: Motor, identity: dict[int, int] | None = None) -> None:
+    def __init__(
+        self, eds: str, number: int, motor: Motor, own: dict[int, int] | None = None, like: Personality = LIKE_NEW
+    ) -> None:
         """Make a drive without power.
 
         Args:
             eds: text of its electronic data sheet.
             number: node id.
             motor: that it drives.
-            identity: what object 1018h says instead of the EDS, by sub-index.
+            own: numbers that its entries have instead of what the EDS says, by key.
+            like: how it is besides its EDS.
 
         Raises:
             DriverError: an EDS that cannot be read.
         """
-        self.objects = Objects(eds, number)
+        self._personality = like
+        self.objects = Objects(eds, number, {0x608F01: motor.counts_per_turn, **dict(like.motor), **(own or {})})
         self.motor = motor
-        self._identity = identity or {}
         self._node = node = Node(number, self.objects)
         self._sdo = SdoServer(self.objects)
         self.emergency = Emergency(node)
@@ -75,8 +79,9 @@ class CanopenDrive:
         )
         self.power = PowerStage(node, motor)
         self._pdos = Pdos(node, self.emergency, self._arrived, self._late)
-        self._torque = TorqueLoop(self.objects, motor)
-        self._makers = MakersWatchdogs(node, self.emergency, self._late)
+        self._torque = TorqueLoop(self.objects, motor, self._personality)
+        self._firmware = Firmware(node, self._personality, self._control)
+        self._makers = MakersWatchdogs(node, self.emergency, self._late, there=like.shipped)
         self._failure = 0
         self._warned = self._evaluated = False
         self._ears: set[int] = set()
@@ -159,7 +164,7 @@ class CanopenDrive:
             if timers[name] > now_ns:
                 break
             self._node.now_ns = max(timers.pop(name), self._node.now_ns)
-            for part in (self.nmt, self._makers, self._pdos, self.power, self.emergency):
+            for part in (self.nmt, self._makers, self._pdos, self.power, self.emergency, self._firmware):
                 part.due(name)
             self._refresh()
             self._pdos.changes()
@@ -259,21 +264,19 @@ class CanopenDrive:
 
     def _arrived(self, keys: tuple[int, ...]) -> None:
         """An RPDO, or an SDO, has set these."""
-        number = self.objects.number
-        if 0x606000 in keys:
-            mode = number(0x6060)
-            if 1 <= mode <= 32 and number(0x6502) >> (mode - 1) & 1:
-                self.objects.put(0x6061, mode)
-        if 0x607100 in keys and self.nmt.state is State.OPERATIONAL:
+        if self._personality.target in keys and self.nmt.state is State.OPERATIONAL:
             self._makers.targeted()
-        if 0x604000 in keys and self.power.control(number(0x6040)) and not self._failure:
+        self._firmware.arrived(keys)
+        if self.power.state is PowerState.OPERATION_ENABLED:
+            self._torque.evaluate(self._node.now_ns)
+            self._evaluated = True
+
+    def _control(self, word: int) -> None:
+        if self.power.control(word) and not self._failure:
             self.power.reset_fault()
             waiting = {NO_HEARTBEAT} if self.nmt.silent_nodes else set()
             waiting |= {NO_VOLTAGE} if not self.power.voltage else set()
             self.emergency.is_over(*[code for code in self.emergency.active if code not in waiting])
-        if self.power.state is PowerState.OPERATION_ENABLED:
-            self._torque.evaluate(self._node.now_ns)
-            self._evaluated = True
 
     def _late(self) -> None:
         self._abort_connection()
@@ -291,7 +294,7 @@ class CanopenDrive:
     def _abort_connection(self) -> None:
         if self.deaf:
             return
-        match self.objects.number(0x6007):
+        match self.objects.number(0x6007) if 0x600700 in self.objects.entries else _FAULT:  # its maker's
             case 1:
                 self.power.trip()
             case 2:
@@ -323,20 +326,17 @@ class CanopenDrive:
 
     def _like_new(self) -> None:
         self.objects.reset(_DRIVE_OBJECTS)
-        self.objects.put(0x608F, self.motor.counts_per_turn, 1)
         self.power.down()
         self._torque.release()
         self._communication_like_new()
 
     def _communication_like_new(self) -> None:
         self.objects.reset(last=_DRIVE_OBJECTS - 1)
-        for subindex, value in self._identity.items():
-            self.objects.put(0x1018, value, subindex)
         self._configure()
 
     def _configure(self) -> None:
         self._pdos.configure()
-        self.sync_identifier = self.objects.number(0x1005) & 0x7FF
+        self.sync_identifier = self.objects.number(0x1005) & 0x7FF or 0x80
         self._ears = {0, self.sync_identifier, 0x600 + self._node.number, *self._pdos.rpdos}
 
     def _about_to_read(self, key: int) -> None:
@@ -346,6 +346,8 @@ class CanopenDrive:
     def _veto(self, key: int, value: int) -> None:
         check_write(self.objects, key, value)
         index = key >> 8
+        if index in _PDO_PARAMETERS and not self._personality.shipped and self.nmt.state is State.OPERATIONAL:
+            raise SdoAbort(WRONG_STATE)
         if key == 0x100300 and value:
             raise SdoAbort(WRONG_VALUE)
         if index in (0x1005, 0x1014) and value & 0x7FFF_F800:

@@ -77,7 +77,7 @@ class Emergency:
 
     def _transmit(self, message: bytes) -> None:
         objects = self._node.objects
-        identifier = objects.number(0x1014)
+        identifier = objects.number(0x1014) or 0x80 + self._node.number  # where none is listed, CiA 301's
         if not identifier & _INVALID:
             self._node.send(identifier & 0x7FF, message)
         if inhibit := objects.number(0x1015):

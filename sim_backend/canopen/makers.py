@@ -19,8 +19,9 @@ _SYNC, _TARGET = "sync", "target"
 class MakersWatchdogs:
     """Both of one drive; each begins with the first thing that it watches."""
 
-    def __init__(self, node: Node, emergency: Emergency, late: Callable[[], None]) -> None:
-        """Take the drive's parts; `late` is called when the host is gone."""
+    def __init__(self, node: Node, emergency: Emergency, late: Callable[[], None], *, there: bool) -> None:
+        """Take the drive's parts; `late` is called when the host is gone, `there` is whether the drive has them."""
+        self._there = there
         self._node, self._emergency, self._late = node, emergency, late
 
     def synced(self) -> None:
@@ -44,6 +45,6 @@ class MakersWatchdogs:
             self._late()
 
     def _wait(self, name: str, code: int, delay_ns: int) -> None:
-        if delay_ns:
+        if delay_ns and self._there:
             self._node.after(name, delay_ns)
             self._emergency.is_over(code)

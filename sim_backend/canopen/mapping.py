@@ -77,6 +77,7 @@ def check_write(objects: Objects, key: int, value: int) -> None:
     """Whether a host may write this value into a PDO parameter now; raises SdoAbort where not.
 
     A PDO's identifier and mapping only change while it does not exist (bit 31), entries only while there are none.
+    Where the identifier is fixed, the number of entries alone says whether it exists.
     """
     index, subindex = key >> 8, key & 0xFF
     if any(index in indices for indices in COMMUNICATION):
@@ -84,15 +85,20 @@ def check_write(objects: Objects, key: int, value: int) -> None:
             _check_identifier(objects, key, value)
         elif subindex == 2 and 241 <= value <= 253:  # reserved, or on remote frames only
             raise SdoAbort(WRONG_VALUE)
-        elif subindex in (3, 6) and not objects.number(index, 1) & INVALID:
+        elif subindex in (3, 6) and _exists(objects, index):
             raise SdoAbort(WRONG_STATE)
     elif any(index in indices for indices in MAPPING):
-        if not objects.number(index - 0x200, 1) & INVALID:
+        if _exists(objects, index - 0x200):
             raise SdoAbort(WRONG_STATE)
         if subindex == 0:
             layout(objects, index, value)
         elif objects.number(index):
             raise SdoAbort(WRONG_STATE)
+
+
+def _exists(objects: Objects, index: int) -> bool:
+    changes = (entry := objects.entries.get(index << 8 | 1)) is not None and entry.writable
+    return changes and not objects.number(index, 1) & INVALID
 
 
 def _check_identifier(objects: Objects, key: int, value: int) -> None:

@@ -1,6 +1,8 @@
 """The object dictionary of an emulated drive: every value, who may touch it, and within which limits (CiA 301, 7.4).
 
-It is made from an EDS (CiA 306). Values are integers, or bytes for strings; a key is `index << 8 | subindex`.
+It is made from an EDS or DCF (CiA 306). Values are integers, or bytes for what is no number here, and may
+be any bytes; a key is `index << 8 | subindex`. Limits of 1016h are not kept: a maker's file has 65535, which no entry
+of it fits.
 
 Boundary: storage and its rules. What a value does is its reader's; `veto` and `written` let the drive know of a host's
 writes.
@@ -8,28 +10,21 @@ writes.
 
 from __future__ import annotations
 
-import io
 import struct
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
-from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes, eds
-
+from ident_service.config.eds import Listed, data_sheet
 from ident_service.errors import DriverError
 
 Value = int | bytes
 
-_FORMATS = {
-    datatypes.BOOLEAN: "?",
-    datatypes.INTEGER8: "b",
-    datatypes.INTEGER16: "h",
-    datatypes.INTEGER32: "i",
-    datatypes.UNSIGNED8: "B",
-    datatypes.UNSIGNED16: "H",
-    datatypes.UNSIGNED32: "I",
-}
-_LAST_DUMMY = 0x0007
+# Data types of CiA 301, table 44, that are numbers here.
+_FORMATS = {0x01: "?", 0x02: "b", 0x03: "h", 0x04: "i", 0x05: "B", 0x06: "H", 0x07: "I"}
+_BYTES = {0x08: 4, 0x11: 8, 0x15: 8, 0x1B: 8}  # of numbers that are none here
+_VISIBLE_STRING = 0x09
+_FIRST, _HEARTBEAT_CONSUMERS = 0x1000, 0x1016
 
 
 class SdoAbort(Exception):
@@ -61,8 +56,8 @@ class Entry:
     """One value of the dictionary.
 
     Attributes:
-        form: its struct format character; None for a string.
-        size: bytes; 0 for a string.
+        form: its struct format character; None for what is no number here.
+        size: bytes; 0 for any number of them.
         readable: by a host.
         writable: by a host.
         mappable: into a PDO.
@@ -93,18 +88,22 @@ class Objects:
         written: called with the key after it.
     """
 
-    def __init__(self, text: str, node: int) -> None:
+    def __init__(self, text: str, node: int, own: Mapping[int, int] | None = None) -> None:
         """Read an EDS.
 
         Args:
             text: of the file.
             node: its number, for defaults that depend on it.
+            own: numbers that entries have instead of what the file says, by key, cut off at what their types hold.
 
         Raises:
-            DriverError: not an EDS, or types that the emulator does not have.
+            DriverError: not an EDS, or one that lists nothing.
         """
         entries, dummies = _read(text, node)
         self.entries, self.dummies = dict(entries), dict(dummies)
+        for key, value in (own or {}).items():
+            if (entry := entries.get(key)) is not None and entry.form is not None:
+                self.entries[key] = replace(entry, default=_cut(entry.form, value))
         self._indices = {key >> 8 for key in self.entries}
         self.values: dict[int, Value] = {}
         self.before_read: Callable[[int], None] = lambda key: None
@@ -129,9 +128,7 @@ class Objects:
         entry = self.entries.get(key)
         if entry is None or entry.form is None:
             return
-        bits = 8 * entry.size
-        low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if entry.form.islower() else (0, (1 << bits) - 1)
-        self.values[key] = min(max(value, low), high)
+        self.values[key] = _cut(entry.form, value)
 
     def read(self, index: int, subindex: int) -> bytes:
         """What a host gets; raises SdoAbort."""
@@ -178,34 +175,47 @@ class Objects:
 @lru_cache(maxsize=32)
 def _read(text: str, node: int) -> tuple[Mapping[int, Entry], Mapping[int, int]]:
     """Read entries by key and sizes of dummy objects by index, once for the many times that a node is made."""
-    try:
-        dictionary: ObjectDictionary = eds.import_eds(io.StringIO(text), node)
-    except Exception as error:  # noqa: BLE001 the library lets whatever its parser meets through
-        raise DriverError(f"not an EDS: {error}") from None
-    entries: dict[int, Entry] = {}
-    dummies: dict[int, int] = {}
-    for index in dictionary:
-        item = dictionary[index]
-        for variable in [item] if isinstance(item, ODVariable) else item.values():
-            if index <= _LAST_DUMMY:
-                dummies[index] = struct.calcsize(_FORMATS[index])
-            else:
-                entries[index << 8 | variable.subindex] = _entry(variable)
-    return entries, dummies
+    sheet = data_sheet(text)
+    if sheet.mistake or not sheet.entries:
+        raise DriverError(f"not an EDS: {sheet.mistake or 'it lists no object'}")
+    dummies = {index: struct.calcsize(_FORMATS[index]) for index in sheet.dummies}
+    return {key: _entry(key, one, node) for key, one in sheet.entries.items() if key >> 8 >= _FIRST}, dummies
 
 
-def _entry(variable: ODVariable) -> Entry:
-    form = None if variable.data_type is None else _FORMATS.get(variable.data_type)
-    if form is None and variable.data_type != datatypes.VISIBLE_STRING:
-        raise DriverError(f"EDS: {variable.name}: type 0x{variable.data_type:X} is not emulated")
-    default: Value = int(variable.default or 0) if form else str(variable.default or "").encode("ascii", "replace")
+def _entry(key: int, listed: Listed, node: int) -> Entry:
+    form = _FORMATS.get(listed.kind)
+    low = high = None
+    if form is None:
+        plain = listed.text or ""
+        default: Value = plain.encode("ascii", "replace") if listed.kind == _VISIBLE_STRING else b""
+        default = default or bytes(_BYTES.get(listed.kind, 0))
+    else:
+        default = _as(form, listed.number(node) or 0)
+        if key >> 8 != _HEARTBEAT_CONSUMERS:
+            low, high = (None if limit is None else _as(form, limit) for limit in (listed.low, listed.high))
     return Entry(
         form=form,
         size=struct.calcsize(f"<{form}") if form else 0,
-        readable=variable.access_type != "wo",
-        writable=variable.access_type in ("rw", "rww", "rwr", "wo"),
-        mappable=bool(variable.pdo_mappable),
-        low=variable.min,
-        high=variable.max,
+        readable=listed.access != "wo",
+        writable=listed.writable,
+        mappable=listed.mappable,
+        low=low,
+        high=high,
         default=default,
     )
+
+
+def _bounds(form: str) -> tuple[int, int]:
+    bits = 8 * struct.calcsize(f"<{form}")
+    return (-(1 << bits - 1), (1 << bits - 1) - 1) if form.islower() else (0, (1 << bits) - 1)
+
+
+def _cut(form: str, value: int) -> int:
+    low, high = _bounds(form)
+    return min(max(value, low), high)
+
+
+def _as(form: str, value: int) -> int:
+    """Return a number of a file as its type holds it: negative ones may stand there as unsigned digits."""
+    low, high = _bounds(form)
+    return _cut(form, value + 2 * low if low and value > high else value)

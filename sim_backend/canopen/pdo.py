@@ -20,6 +20,8 @@ from sim_backend.canopen.objects import SdoAbort
 PDO_SHORT, PDO_LONG, RPDO_TIMEOUT = 0x8210, 0x8220, 0x8250
 _MS, _INHIBIT_NS = 1_000_000, 100_000
 _SYNCHRONOUS = 240
+_US = 1000
+_WINDOW = 0x1007  # after SYNC, in which synchronous RPDOs are taken; 0 for always (CiA 301, 7.5.2.7)
 _DEADLINE, _EVENT, _INHIBITED = "rpdo deadline ", "tpdo event ", "tpdo inhibited "
 
 
@@ -64,6 +66,7 @@ class Pdos:
         self.rpdos: dict[int, list[_Received]] = {}
         self._tpdos: list[_Sent] = []
         self._active = False
+        self._synced_ns = 0
 
     def configure(self) -> None:
         """Read the parameters again, after one has changed."""
@@ -73,7 +76,7 @@ class Pdos:
         self.rpdos, self._tpdos = {}, []
         for number, index in enumerate(COMMUNICATION[0]):
             identifier = objects.number(index, 1)
-            if identifier & INVALID or (where := self._layout(MAPPING[0][number])) is None:
+            if not identifier or identifier & INVALID or (where := self._layout(MAPPING[0][number])) is None:
                 self._node.stop(f"{_DEADLINE}{number}")
                 continue
             rpdo = _Received(
@@ -87,7 +90,7 @@ class Pdos:
             self.rpdos.setdefault(rpdo.identifier, []).append(rpdo)
         for number, index in enumerate(COMMUNICATION[1]):
             identifier = objects.number(index, 1)
-            if identifier & INVALID or (where := self._layout(MAPPING[1][number])) is None:
+            if not identifier or identifier & INVALID or (where := self._layout(MAPPING[1][number])) is None:
                 self._node.stop(f"{_EVENT}{number}")
                 continue
             before = lasts.get(number)
@@ -134,6 +137,9 @@ class Pdos:
                 self._emergency.is_over(PDO_SHORT, PDO_LONG, RPDO_TIMEOUT)
             if rpdo.deadline_ns:
                 self._node.after(f"{_DEADLINE}{rpdo.number}", rpdo.deadline_ns)
+            window = self._node.objects.number(_WINDOW) * _US
+            if rpdo.synchronous and window and self._node.now_ns - self._synced_ns > window:
+                continue
             if rpdo.synchronous:
                 rpdo.waiting = data[:size]
             else:
@@ -141,6 +147,7 @@ class Pdos:
 
     def sync(self) -> None:
         """A SYNC: what is to be sent is sent as it is now, then what has come acts."""
+        self._synced_ns = self._node.now_ns
         if not self._active:
             return
         for tpdo in self._tpdos:

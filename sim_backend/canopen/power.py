@@ -206,7 +206,7 @@ class PowerStage:
     def _brake(self) -> None:
         now = self._node.now_ns
         speed, per_radian = abs(self._motor.speed(now)), self._motor.counts_per_turn / (2.0 * math.pi)
-        deceleration = self._node.objects.number(0x6085)
+        deceleration = self._node.objects.number(0x6085) or 1  # a drive without one brakes for as long as it may
         self._slow = max(_SLOW * speed, 1e-9 * _MS * deceleration / per_radian)
         self._ramp_ends_ns = now + _LONGEST_NS
         self._motor.brake(now)

@@ -1,9 +1,9 @@
 """The torque loop of an emulated drive in cyclic synchronous torque mode (CiA 402-2, 14): demand, limits, what is told.
 
-Demand is target plus offset, in whole thousandths of the rated torque, cut off at 6072h and 6073h. Above the speed
-limit (6080h) no torque acts that leads faster; the target is ignored then, and the statusword says so (bit 12).
-Software position limits (607Dh) are of the position modes: torque acts beyond them. Current is told as torque, since
-the motor is linear.
+Demand is target plus offset, in counts of the target, cut off at the drive's limits (of CiA 402: thousandths of the
+rated torque, 6072h and 6073h). Above the speed limit (6080h) no torque acts that leads faster; the target is ignored
+then, and the statusword says so (bit 12). Software position limits (607Dh) are of the position modes: torque acts
+beyond them. Current is told as torque, since the motor is linear.
 
 Boundary: one evaluation; when there is one is `drive.py`.
 """
@@ -13,10 +13,9 @@ from __future__ import annotations
 import math
 
 from sim_backend.canopen.objects import Objects
+from sim_backend.canopen.personality import Personality
 from sim_backend.pucks.motor import Motor
 
-CYCLIC_TORQUE = 10
-_LARGEST = 0x7FFF
 _RPM = 60.0 / (2.0 * math.pi)
 
 
@@ -28,9 +27,9 @@ class TorqueLoop:
         follows: whether the target acts (bit 12).
     """
 
-    def __init__(self, objects: Objects, motor: Motor) -> None:
+    def __init__(self, objects: Objects, motor: Motor, personality: Personality) -> None:
         """A loop that is not closed."""
-        self._objects, self._motor = objects, motor
+        self._objects, self._motor, self._personality = objects, motor, personality
         self.limited = self.follows = False
 
     def release(self) -> None:
@@ -43,10 +42,10 @@ class TorqueLoop:
         """Make the motor do what is asked for, as far as limits let it."""
         number = self._objects.number
         values = self._objects.values
-        cyclic = number(0x6061) == CYCLIC_TORQUE
-        asked = number(0x6071) + number(0x60B2) if cyclic else 0
-        reach = min(number(0x6072), number(0x6073), _LARGEST)
-        reach = int(reach * self._motor.defects.torque_share)
+        cyclic = number(0x6061) in self._personality.modes
+        target = self._personality.target
+        asked = number(target >> 8, target & 0xFF) + number(0x60B2) if cyclic else 0
+        reach = int(self._personality.reach(self._objects) * self._motor.defects.torque_share)
         demand = min(max(asked, -reach), reach)
         self.follows = cyclic
         self.limited = demand != asked
@@ -55,8 +54,9 @@ class TorqueLoop:
         values[0x607400] = demand
         fraction = self._motor.defects.torque_fraction
         values[0x607700] = values[0x607800] = round(fraction * demand)
-        self._motor.drive(fraction * demand * number(0x6076) * 1e-6, now_ns)
+        self._motor.drive(self._personality.torque(fraction * demand, self._objects), now_ns)
 
     def _leads_faster(self, demand: int, now_ns: int) -> bool:
         speed = self._motor.speed(now_ns)
-        return speed * demand > 0.0 and abs(speed) * _RPM > self._objects.number(0x6080)
+        limited = 0x608000 in self._objects.entries
+        return limited and speed * demand > 0.0 and abs(speed) * _RPM > self._objects.number(0x6080)

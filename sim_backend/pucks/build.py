@@ -6,6 +6,7 @@ joint is braked less than asked while all brake. Boundary: construction only.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -17,6 +18,7 @@ from ident_service.errors import DriverError
 from ident_service.model.arm_model import arm_model
 from sim_backend.build import build_machine
 from sim_backend.canopen.drive import CanopenDrive as Drive
+from sim_backend.canopen.personality import personality_of
 from sim_backend.pucks.body import Body
 from sim_backend.pucks.emulator import Emulator
 from sim_backend.pucks.faults import PuckFault, configured
@@ -71,16 +73,19 @@ def build_emulator(config: ArmConfig, faults: Sequence[PuckFault] = ()) -> Emula
         )
         for number, drive in enumerate(driver.drives)
     )
+    own = itertools.cycle(emulation.eds or (None,))
     faces = [
         Drive(driver.eds.text, drive.node, motor, _identity(drive))
-        for drive, motor in zip(driver.drives, body.motors, strict=True)
+        if sheet is None
+        else Drive(sheet.text, drive.node, motor, like=personality_of(sheet.text, drive, driver.families))
+        for drive, motor, sheet in zip(driver.drives, body.motors, own, strict=False)
     ]
     at_first = configured(emulation.faults, names, machine.plant.period)
     return Emulator(body, faces, [drive.bus for drive in driver.drives], names, (*at_first, *faults))
 
 
 def _identity(drive: CanopenDrive) -> dict[int, int]:
-    """What object 1018h answers, by sub-index, where the configuration asks for something."""
+    """What entries of 1018h answer, by key, where the configuration asks for something."""
     asked = drive.identity
     values = (asked.vendor, asked.product, asked.revision, asked.serial)
-    return {subindex: value for subindex, value in enumerate(values, 1) if value is not None}
+    return {0x101800 | sub: value for sub, value in enumerate(values, 1) if value is not None}

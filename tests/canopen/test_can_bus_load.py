@@ -12,7 +12,8 @@ from can_arms import MAX_TORQUE, RATED
 
 from drivers.canopen.coordinates import coordinates
 from ident_service.cli import DONE, USAGE, VERDICT_NO, main
-from ident_service.config.canopen import CanopenDriver, disagreements
+from ident_service.config.canopen import CanopenDriver
+from ident_service.config.canopen_checks import disagreements
 from ident_service.config.limits import motion_limits
 from ident_service.config.load import load_arm
 from ident_service.errors import ConfigError
@@ -164,7 +165,7 @@ def test_the_identified_parameters_are_those_of_the_simulated_wam(arms: Path) ->
         ("heartbeats: {timeout: 0.05}", "not longer than the heartbeats' periods"),
         ("torque_deadline: 0.0001", "greater than or equal to 0.001"),
         ("status: {inhibit: 7.0}", "less than or equal to 6.5"),
-        ("drives: [{node: 1, rated_torque: 0.0005, max_torque: 0.01, max_speed: 1}]", "not whole mN m"),
+        ("drives: [{node: 1, rated_torque: 0.0000005, max_torque: 0.01, max_speed: 1}]", "not whole uN m"),
         ("drives: [{node: 1, rated_torque: 0.01, max_torque: 0.5, max_speed: 1}]", "50 times rated_torque"),
     ],
 )

@@ -96,7 +96,7 @@ def test_another_drive_than_the_configuration_names_is_refused(key: str, asked: 
 def test_a_rated_torque_that_only_the_drive_decides_must_be_the_configured_one() -> None:
     fixed = eds_with("6076", AccessType="ro", DefaultValue="1200")
     bench = Bench(weightless_config(), weightless_config(eds=fixed))
-    with pytest.raises(DriverError, match=r"node 1: its rated torque is 1200 mN m and cannot be set.*rated_torque: 1"):
+    with pytest.raises(DriverError, match=r"node 1: its rated torque is 1.2 N m and cannot be set.*rated_torque: 1"):
         bench.arm.open()
     check_nothing_is_open(bench)
     same = eds_with("6076", AccessType="ro", DefaultValue="1000")
@@ -124,7 +124,8 @@ def test_a_speed_limit_that_only_the_drive_decides_must_leave_the_joints_their_v
 
 
 def test_a_drive_that_maps_no_dummies_says_so_in_words_whatever_its_data_sheet_says() -> None:
-    real = weightless_config(eds=eds_with("DummyUsage", Dummy0003="0"), torque_frames="single")
+    none = {f"Dummy000{k}": "0" for k in range(1, 8)}
+    real = weightless_config(eds=eds_with("DummyUsage", **none), torque_frames="single")
     bench = Bench(weightless_config(), real)
     with pytest.raises(DriverError, match=r"node 1: setting 1600h:0\d .*: 06\w{6}h object") as refused:
         bench.arm.open()
@@ -177,8 +178,8 @@ def test_drives_that_do_not_answer_are_named(silent: tuple[int, ...]) -> None:
         (0x605A, 0, "605Ah"),
         (0x605E, 0, "605Eh"),
         (0x6007, 0, "6007h"),
-        (0x1400, 5, "would not stop by itself"),
-        (0x1016, 1, "would not stop by itself"),
+        (0x1400, 5, "1400h:05"),
+        (0x1016, 1, "1016h:01"),
     ],
 )
 def test_a_protection_that_does_not_hold_is_found_by_reading_it_back(index: int, subindex: int, words: str) -> None:
@@ -191,6 +192,7 @@ def test_a_protection_that_does_not_hold_is_found_by_reading_it_back(index: int,
             objects.put(index, 9, subindex)
         written(key)
 
+    objects.put(index, 7, subindex)  # what a drive has already is not written
     objects.written = forgetful
     with pytest.raises(DriverError, match=rf"node 2: .*{words}"):
         bench.arm.open()
@@ -323,3 +325,62 @@ def test_an_arm_whose_bus_is_gone_can_be_stopped_closed_and_opened_again() -> No
     assert not any("enabled" in state for state in bench.states)
     with bench.arm as arm:
         arm.exchange(None)
+
+
+def test_unused_pdos_are_off_before_any_other_is_on() -> None:
+    """Out of the box RPDO3 listens to the very COB-ID that the torques of both drives get."""
+    config = weightless_config(eds=eds_with("1402sub1", DefaultValue="0x201"))
+    bench = Bench(config)
+    with bench.arm:
+        written = [frame.data for frame in bench.taps[0].sent if frame.identifier == 0x602 and frame.data[0] == 0x23]
+    downloads = [struct.unpack_from("<HBI", data, 1) for data in written]
+    off = downloads.index((0x1402, 1, 0x8000_0402))
+    on = downloads.index((0x1400, 1, 0x0000_0201))
+    assert off < on
+    assert bench.drive(1).objects.number(0x1402, 1) >> 31
+
+
+def test_what_a_drive_has_already_is_not_written_again() -> None:
+    bench = Bench(weightless_config())
+    downloads = []
+    for _ in range(2):
+        with bench.arm:
+            sent = bench.taps[0].sent
+            ours = [frame.data for frame in sent if 0x600 < frame.identifier < 0x680 and frame.data[0] & 0xE0 == 0x20]
+            downloads.append([struct.unpack_from("<HB", data, 1) for data in ours])
+    assert len(downloads[0]) > 40
+    # Only what `close` took back, so that the drives forget their host.
+    assert set(downloads[1]) == {(0x6007, 0), (0x1016, 1)}
+
+
+def test_a_rated_torque_that_the_entry_cannot_hold_is_refused_before_the_drive_has_another() -> None:
+    fine = [one | {"rated_torque": 0.0005, "max_torque": 0.01} for one in drives()]
+    bench = Bench(weightless_config(drives=fine))
+    with pytest.raises(
+        DriverError, match=r"node 1: rated_torque 0.0005 N m is not whole mNm, which is what 6076h holds"
+    ):
+        bench.arm.open()
+    check_nothing_is_open(bench)
+
+
+def test_a_mode_that_can_only_be_written_is_read_back_by_its_display() -> None:
+    bench = Bench(weightless_config(eds=eds_with("6060", AccessType="wo")))
+    with bench.arm as arm:
+        arm.enable()
+        assert arm.exchange(ZERO).valid.all()
+
+
+def test_a_hint_that_a_drive_rounds_is_left_as_it_is() -> None:
+    bench = Bench(weightless_config())
+    objects = bench.drive(0).objects
+    written = objects.written
+
+    def rounds(key: int) -> None:
+        if key == 0x100600:
+            objects.put(0x1006, 1000)
+        written(key)
+
+    objects.written = rounds
+    with bench.arm as arm:
+        assert arm.exchange(None).valid.all()
+    assert objects.number(0x1006) == 1000

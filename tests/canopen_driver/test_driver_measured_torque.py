@@ -12,7 +12,8 @@ from helpers.emulated_arms import EDS, weightless_config
 from drivers.arm import Sample
 from drivers.canopen.arm import CanopenArm
 from drivers.canopen.budget import budget
-from ident_service.config.canopen import CanopenDriver, disagreements
+from ident_service.config.canopen import CanopenDriver
+from ident_service.config.canopen_checks import disagreements
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import RecordingError
 from ident_service.record.cycle import Cycle

@@ -15,7 +15,8 @@ from drivers.canopen.arm import CanopenArm
 from drivers.canopen.budget import budget
 from drivers.canopen.dictionary import Entry, Kind
 from drivers.canopen.profile import HEARTBEAT, Write
-from ident_service.config.canopen import CanopenDrive, CanopenDriver, disagreements, quick_stop_decelerations
+from ident_service.config.canopen import CanopenDrive, CanopenDriver, quick_stop_decelerations
+from ident_service.config.canopen_checks import disagreements
 from ident_service.config.limits import motion_limits
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from canopen_run_bench import canopen, checked, described, simulated, write
 from ident_service.cli import main
 from ident_service.record.open import open_recording
 
+SHEETS = Path(__file__).parents[3] / "shared" / "data" / "eds"
 RATE, KP, KD = 250.0, 225.0, 30.0
 
 
@@ -30,18 +32,37 @@ def found(folder: Path, name: str, arm: Path) -> tuple[np.ndarray, np.ndarray]:
     return np.array(document["values"]), np.array(document["standard_deviations"])
 
 
+def of_makers(tree: dict[str, Any]) -> dict[str, Any]:
+    """The same arm behind drives of two makers, by their files, each with the watchdog and the mode that it has."""
+    files = [str(SHEETS / name) for name in ("maxon_epos4_50-5_0170h.eds", "elmo_simpliq.dcf")]
+    drive = {"counts": 65536, "rated_torque": 0.35, "max_torque": 1.05, "max_speed": 6000.0, "watchdog": "heartbeat"}
+    section = {
+        "eds": files[0],
+        "torque_frames": "single",
+        "drives": [drive | {"node": node, "eds": file} for node, file in enumerate(files, 1)],
+        "heartbeats": {"period": 0.02, "timeout": 0.11, "host_timeout": 0.06},
+        "status": {"period": 0.1, "inhibit": 0.01},
+    }
+    found = canopen(tree, {"interface": "lock_step"}, 2, **section)
+    found["driver"]["emulation"]["eds"] = files
+    return found
+
+
 @pytest.mark.slow
-def test_both_arms_have_the_same_parameters_within_their_standard_deviations(tmp_path: Path) -> None:
+def test_arms_have_the_same_parameters_within_their_standard_deviations(tmp_path: Path) -> None:
     plain = write(tmp_path, simulated(described("plain", RATE, KP, KD), 1))
-    drives = write(tmp_path, canopen(described("drives", RATE, KP, KD), {"interface": "lock_step"}, 2))
+    arms = {"drives": write(tmp_path, canopen(described("drives", RATE, KP, KD), {"interface": "lock_step"}, 2))}
+    if SHEETS.is_dir():
+        arms["makers"] = write(tmp_path, of_makers(described("makers", RATE, KP, KD)))
     one, one_deviation = found(tmp_path, "plain", plain)
-    two, two_deviation = found(tmp_path, "drives", drives)
-    assert one.shape == two.shape == (13,)
-    doubt = np.hypot(one_deviation, two_deviation)
-    assert (doubt > 0.0).all()
-    z = (one - two) / doubt
-    # 13 figures of unit variance: none beyond what one in ten thousand is, nor all of them together.
-    assert np.abs(z).max() < 4.0, z
-    assert z @ z < 35.0, z
-    # The doubts themselves mean something: most parameters are known within about a tenth.
-    assert np.median(doubt / np.maximum(np.abs(one), 1e-3)) < 0.12
+    for name, arm in arms.items():
+        two, two_deviation = found(tmp_path, name, arm)
+        assert one.shape == two.shape == (13,)
+        doubt = np.hypot(one_deviation, two_deviation)
+        assert (doubt > 0.0).all()
+        z = (one - two) / doubt
+        # 13 figures of unit variance: none beyond what one in ten thousand is, nor all of them together.
+        assert np.abs(z).max() < 4.0, (name, z)
+        assert z @ z < 35.0, (name, z)
+        # The doubts themselves mean something: most parameters are known within about a tenth.
+        assert np.median(doubt / np.maximum(np.abs(one), 1e-3)) < 0.12

@@ -236,7 +236,7 @@ def test_no_id_is_a_path(daemon: Asked, word: str) -> None:
         assert "ident_" not in answer.text.replace("ident_session", "")
     jobs: list[dict[str, object]] = [
         *({"kind": kind, "run": word} for kind in ("report", "feasible", "correct", "figures", "verify")),
-        *({"kind": kind, "arm": word} for kind in ("bus_load", "bus_scan", "config_check")),
+        *({"kind": kind, "arm": word} for kind in ("bus_load", "bus_scan", "bus_probe", "config_check")),
         {"kind": "identify", "arm": "planar2", "recordings": [{"run": word}]},
         {"kind": "payload", "run": "r", "recordings": [{"run": "r", "name": word}]},
         {"kind": "feasible", "run": "r", "arm": word},

@@ -180,6 +180,7 @@ def test_verbs_are_done_by_a_daemon(
         assert done("recover", "quick")["answer"]["usable"] is True
         assert done("bus", "load", ON_A_BUS)["answer"]["fits"] is True
         assert done("bus", "scan", ON_A_BUS)["answer"]["complete"] is True
+        assert done("bus", "probe", ON_A_BUS)["answer"]["good"] is True
         assert done("home", ON_A_BUS, "--zero", "--confirm", ON_A_BUS)["job"]["kind"] == "zero"
         done("home", ON_A_BUS, "--zero", "--confirm", "quick", code=2)
         assert done("config", "check", "quick")["answer"]["stability"]["stable"] is True

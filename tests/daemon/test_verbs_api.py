@@ -112,7 +112,9 @@ def test_buses_and_descriptions(daemon: Asked, state: Path) -> None:
     ended, said = answered(daemon, {"kind": "bus_scan", "arm": ON_A_BUS})
     assert ended["state"] == "done", ended
     assert said["complete"] is True
-    for kind in ("bus_load", "bus_scan"):
+    ended, said = answered(daemon, {"kind": "bus_probe", "arm": ON_A_BUS})
+    assert (ended["state"], said["good"]) == ("done", True), ended
+    for kind in ("bus_load", "bus_scan", "bus_probe"):
         ended, _ = answered(daemon, {"kind": kind, "arm": "quick"})
         assert ended["state"] == "failed"
         refusal(daemon.post("/api/v1/jobs", {"job": {"kind": kind, "arm": "none"}}), 404, "no arm")

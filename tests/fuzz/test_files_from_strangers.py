@@ -25,7 +25,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ident_service.config import load, source
-from ident_service.config.eds import LONGEST, eds_mistake, has_object, maps_dummies
+from ident_service.config.eds import LONGEST, data_sheet
 from ident_service.config.load import arm_from_json, load_arm, load_recording_format
 from ident_service.config.quantities import TextFile
 from ident_service.config.shipped import shipped_arms
@@ -204,10 +204,8 @@ def _mechanism(kind: Kind) -> Callable[[Path], Any]:
 def _eds(path: Path) -> None:
     """As a description's check does, then the drive that is emulated."""
     text = path.read_text(encoding="utf-8")
-    if why := eds_mistake(text):
+    if why := data_sheet(text).mistake:
         raise DriverError(why)
-    maps_dummies(text)
-    has_object(text, 0x6077)
     Objects(text, 5)
 
 

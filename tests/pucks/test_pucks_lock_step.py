@@ -172,6 +172,6 @@ def test_a_bus_of_another_arm_cannot_be_joined(tmp_path: Path) -> None:
 
 def test_a_data_sheet_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
     broken = tmp_path / "broken.eds"
-    broken.write_text("[DeviceInfo]\n[DummyUsage]\nDummy0003=1\n[1000]\n", encoding="utf-8")
+    broken.write_text("[DeviceInfo]\n[DummyUsage]\nDummy0003=1\n", encoding="utf-8")
     with pytest.raises(DriverError, match="not an EDS"):
         open_links(pucks_config(tmp_path, eds=str(broken)))

@@ -142,6 +142,13 @@ class BusScan(Ask):
     arm: ArmName
 
 
+class BusProbe(Ask):
+    """What the arm's drives can, and what they lack; reads only."""
+
+    kind: Literal["bus_probe"]
+    arm: ArmName
+
+
 class ConfigCheck(Ask):
     """The arm's description: bus budget, and whether its gains are stable."""
 
@@ -278,6 +285,7 @@ Asked = Annotated[
     | LeaveLimit
     | BusLoad
     | BusScan
+    | BusProbe
     | ConfigCheck
     | Identify
     | Simulate

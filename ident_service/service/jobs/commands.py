@@ -16,6 +16,7 @@ from ident_service.service.jobs.asked import (
     Asked,
     Base,
     BusLoad,
+    BusProbe,
     BusScan,
     Check,
     Compare,
@@ -47,13 +48,14 @@ from ident_service.service.registry.motions import MOTIONS, motion_path, new_id
 from ident_service.service.registry.runs import COLUMNS, RUNS, known_run, recording_name, run_file, run_folder
 
 JOBS, REPORTS, EXPORTS = "jobs", "reports", "exports"
-_LOOKS = (Check, Watch, Recover, Base, Preview, Zero, BusLoad, BusScan, ConfigCheck)  # that make no folder
+_LOOKS = (Check, Watch, Recover, Base, Preview, Zero, BusLoad, BusScan, BusProbe, ConfigCheck)  # that make no folder
 _OF_A_RUN = (Report, Export, Verify, Compare, Feasible, Correct, Figures, Payload)
 _VERBS: Final = {
     "leave_limit": ("recover",),
     "zero": ("home",),
     "bus_load": ("bus", "load"),
     "bus_scan": ("bus", "scan"),
+    "bus_probe": ("bus", "probe"),
     "config_check": ("config", "check"),
 }
 TAKEN_AWAY: Final = frozenset({"export", "figures", "payload", "correct"})
@@ -108,7 +110,7 @@ def command(db: Database, state: Path, asked: Asked) -> Command:
         arm.name,
         moves,
         made,
-        resources(arm.config) if moves or isinstance(asked, Watch | Recover | BusScan) else (),
+        resources(arm.config) if moves or isinstance(asked, Watch | Recover | BusScan | BusProbe) else (),
         HOLD_TO_RUN_SECONDS if isinstance(asked, Rehearse) else LEASE_SECONDS,
         waits=not isinstance(asked, Zero),
     )
@@ -146,7 +148,7 @@ def _words(db: Database, state: Path, asked: Asked, arm: KnownArm) -> list[str]:
     if isinstance(asked, Simulate):
         motion = [] if asked.motion is None else [f"--motion={motion_path(db, state, asked.motion)}"]
         return [path, *motion, *_given({"seed": asked.seed, "feasible-set": asked.feasible_set})]
-    if isinstance(asked, Home | Base | Recover | BusScan | ConfigCheck):
+    if isinstance(asked, Home | Base | Recover | BusScan | BusProbe | ConfigCheck):
         return [path]
     if isinstance(asked, BusLoad):
         return [path, *_given({"rate": asked.rate})]

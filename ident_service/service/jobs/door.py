@@ -16,7 +16,7 @@ from ident_service.service.jobs.child import ANSWER, LOG, PROCESS, name_of
 
 _MOST = 64 * 1024
 _VERBS = frozenset({"check", "rehearse", "run", "home", "recover"})
-_LOOKS = (("watch",), ("recover",), ("bus", "scan"))
+_LOOKS = (("watch",), ("recover",), ("bus", "scan"), ("bus", "probe"))
 _OPTIONS_OF_LOOKS = ("--json", "--state", "--seconds=")
 
 

@@ -1,0 +1,399 @@
+"""What a drive can, held against what this driver needs: asked by SDO uploads, or foretold by its data sheet.
+
+A drive's answer counts before its family (`profiles/`), the family before the file. What is indispensable and missing
+is a problem, with the object and the reason; what is optional and missing is told with what happens instead. Of what
+can be had in several ways the first of the family's list is taken.
+
+Boundary: it writes nothing. Whether an entry can be written shows when `setup.py` writes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from drivers.canopen import dictionary as od
+from drivers.canopen.bus_errors import BusError
+from drivers.canopen.dictionary import Entry, pdo_entry
+from drivers.canopen.families import entry_of, family_of
+from drivers.canopen.sdo import DOES_NOT_EXIST, Objects, SdoRefused
+from ident_service.config.canopen import CanopenDrive, CanopenDriver
+from ident_service.config.eds import DataSheet
+from ident_service.config.family import Family, TorqueLimit, TorquePath
+from ident_service.config.watchdogs import WatchdogKind
+from ident_service.errors import DriverError
+
+DRIVE_PROFILE = 402  # low word of 1000h
+TORQUE_UNITS = {"mNm": 1e-3, "uNm": 1e-6, "mA": 1e-3}
+_SAME = 0.01  # of a torque's unit: rounding, not another unit
+_ABSURD = 5.0  # between two sayings of one rated torque
+_MOST_TIMES = 20.0  # the rated torque, which no drive's peak torque comes near
+_POWERS = range(1, 7)
+
+# Why a drive without these cannot be driven.
+_INDISPENSABLE: Sequence[tuple[Entry, str]] = (
+    (od.VENDOR, "nobody knows whose it is"),
+    (od.CONTROL_WORD, "it cannot be led to `operation enabled`, nor out of it"),
+    (od.STATUS_WORD, "it does not tell its state"),
+    (od.MODE, "its mode of operation cannot be set"),
+    (od.MODE_DISPLAY, "it does not tell its mode of operation"),
+    (od.POSITION, "it does not tell its position"),
+    (od.RPDO_COB_ID, "torques have no frame"),
+    (od.RPDO_COUNT, "torques have no frame"),
+    (pdo_entry(od.RPDO_COB_ID, 2), "control words have no frame"),
+    (od.TPDO_COB_ID, "positions have no frame"),
+    (od.TPDO_COUNT, "positions have no frame"),
+    (pdo_entry(od.TPDO_COB_ID, 2), "status reports have no frame"),
+)
+# What happens without these.
+_OPTIONAL: Sequence[tuple[Entry, str]] = (
+    (od.SYNC_COB_ID, "SYNC is taken to be 080h; a position proves it"),
+    (od.SYNC_PERIOD, "it is not told the cycle"),
+    (od.PERIOD_NUMBER, "it is not told the interpolation period"),
+    (od.EMERGENCY_COB_ID, "emergencies are taken to be 080h + node"),
+    (od.EMERGENCY_INHIBIT, "a storm of emergencies is not held back"),
+    (od.ERROR_BEHAVIOUR, "a lost host may end `operational`: without status reports its watchdog cannot be proven"),
+    (od.ABORT_CONNECTION, "what it does when its host is gone is its maker's"),
+    (od.QUICK_STOP_OPTION, "`disable voltage` is the only stop that is known"),
+    (od.FAULT_OPTION, "what it does in a fault is its maker's"),
+    (od.LOWER_LIMIT, "it knows no position limits, which are no wall in torque mode either"),
+    (od.ZERO_COUNTS, "it cannot keep a zero (`zero: at_home`)"),
+)
+_OTHERS: Sequence[Entry] = (
+    *(od.DEVICE_TYPE, od.PRODUCT, od.REVISION, od.SERIAL, od.SYNC_WINDOW, od.SYNC_OVERFLOW, od.GUARD_TIME),
+    *(od.LIFE_FACTOR, od.HEARTBEAT_CONSUMER, od.HEARTBEAT_PRODUCER, od.RPDO_DEADLINE, pdo_entry(od.TPDO_PERIOD, 2)),
+    *(od.TORQUE_ACTUAL, od.RATED_CURRENT, od.SUPPORTED_MODES, od.ENCODER_COUNTS, od.ENCODER_TURNS),
+)
+
+
+@dataclass(frozen=True)
+class Found:
+    """What is known of a drive's entries.
+
+    Attributes:
+        there: keys (index << 8 | sub-index) of entries that it has.
+        values: what they hold, by key, where that is known.
+        unread: why one that it seems to have could not be read, by key.
+        asked: whether the drive was asked; else its data sheet foretells.
+    """
+
+    there: frozenset[int]
+    values: Mapping[int, int]
+    unread: Mapping[int, str] = field(default_factory=dict)
+    asked: bool = True
+
+    def has(self, entry: Entry) -> bool:
+        """Whether the drive has an entry."""
+        return entry.key in self.there
+
+    def get(self, entry: Entry) -> int | None:
+        """What an entry holds; None where that is not known."""
+        return self.values.get(entry.key)
+
+    @property
+    def identity(self) -> dict[str, int]:
+        """Vendor and product (1018h), as far as they are known."""
+        said = {"vendor": self.get(od.VENDOR), "product": self.get(od.PRODUCT)}
+        return {name: value for name, value in said.items() if value is not None}
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is indispensable and missing: the object's index [h], and why it is needed, in words."""
+
+    where: str
+    why: str
+
+    def __str__(self) -> str:
+        return f"{self.where}: {self.why}"
+
+
+@dataclass(frozen=True)
+class Capabilities:
+    """What one drive can, and what of it is taken.
+
+    Attributes:
+        family: that it belongs to.
+        found: what it has.
+        torque: how torques are streamed; None for no way.
+        count: a count of the target [N m]; None where nothing tells it.
+        limit: of the torque, in the drive; None for none.
+        speed: entry of the largest speed; None where the drive has none.
+        watchdogs: kinds that it has, the most trusted first.
+        event: whether it has an event timer for status reports; else they come with every n-th SYNC.
+        dummies: indices of what may take the room of others' torques, in the order in which they are tried.
+        shares: whether its data sheet or its family lets it share torque frames.
+        problems: why it cannot be driven.
+        changes: what the description has to say instead.
+        notes: what it lacks, and what happens instead.
+    """
+
+    family: Family
+    found: Found
+    torque: TorquePath | None
+    count: float | None
+    limit: TorqueLimit | None
+    speed: Entry | None
+    watchdogs: tuple[WatchdogKind, ...]
+    event: bool
+    dummies: tuple[int, ...]
+    shares: bool
+    problems: tuple[Problem, ...]
+    changes: tuple[Problem, ...]
+    notes: tuple[str, ...]
+
+    def require(self, node: int) -> None:
+        """Raise DriverError where the drive is to be refused, with everything that is wrong."""
+        if wrong := (*self.problems, *self.changes):
+            told = "; ".join(map(str, wrong))
+            raise DriverError(f"node {node}: cannot be driven ({self.family.name}): {told}")
+
+
+def capabilities(objects: Objects, driver: CanopenDriver, number: int) -> Capabilities:
+    """Ask a drive of an arm what it can, by uploads alone, and judge it.
+
+    Args:
+        objects: of the drive.
+        driver: the arm's section.
+        number: of the drive.
+
+    Raises:
+        DriverError: it does not answer, or the bus is gone.
+    """
+    drive = driver.drives[number]
+    family, found = discovered(objects, drive, driver.families)
+    return judged(found, family, drive, driver, driver.sheets[number])
+
+
+def required(objects: Objects, driver: CanopenDriver, number: int) -> Capabilities:
+    """Ask as `capabilities` does; raises DriverError also for a drive that cannot be driven, with everything wrong."""
+    can = capabilities(objects, driver, number)
+    can.require(objects.node)
+    return can
+
+
+def discovered(objects: Objects, drive: CanopenDrive, own: Sequence[Family] = ()) -> tuple[Family, Found]:
+    """Ask a drive for all that matters, by uploads alone.
+
+    Args:
+        objects: of the drive.
+        drive: its section of the description.
+        own: families of the description.
+
+    Raises:
+        DriverError: it does not answer, or the bus is gone.
+    """
+    objects.read_bytes(od.DEVICE_TYPE.index, 0, od.DEVICE_TYPE.name)  # one that is silent is not asked for all the rest
+    first = _asked(objects, (od.DEVICE_TYPE, od.VENDOR, od.PRODUCT))
+    family = family_of(first.identity, own)
+    return family, _asked(objects, _entries(family, drive))
+
+
+def foretold(sheet: DataSheet, drive: CanopenDrive, own: Sequence[Family] = ()) -> tuple[Family, Found]:
+    """Return what a data sheet says instead of the drive; arguments as for `discovered`."""
+    told = {0x101800 | sub: value for sub, value in sheet.identity.items()}
+    family = family_of(Found(frozenset(), told).identity, own)
+    values = {key: value for key, one in sheet.entries.items() if (value := one.number(drive.node)) is not None}
+    return family, Found(frozenset(sheet.entries), values | told, asked=False)
+
+
+def _entries(family: Family, drive: CanopenDrive) -> dict[int, Entry]:
+    texts = [path.target for path in family.torque] + [path.slope for path in family.torque if path.slope]
+    texts += [text for path in family.torque if path.by for text in (path.by.entry, path.by.display)]
+    texts += [text for one in family.torque_limit for text in (one.entry, one.per, one.negative) if text]
+    texts += [*family.speed_limit, *([family.unit.rated] if family.unit and family.unit.rated else [])]
+    texts += [family.watchdog.entry] if family.watchdog else []
+    entries = [*(entry for entry, _ in (*_INDISPENSABLE, *_OPTIONAL)), *_OTHERS]
+    entries += [entry_of(text, "entry of its family") for text in texts]
+    if (mine := drive.watchdog_entry) is not None:
+        entries.append(entry_of(f"{mine.index:04X}:{mine.sub:X}/{mine.type}", "watchdog"))
+    return {entry.key: entry for entry in reversed(entries)}
+
+
+def _asked(objects: Objects, entries: Mapping[int, Entry] | Sequence[Entry]) -> Found:
+    there, values, unread = set(), {}, {}
+    for entry in entries.values() if isinstance(entries, Mapping) else entries:
+        try:
+            values[entry.key] = objects.read(entry)
+        except BusError:
+            raise
+        except SdoRefused as refused:
+            if refused.code in DOES_NOT_EXIST:
+                continue
+            unread[entry.key] = str(refused)
+        except DriverError as error:
+            unread[entry.key] = str(error)
+        there.add(entry.key)
+    return Found(frozenset(there), values, unread)
+
+
+def judged(
+    found: Found, family: Family, drive: CanopenDrive, driver: CanopenDriver, sheet: DataSheet | None
+) -> Capabilities:
+    """Hold what a drive has against what it needs.
+
+    Args:
+        found: what it has.
+        family: that it belongs to.
+        drive: its section of the description.
+        driver: the section that has it.
+        sheet: its data sheet, None where none is known.
+    """
+    problems = [Problem(where(entry), f"missing; {why}") for entry, why in _INDISPENSABLE if not found.has(entry)]
+    notes = [f"{where(entry)} is missing: {words}" for entry, words in _OPTIONAL if not found.has(entry)]
+    notes += [f"cannot be read: {why}" for why in found.unread.values()]
+    torque = next((path for path in family.torque if _streams(path, found)), None)
+    kind = found.get(od.DEVICE_TYPE)
+    if kind is not None and kind & 0xFFFF != DRIVE_PROFILE:
+        problems = [Problem("1000h", f"is {kind:08X}h, which is no drive of CiA 402")]
+    elif torque is None:
+        problems = [Problem("6502h", family.refuse or _no_torque(family, found))]
+    elif kind is None and found.asked:
+        problems.insert(0, Problem("1000h", "does not tell that it is a drive of CiA 402"))
+    count = _count(family, found, drive)
+    limit = next((one for one in family.torque_limit if _limits(one, found)), None)
+    speeds = [entry_of(text, "largest speed", "turns per minute") for text in family.speed_limit]
+    speed = next((entry for entry in speeds if found.has(entry)), None)
+    if speed is None:
+        notes.append("no limit of the speed in the drive: the host alone watches it")
+    watchdogs = tuple(_watchdogs(family, found, drive))
+    changes: list[Problem] = []
+    if torque is not None:
+        problems += _unit_problems(family, found, count)
+        changes += _unit_changes(family, found, drive, count)
+        if limit is None:
+            tried = ", ".join(sorted({named(one.entry) for one in family.torque_limit})) or "none is known"
+            problems.append(Problem(tried, "missing; the drive itself must limit the torque"))
+        if not watchdogs:
+            problems.append(Problem("1400h:05, 1016h:01, 100Ch", "missing; nothing stops it when its host is gone"))
+        elif drive.watchdog not in watchdogs:
+            words = f"{drive.watchdog}: this drive lacks it; it has {', '.join(watchdogs)}"
+            changes.append(Problem("drives.watchdog", words))
+        if driver.torque_reports != "none" and not found.has(od.TORQUE_ACTUAL):
+            changes.append(Problem("driver.measured_torque", "it does not tell its torque (6077h): set it to none"))
+    event = found.has(pdo_entry(od.TPDO_PERIOD, 2))
+    if not event:
+        notes.append("1801h:05 is missing: status reports come with every n-th SYNC")
+    listed = frozenset() if sheet is None else sheet.dummies
+    dummies = sorted((int(text, 16) for text in family.dummies or ()), key=lambda dummy: dummy not in listed)
+    return Capabilities(
+        family,
+        found,
+        torque,
+        count,
+        limit,
+        speed,
+        watchdogs,
+        event,
+        tuple(dummies),
+        any(dummy in listed for dummy in dummies) and _identifier_is_free(sheet),
+        tuple(problems),
+        tuple(changes),
+        tuple(notes),
+    )
+
+
+def where(entry: Entry) -> str:
+    """Return an entry as people write it: `6410h:02`."""
+    return f"{entry.index:04X}h" + (f":{entry.sub:02X}" if entry.sub else "")
+
+
+def named(text: str) -> str:
+    """Return an entry of a family likewise."""
+    return where(entry_of(text, ""))
+
+
+def _streams(path: TorquePath, found: Found) -> bool:
+    """Return whether a drive has a way of streaming torques; one whose 6502h is not known may have it."""
+    needed = [path.target, *([path.slope] if path.slope else []), *([path.by.entry] if path.by else [])]
+    modes = found.get(od.SUPPORTED_MODES)
+    supported = path.supported is None or modes is None or bool(modes >> path.supported & 1)
+    return supported and all(found.has(entry_of(text, "")) for text in needed)
+
+
+def _no_torque(family: Family, found: Found) -> str:
+    modes = found.get(od.SUPPORTED_MODES)
+    said = "has no value" if modes is None else f"is {modes:X}h"
+    lacking = sorted({named(p.target) for p in family.torque if not found.has(entry_of(p.target, ""))})
+    return f"no torque mode: 6502h {said}" + (f", {', '.join(lacking)} missing" if lacking else "")
+
+
+def _limits(limit: TorqueLimit, found: Found) -> bool:
+    return all(found.has(entry_of(text, "")) for text in (limit.entry, limit.per, limit.negative) if text)
+
+
+def _count(family: Family, found: Found, drive: CanopenDrive) -> float | None:
+    """Return what one count of the target is [N m]; None where nothing tells it."""
+    unit = family.unit
+    if unit is None or (unit.unit == "mA" and drive.torque_constant is None):
+        return None
+    factor = TORQUE_UNITS[unit.unit] * (drive.torque_constant or 1.0 if unit.unit == "mA" else 1.0)
+    if unit.rated is None:
+        return factor * (unit.count or 0.0)
+    held = found.get(entry_of(unit.rated, ""))
+    return None if not held else held * factor * 1e-3
+
+
+def _unit_problems(family: Family, found: Found, count: float | None) -> Iterator[Problem]:
+    unit = family.unit
+    if unit is None or unit.writable or unit.rated is None or not found.asked:
+        return
+    if count is None and not found.get(entry_of(unit.rated, "")):
+        words = "is 0 or not there, so that nobody knows what a count is: enter the motor by its maker's tool"
+        yield Problem(named(unit.rated), words)
+
+
+def _unit_changes(family: Family, found: Found, drive: CanopenDrive, count: float | None) -> Iterator[Problem]:
+    """Hold what a count is by the drive against the description, and against its current and torque constant."""
+    unit = family.unit
+    if unit is None or unit.writable:
+        return
+    if unit.unit == "mA" and drive.torque_constant is None:
+        of = "a count" if unit.rated is None else named(unit.rated)
+        yield Problem("drives.torque_constant", f"{of} is of a current: give it [N m/A]")
+    if count is None or not found.asked:
+        return
+    thousand = 1e3 * count
+    if factor := _factor(thousand, drive.rated_torque, _SAME):
+        words = f"{drive.rated_torque:g} N m, but a thousand counts are {thousand:g} N m by the drive{factor}"
+        yield Problem("drives.rated_torque", words)
+    if drive.max_torque > _MOST_TIMES * thousand:
+        words = f"{drive.max_torque:g} N m are {drive.max_torque / thousand:.3g} times what a thousand counts are"
+        yield Problem("drives.max_torque", f"{words}, more than any drive gives; is it of the motor, in N m?")
+    current = found.get(od.RATED_CURRENT)
+    if unit.unit != "mA" and current and drive.torque_constant is not None:
+        by_current = 1e-3 * current * drive.torque_constant
+        if factor := _factor(thousand, by_current, _ABSURD - 1.0):
+            words = f"with 6075h it makes {by_current:g} N m, but a thousand counts are {thousand:g} N m{factor}"
+            yield Problem("drives.torque_constant", words)
+
+
+def _factor(first: float, second: float, tolerance: float) -> str:
+    """Return by which factor two torques differ, in words; nothing where they do not."""
+    ratio = max(first / second, second / first)
+    if ratio <= 1.0 + tolerance:
+        return ""
+    power = next((10**k for k in _POWERS if abs(ratio / 10**k - 1.0) < _SAME), None)
+    return f": wrong by {ratio:.3g}" if power is None else f": wrong by {power}, which is another unit"
+
+
+def _watchdogs(family: Family, found: Found, drive: CanopenDrive) -> Iterator[WatchdogKind]:
+    if found.has(od.RPDO_DEADLINE):
+        yield "rpdo_timer"
+    mine = drive.watchdog_entry
+    theirs = family.watchdog and found.has(entry_of(family.watchdog.entry, ""))
+    own = mine is not None and mine.index << 8 | mine.sub in found.there
+    if own if drive.watchdog == "vendor" else theirs:
+        yield "vendor"
+    if drive.watchdog == "sync_loss":  # which no standard entry tells: the description says that there is one
+        yield "sync_loss"
+    if found.has(od.HEARTBEAT_CONSUMER):
+        yield "heartbeat"
+    if found.has(od.GUARD_TIME) and found.has(od.LIFE_FACTOR):
+        yield "node_guarding"
+
+
+def _identifier_is_free(sheet: DataSheet | None) -> bool:
+    """Return whether the COB-ID of torque frames may be another; one that is fixed is nobody else's."""
+    entry = None if sheet is None else sheet.entries.get(od.RPDO_COB_ID.key)
+    return entry is None or entry.writable

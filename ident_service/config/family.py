@@ -1,0 +1,136 @@
+"""Describe what is special about a maker's drives: data files beside the driver, or beside a user's description.
+
+A family replaces what differs from `generic402`, whose lists are the fallbacks of CiA 402 in their order. An entry is
+written `6071:0/i16`: index and sub-index in hexadecimal digits, and its type.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError, model_validator
+
+from ident_service.config.quantities import Positive, Section
+from ident_service.errors import DriverError
+
+EntryText = Annotated[str, Field(pattern=r"^[0-9A-F]{4}:[0-9A-F]{1,2}/[iu](8|16|32)$")]
+Unsigned32 = Annotated[int, Field(strict=True, ge=0, le=0xFFFF_FFFF)]
+TargetText = Annotated[str, Field(pattern=r"^[0-9A-F]{4}:[0-9A-F]{1,2}/i16$")]  # as torque frames carry it
+_MOST_MODE = 127
+_NEEDS_NO_SOURCE = frozenset({"name", "proved", "sources", "notes"})
+
+
+class Match(Section):
+    """Which drives belong to a family (1018h:01, 1018h:02); no product is every product of the vendor's."""
+
+    vendor: Unsigned32 | None = None
+    product: tuple[Unsigned32, ...] = ()
+
+
+class ModeEntry(Section):
+    """A maker's own entry that takes the place of 6060h; `display` tells what is in effect."""
+
+    entry: EntryText
+    display: EntryText
+
+
+class TorquePath(Section):
+    """How torques are streamed: a mode, its bit in 6502h where it has one, and the entry that takes the torque."""
+
+    mode: Annotated[int, Field(strict=True, ge=-128, le=0xFFFF)]
+    supported: Annotated[int, Field(strict=True, ge=0, le=31)] | None = None
+    target: TargetText
+    by: ModeEntry | None = None
+    slope: EntryText | None = None
+
+    @model_validator(mode="after")
+    def _fits(self) -> TorquePath:
+        if self.by is None and self.mode > _MOST_MODE:
+            raise ValueError(f"mode {self.mode} does not fit 6060h; `by` names the maker's own entry")
+        return self
+
+
+class TorqueUnit(Section):
+    """What a count of the target is: a thousandth of `rated`, or `count`, in `unit`; mA need a torque constant."""
+
+    rated: EntryText | None = None
+    count: Positive | None = None
+    unit: Literal["mNm", "uNm", "mA"]
+    writable: bool = False
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> TorqueUnit:
+        if (self.rated is None) == (self.count is None):
+            raise ValueError("either `rated` names an entry, or `count` is a number")
+        if self.writable and (self.rated is None or self.unit == "mA"):
+            raise ValueError("only a rated torque in mNm or uNm is written")
+        return self
+
+
+class TorqueLimit(Section):
+    """Where the largest torque stands, in counts of the target or thousandths of `per`; `negative`: the other way."""
+
+    entry: EntryText
+    per: EntryText | None = None
+    negative: EntryText | None = None
+
+
+class MakersWatchdog(Section):
+    """An entry of the maker's that makes the drive miss torque frames."""
+
+    entry: EntryText
+    unit: str
+    option: EntryText | None = None
+
+
+class Family(Section):
+    """What is known of some drives.
+
+    `refuse` is the sentence with which drives without a torque mode are refused. `sources` says for every other key
+    where it is from; `proved` whether somebody has run it on hardware.
+    """
+
+    name: Annotated[str, Field(min_length=1)]
+    proved: bool
+    match: Match = Match()
+    refuse: str = ""
+    torque: tuple[TorquePath, ...] = ()
+    unit: TorqueUnit | None = None
+    torque_limit: tuple[TorqueLimit, ...] = ()
+    speed_limit: tuple[EntryText, ...] = ()
+    dummies: tuple[Literal["0003", "0006", "0005", "0002"], ...] | None = None
+    watchdog: MakersWatchdog | None = None
+    notes: str = ""
+    sources: dict[str, Annotated[str, Field(min_length=1)]]
+
+    @model_validator(mode="after")
+    def _every_fact_has_a_source(self) -> Family:
+        told = self.model_fields_set - _NEEDS_NO_SOURCE
+        if empty := [key for key in sorted(told) if getattr(self, key) is None]:
+            raise ValueError(f"{', '.join(empty)}: leave out what is not known")
+        if told != self.sources.keys():
+            raise ValueError(f"sources are needed for {', '.join(sorted(told))}; there are {', '.join(self.sources)}")
+        return self
+
+    def over(self, generic: Family) -> Family:
+        """Return this family with what it leaves open as in another one."""
+        return generic.model_copy(update={key: getattr(self, key) for key in self.model_fields_set})
+
+
+def family_from(name: str, text: str) -> Family:
+    """Read a family.
+
+    Args:
+        name: of the file.
+        text: its YAML.
+
+    Raises:
+        DriverError: it is no family; the message says why.
+    """
+    import yaml  # where a family is read; a motion's process needs none
+
+    try:
+        content: Any = yaml.safe_load(text)
+        return Family.model_validate(content)
+    except (yaml.YAMLError, ValidationError, RecursionError) as error:
+        raise DriverError(f"{name} is no family of drives: {error}") from None

@@ -1,0 +1,210 @@
+"""Every data sheet of a real drive that is at hand: brought up, moved, stopped and left alone, or refused in words."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.makers import CAPABLE, REFUSED, SHEETS, Bench, arm_of
+from test_driver_watchdogs import Bench as HeldBench
+
+from drivers.arm import StopKind
+from drivers.status import AxisStatus
+from ident_service.config.schema import ArmConfig
+from ident_service.errors import DriverError
+from ident_service.motion.preflight.check import Verdict
+
+ZERO = np.zeros(2)
+PROVEN = {"maxon_epos4_50-5_0170h.eds", "elmo_gold_V002.dcf", "elmo_simpliq.dcf"}
+MS = 1_000_000
+pytestmark = pytest.mark.skipif(not SHEETS.is_dir(), reason="the makers' data sheets are not beside this checkout")
+
+
+@pytest.mark.parametrize("name", CAPABLE)
+def test_a_drive_with_a_torque_mode_is_brought_up_moves_and_stops(name: str) -> None:
+    bench = Bench(arm_of(name))
+    truths: list[Any] = []
+    bench.behind.emulator.observer = truths.append
+    with bench.arm as arm:
+        assert bench.states == ["switch on disabled"] * 2
+        assert [face.objects.number(0x6061) for face in bench.behind.emulator.faces] == [CAPABLE[name][1]] * 2  # type: ignore[attr-defined]
+        arm.enable()
+        assert bench.states == ["operation enabled"] * 2
+        torque = np.array([0.1, 0.05])
+        start = arm.exchange(torque)
+        for _ in range(60):
+            sample = arm.exchange(torque)
+        assert sample.valid.all()
+        assert all(AxisStatus(word) & AxisStatus.POWERED for word in sample.status)
+        # The torque that is told is the one that acts, and it is the one that was asked for.
+        np.testing.assert_allclose(truths[-1].torque, sample.torque, rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(sample.torque, torque, atol=1.1e-3)
+        moved = sample.position - start.position
+        np.testing.assert_allclose(moved, torque * 0.5 * 0.12**2, rtol=0.1)  # 60 cycles at 500 Hz, inertias of 1
+        arm.stop(StopKind.TORQUE_OFF)
+        for _ in range(5):
+            arm.exchange(None)
+        assert bench.states == ["switch on disabled"] * 2
+        arm.enable()
+        arm.stop(StopKind.QUICK_STOP)
+        for _ in range(80):
+            arm.exchange(None)
+        assert "operation enabled" not in bench.states
+
+
+@pytest.mark.parametrize("name", CAPABLE)
+def test_a_drive_whose_host_dies_lets_go_in_the_promised_time(name: str) -> None:
+    config = arm_of(name)
+    bench = Bench(config)
+    bench.arm.open()
+    bench.arm.enable()
+    for _ in range(30):
+        bench.arm.exchange(ZERO)
+    died = bench.behind.clock.now_ns()
+    bench.behind.settle(died + 30 * MS)
+    assert bench.states == ["operation enabled"] * 2
+    longest = max(one.seconds for one in bench.arm.watchdogs())
+    bench.behind.settle(died + round(longest * 1e9) + 130 * MS)  # the watchdog, and then its ramp
+    assert "operation enabled" not in bench.states
+
+
+@pytest.mark.parametrize("name", CAPABLE)
+def test_a_second_bring_up_writes_what_closing_took_back_and_nothing_else(name: str) -> None:
+    bench = Bench(arm_of(name))
+    with bench.arm:
+        first = bench.downloads()
+    with bench.arm:
+        again = {(index, sub) for _, index, sub in bench.downloads()}
+    assert len(first) > 20
+    # And what it refuses every time: its own cycle, COB-IDs that are fixed.
+    refused = {(0x60C2, 1)} | {(index, 1) for index in (0x1402, 0x1403, 0x1802, 0x1803)}
+    taken_back = {(0x6007, 0), (0x1016, 1), (0x100C, 0)}
+    assert again - refused <= taken_back
+    assert not again & refused or name in ("elmo_simpliq.dcf", "maxon_epos2_50-5_2126h.eds")
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_drive_without_a_torque_mode_is_refused_before_anything_is_written(name: str) -> None:
+    bench = Bench(arm_of(name, measured_torque="none"))
+    with pytest.raises(DriverError, match=rf"node 1: cannot be driven .*{REFUSED[name]}"):
+        bench.arm.open()
+    assert bench.downloads() == []
+
+
+def test_drives_of_two_makers_share_a_bus() -> None:
+    bench = Bench(arm_of("maxon_epos4_50-8_0110h.eds", "e35.eds"))
+    with bench.arm as arm:
+        arm.enable()
+        for _ in range(20):
+            sample = arm.exchange(np.array([0.1, -0.1]))
+        assert sample.valid.all()
+        np.testing.assert_allclose(sample.torque, [0.1, -0.1], atol=1.1e-3)
+
+
+@pytest.mark.parametrize("name", ["e35.eds", "elmo_gold_V002.dcf"])
+def test_foreign_slots_take_the_dummies_that_a_drive_has(name: str) -> None:
+    """One has 0006h, the other 0005h twice; neither has 0003h."""
+    bench = Bench(arm_of(name, torque_frames="shared"))
+    with bench.arm as arm:
+        arm.enable()
+        for _ in range(20):
+            sample = arm.exchange(np.array([0.1, -0.1]))
+        np.testing.assert_allclose(sample.torque, [0.1, -0.1], atol=1.1e-3)
+        torques = bench.behind.emulator.body.truth(bench.behind.clock.now_ns()).torque
+        np.testing.assert_allclose(torques, sample.torque, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("second", "entry"), [("maxon_epos4_50-8_0110h.eds", "1600h"), ("elmo_simpliq.dcf", "1400h:01")]
+)
+def test_a_drive_that_shares_no_frame_says_what_to_write_instead(second: str, entry: str) -> None:
+    """One maps no dummies, the other's COB-IDs are fixed."""
+    bench = Bench(arm_of("e35.eds", second, torque_frames="shared"))
+    with pytest.raises(DriverError, match=rf"node 2: setting {entry}.*torque_frames must be single"):
+        bench.arm.open()
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "words"),
+    [
+        ("maxon_epos4_50-8_0110h.eds", {"rated_torque": 0.001, "max_torque": 0.002}, "by 1000, which is another unit"),
+        ("maxon_epos4_50-8_0110h.eds", {"rated_torque": 10.0}, "by 10, which is another unit"),
+        ("maxon_epos4_50-8_0110h.eds", {"rated_torque": 1.3}, "wrong by 1.3"),
+        ("maxon_epos4_50-8_0110h.eds", {"max_torque": 30.0}, r"30 N m are 30 times what a thousand counts are"),
+        (
+            "e35.eds",
+            {"torque_constant": 50.0},
+            r"drives.torque_constant: with 6075h it makes .* by 1000, which is another",
+        ),
+        ("elmo_gold_V002.dcf", {"torque_constant": None}, r"drives.torque_constant: 6075h is of a current"),
+        ("elmo_gold_V002.dcf", {"torque_constant": 1.0}, "by 10, which is another unit"),
+        ("e35.eds", {"watchdog": "heartbeat"}, r"heartbeat: this drive lacks it; it has node_guarding"),
+    ],
+)
+def test_a_unit_or_a_watchdog_that_is_another_is_noticed_before_anything_is_written(
+    name: str, changes: dict[str, Any], words: str
+) -> None:
+    right = arm_of(name)
+    document = right.model_dump(mode="json", by_alias=True)
+    for drive in document["driver"]["drives"]:
+        drive.update(changes)
+    bench = Bench(ArmConfig.model_validate(document), right)
+    with pytest.raises(DriverError, match=rf"node 1: cannot be driven .*{words}"):
+        bench.arm.open()
+    assert bench.downloads() == []
+
+
+@pytest.mark.parametrize("name", CAPABLE)
+def test_a_fault_is_reset_by_an_edge_that_slow_firmware_sees(name: str) -> None:
+    """At 1 kHz, where a drive with a loop of 1 ms may read one of two words that follow each other."""
+    config = arm_of(name)
+    fast = ArmConfig.model_validate(config.model_dump(mode="json", by_alias=True) | {"control": {"rate": 1000.0}})
+    bench = Bench(fast)
+    with bench.arm as arm:
+        arm.enable()
+        face = bench.behind.emulator.faces[0]
+        face.fail(0x4310, bench.behind.clock.now_ns())
+        arm.stop(StopKind.TORQUE_OFF)
+        for _ in range(200):
+            arm.exchange(None)
+        assert bench.states[0] == "fault"
+        arm.reset()
+        assert bench.states == ["switch on disabled"] * 2
+        arm.enable()
+        assert bench.states == ["operation enabled"] * 2
+
+
+@pytest.mark.parametrize("name", CAPABLE)
+def test_a_watchdog_is_proven_where_the_drive_goes_on_telling_its_state(name: str) -> None:
+    """Drives without 1029h:01 leave `operational`; nobody hears that they have stopped, and so it is not believed."""
+    bench = HeldBench(arm_of(name, status={"period": 0.1, "inhibit": 0.005}))
+    told = bench.behind.emulator.faces[0].objects.entries.keys() >= {0x102901}  # type: ignore[attr-defined]
+    for _ in range(50):
+        bench.arm.exchange(ZERO)
+    check = bench.check()
+    assert (check.verdict is Verdict.PASSED) == told == (name in PROVEN), check.reason
+    bench.arm.close()
+    assert "operation enabled" not in " ".join(bench.behind.emulator.states)
+
+
+def test_a_family_of_the_users_has_its_rated_torque_written_in_its_own_unit() -> None:
+    mine = """
+name: mine
+proved: no
+match: {vendor: 0xFB, product: [0x65510000]}
+unit: {rated: 6076:0/u32, unit: uNm, writable: yes}
+torque_limit: [{entry: 3001:2/u32, per: 3001:1/u32}]
+sources: {match: a test, unit: a test, torque_limit: a test}
+"""
+    config = arm_of("maxon_epos4_50-8_0110h.eds", profiles=[{"name": "mine.yaml", "text": mine}])
+    document = config.model_dump(mode="json", by_alias=True)
+    for drive in document["driver"]["drives"]:
+        drive.update(rated_torque=0.25, max_torque=0.5)
+    bench = Bench(ArmConfig.model_validate(document), config)
+    with bench.arm as arm:
+        arm.enable()
+        sample = arm.exchange(np.array([0.1, 0.1]))
+        held = [face.objects.number(0x6076) for face in bench.behind.emulator.faces]  # type: ignore[attr-defined]
+    assert held == [250_000, 250_000]
+    np.testing.assert_allclose(sample.torque, 0.1, atol=3e-4)
