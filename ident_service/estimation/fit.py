@@ -18,6 +18,7 @@ from ident_service.estimation.choices import Choice, chosen, held_out_error
 from ident_service.estimation.delay import Delay, estimate_delay, with_delay
 from ident_service.estimation.doubt import uncertainty, widening
 from ident_service.estimation.equations import Equations, equations
+from ident_service.estimation.feasible.central import Near
 from ident_service.estimation.feasible.feasibility import constrained_least_squares
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.feasible.priors import residual_deviation
@@ -216,24 +217,25 @@ def _doubted(method: Method, fit: LeastSquares, equations: Equations, shares: Ar
     return Fit(fit, equations, found.covariance, found.deviations, found.degrees, found.noise, shares, method)
 
 
-def as_good_as_the_same(fit: LeastSquares, base: BaseParameters, deviations: Array) -> Array:
+def as_good_as_the_same(fit: LeastSquares, base: BaseParameters, deviations: Array, beta: Array) -> Near | None:
     """Give N of `central.py`: changes of the links' base parameters by less than a hundredth of their deviations.
 
     In the metric of eq. 81 a change of length 1 moves each parameter by at most its white deviation, which is no
-    larger than the one that is told; so no torque changes by what could be seen.
+    larger than the one that is told; so no torque changes by what could be seen. Friction does not move.
 
     Args:
         fit: unconstrained.
         base: grouping of the parameters.
         deviations: that are told, shape (base,).
+        beta: what they move from, shape (base,).
 
     Returns:
-        Shape (rows, base); columns of zeros for what does not change.
+        None where no parameter was seen, or nothing is uncertain.
     """
-    seen = np.isfinite(fit.standard_deviations) & np.isfinite(deviations) & (fit.standard_deviations > 0.0)
-    of_links = [name.rstrip("0123456789") in INERTIAL for name in (base.names[column] for column in base.base)]
-    moves = seen & np.array(of_links)
-    if not moves.any():
-        return np.zeros((0, base.size))
-    least = float(np.min(deviations[moves] / fit.standard_deviations[moves]))
-    return np.where(moves, fit.R1, 0.0) / (SAME * least * residual_deviation(fit))
+    white = fit.standard_deviations
+    seen = np.isfinite(white) & np.isfinite(deviations) & (white > 0.0)
+    if not seen.any():
+        return None
+    moves = np.array([base.names[column].rstrip("0123456789") in (*INERTIAL, "Ia") for column in base.base])
+    least = float(np.min(deviations[seen] / white[seen]))
+    return Near(beta, fit.R1 / (SAME * least * residual_deviation(fit)), moves)

@@ -24,7 +24,7 @@ from ident_service.estimation.feasible.feasibility import (
     feasibility_test,
 )
 from ident_service.estimation.feasible.feasible_set import FeasibleSet, SetName, feasible_set
-from ident_service.estimation.feasible.priors import Prior, choose_weight
+from ident_service.estimation.feasible.priors import Prior, choose_weight, roomier
 from ident_service.estimation.fit import Fit, Prepared, as_good_as_the_same, prepare, unconstrained
 from ident_service.estimation.friction_fit import at_the_edge
 from ident_service.estimation.least_squares import (
@@ -247,8 +247,9 @@ def identify(
     if prior is None and custom is None:
         likely = likely_bodies(prepared.model)
         nearest_to = likely.source
-        near = as_good_as_the_same(found.fit, base, deviations) if held[kind].tight else None
-        held[kind] = held[kind].centred(base, conditions, likely, near)
+        near = as_good_as_the_same(found.fit, base, deviations, held[kind].beta) if held[kind].tight else None
+        begin = held[kind] if near is None else roomier(held[kind], base, conditions, likely, near)
+        held[kind] = begin.centred(base, conditions, likely, near)
 
     everything, moving = prepared.equations.everything, prepared.equations.moving
     label = found.method.upper()

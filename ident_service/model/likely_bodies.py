@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from ident_service.config.workspace import Capsule
-from ident_service.model.arm_model import ArmModel
+from ident_service.model.arm_model import ArmModel, control_model
 from ident_service.model.chain import Array
 from ident_service.model.layout import INERTIAL
 
@@ -33,11 +33,13 @@ class LikelyBodies:
     """Link parameters to choose near to.
 
     Attributes:
-        delta: SI units, shape (layout.size,); joint terms are zero.
+        delta: of the links [SI], shape (layout.size,); joint terms are zero.
+        drives: drive inertias alone [kg m^2 or kg], shape (layout.size,).
         source: whether all of them are the prior's, or some are guessed from geometry.
     """
 
     delta: Array
+    drives: Array
     source: Source
 
 
@@ -70,7 +72,28 @@ def likely_bodies(model: ArmModel) -> LikelyBodies:
         wanted = float(np.clip(masses, total.lower - known, left)) if left > 0.0 else 0.1 * masses
         for place in guessed:
             delta[place] *= wanted / masses
-    return LikelyBodies(delta, "geometry" if guessed else "prior")
+    return LikelyBodies(delta, _drives(model, delta), "geometry" if guessed else "prior")
+
+
+def _drives(model: ArmModel, delta: Array) -> Array:
+    """Drive inertias: the prior's, the description's, or about what the links beyond a joint have."""
+    layout, found = model.layout, np.zeros(model.layout.size)
+    columns = layout.term_columns("drive_inertia")
+    if not len(columns):
+        return found
+    known = control_model(model).prior
+    stated = [
+        0.0 if joint is None else joint.drive_inertia or 0.0
+        for joint in map(model.config.joints.get, model.chain.names)
+    ]
+    found[columns] = stated if known is None else known[columns]
+    outer = np.zeros(model.chain.joints)
+    for k in range(model.chain.joints):
+        own = delta[layout.inertial(k)]
+        for ancestor in model.chain.ancestors(k):
+            outer[ancestor] += max(own[0] + own[3] + own[5], 0.0) / 3.0
+    found[columns] = np.where(found[columns] > 0.0, found[columns], outer)
+    return found
 
 
 def lines_of(model: ArmModel, link: int) -> Sequence[Capsule]:

@@ -12,7 +12,7 @@ from feasible.random_cases import random_case
 from ident_service.config.load import load_arm
 from ident_service.config.schema import FeasibleSetName
 from ident_service.estimation.feasible.blocks import reference, symmetric
-from ident_service.estimation.feasible.central import central
+from ident_service.estimation.feasible.central import Near, central
 from ident_service.estimation.feasible.feasibility import constrained_least_squares, feasibility_test
 from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
 from ident_service.estimation.feasible.posing import EPSILON, Lift
@@ -59,9 +59,10 @@ def test_it_is_the_minimiser_that_another_solver_finds(likely: bool, moves: bool
     bodies = likely_bodies(replace(model, prior=None)) if likely else None
     rng = np.random.default_rng(2)
     # Of moving parameters all but the last two, which are friction.
-    near = 30.0 * rng.normal(size=(base.size, base.size)) * (np.arange(base.size) < base.size - 2) if moves else None
+    metric, may = 30.0 * rng.normal(size=(base.size, base.size)), np.arange(base.size) < base.size - 2
     conditions = feasible_set("pseudo_inertia", base.names, model.config)
     start = feasibility_test(base.K @ model.layout.vector(model.config.driver.truth), base, conditions).delta  # type: ignore[union-attr, arg-type]
+    near = Near(base.K @ start, metric, may) if moves else None
     found = central(start, base, conditions, bodies, near)
     delta = cp.Variable(len(start))
     terms = []
@@ -69,7 +70,9 @@ def test_it_is_the_minimiser_that_another_solver_finds(likely: bool, moves: bool
     for block in conditions.blocks:
         entries = block.F @ delta + block.f - inset * block.identity()
         if block.size == 0:
-            terms.append(-cp.sum(cp.log(entries / block.references())))
+            own = np.zeros(len(block.f)) if bodies is None else block.F @ bodies.drives
+            units = np.where(own > 0.0, own, block.references())
+            terms.append(-cp.sum(cp.log(entries / units)) + (own > 0.0) @ (entries / units))
             continue
         root = np.diag(np.sqrt(block.references()))
         if bodies is not None:
@@ -82,15 +85,15 @@ def test_it_is_the_minimiser_that_another_solver_finds(likely: bool, moves: bool
         terms.append(-cp.log_det(scaled) + cp.trace(scaled))
     change, kept = base.K @ delta - base.K @ start, np.ones(base.size, dtype=bool)
     if near is not None:
-        kept = ~near.any(axis=0)
+        kept = ~may
         # log(1 - |x|^2) as the determinant of [[1, x], [x^T, 1]].
-        x, one = cp.reshape(near @ change, (base.size, 1), order="C"), np.ones((1, 1))
+        x, one = cp.reshape(metric @ change, (base.size, 1), order="C"), np.ones((1, 1))
         terms.append(-cp.log_det(cp.bmat([[np.eye(base.size), x], [x.T, one]])))
     problem = cp.Problem(cp.Minimize(sum(terms)), [change[np.flatnonzero(kept)] == 0.0])
     problem.solve(solver=cp.CLARABEL)
     assert problem.status == "optimal"
     if near is not None:
-        moved = np.linalg.norm(near @ (base.K @ (found - start)))
+        moved = np.linalg.norm(near.moved(base.K @ found))
         assert 0.5 < moved < 1.0
     scale = np.array([reference(name) for name in base.names])
     np.testing.assert_allclose(delta.value / scale, found / scale, rtol=1e-3, atol=1e-3)

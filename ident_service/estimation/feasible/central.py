@@ -15,7 +15,8 @@ Newton's method finds its minimiser to the last digits.
 
 Where data press against the set, the only bodies with exactly these base parameters are nearly points and rods. So an
 estimate's base parameters may move by far less than is known of them, K delta = beta + x with |N x| < 1, and f has the
-barrier -log(1 - |N x|^2) besides.
+barrier -log(1 - |N x|^2) besides. Along what data do not see x is free; the drive inertias that then are have a likely
+value as bodies have, -log Ia + Ia / Ia_likely.
 """
 
 from __future__ import annotations
@@ -43,6 +44,25 @@ _KEPT = 0.5  # share of the margin, at most the paper's, that is left where data
 
 
 @dataclass(frozen=True)
+class Near:
+    """How far base parameters may move.
+
+    Attributes:
+        origin: base parameters that they move from [SI], shape (base,).
+        metric: N above, shape (rows, base).
+        moves: which of them may, shape (base,).
+    """
+
+    origin: Array
+    metric: Array
+    moves: NDArray[np.bool_]
+
+    def moved(self, beta: Array) -> Array:
+        """N x of other base parameters, shape (rows,); they are near where its length is below 1."""
+        return np.asarray(self.metric @ (beta - self.origin))
+
+
+@dataclass(frozen=True)
 class _Matrix:
     """One symmetric matrix of the set over its reference scale, as an affine function of the free directions.
 
@@ -64,7 +84,7 @@ def central(
     base: BaseParameters,
     conditions: FeasibleSet,
     likely: LikelyBodies | None = None,
-    near: Array | None = None,
+    near: Near | None = None,
 ) -> Array:
     """Move link parameters to the centre of those with the same base parameters.
 
@@ -73,15 +93,16 @@ def central(
         base: grouping of the parameters.
         conditions: the feasible set.
         likely: bodies to stay near to; ones of 1 kg and 0.1 m at each link's origin when None.
-        near: N above, shape (rows, base): base parameters with a column of zeros do not move; none moves when None.
+        near: how far base parameters may move; none moves when None.
 
     Returns:
         Link parameters with the same base parameters to rounding, or as near to them as `near` says, inside the set,
         shape (parameters,); `delta` itself where rounding forbids a step.
     """
     lift = Lift(base)
-    N = np.zeros((0, base.size)) if near is None else near
-    moving = np.flatnonzero(np.any(N != 0.0, axis=0))
+    N = np.zeros((0, base.size)) if near is None else near.metric
+    begin = np.zeros(0) if near is None else near.moved(base.K @ delta)
+    moving = np.zeros(0, dtype=int) if near is None else np.flatnonzero(near.moves)
     free = np.column_stack([lift.of_dependent, lift.of_beta[:, moving]])
     N = np.column_stack([np.zeros((len(N), len(lift.dependent))), N[:, moving]])
     E, _ = conditions.equality_rows()
@@ -108,7 +129,7 @@ def central(
             rows.append(J)
             wanted.append((np.eye(len(L)) - (L.T @ L if matrix.bounded else 0.0)).ravel())
             moves.append(move)
-        away = N @ y
+        away = begin + N @ y
         left = 1.0 - float(away @ away)
         J = np.vstack([*rows, np.sqrt(2.0 / left) * N, 2.0 / left * (away @ N)[None]])
         r = np.concatenate([*wanted, -np.sqrt(2.0 / left) * away, np.zeros(1)])
@@ -161,10 +182,16 @@ def _matrices(block: Block, delta: Array, free: Array, inset: float, likely: Lik
         G = np.linalg.inv(_root(block, likely))
         value, *found = (G @ symmetric(entries, block.size) @ G.T for entries in (values, *slopes.T[directions]))
         return [_Matrix(value, directions, np.array(found), bounded=True)] if found else []
-    scaled = [(value / unit, row / unit) for value, row, unit in zip(values, slopes, block.references(), strict=True)]
+    units = block.references()
+    drives = np.zeros(len(units), dtype=bool)
+    if likely is not None:  # of drive inertias, which nothing else bounds
+        own = block.F @ likely.drives
+        drives = own > 0.0
+        units = np.where(drives, own, units)
+    scaled = zip(values / units, slopes / units[:, None], drives, strict=True)
     return [
-        _Matrix(np.full((1, 1), value), np.flatnonzero(row), row[row != 0.0][:, None, None], bounded=False)
-        for value, row in scaled
+        _Matrix(np.full((1, 1), value), np.flatnonzero(row), row[row != 0.0][:, None, None], bounded=bool(drive))
+        for value, row, drive in scaled
         if np.any(row != 0.0)
     ]
 

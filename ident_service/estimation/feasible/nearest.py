@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident_service.errors import SolverError
-from ident_service.estimation.feasible.central import central
+from ident_service.estimation.feasible.central import Near, central
 from ident_service.estimation.feasible.conic import ConicProblem, Solution
 from ident_service.estimation.feasible.consistency import ConditionsError, contradiction
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
@@ -66,7 +66,7 @@ class FeasibleEstimate:
         base: BaseParameters,
         conditions: FeasibleSet,
         likely: LikelyBodies | None = None,
-        near: Array | None = None,
+        near: Near | None = None,
     ) -> FeasibleEstimate:
         """Return the link parameters nearest to likely ones, with these base parameters or near ones: `central.py`."""
         delta = central(self.delta, base, conditions, likely, near)

@@ -14,15 +14,16 @@ With P0 = G G^T the divergence is that of Q = G^-1 P G^-T from the identity. In 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ident_service.errors import ParameterError
+from ident_service.errors import ParameterError, SolverError
 from ident_service.estimation.feasible.blocks import reference, symmetric
+from ident_service.estimation.feasible.central import Near
 from ident_service.estimation.feasible.conic import ConicProblem, triangle_entries
 from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet, feasible_set
 from ident_service.estimation.feasible.nearest import FeasibleEstimate, hold, solve_inside
@@ -31,7 +32,9 @@ from ident_service.estimation.least_squares import LeastSquares
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.layout import INERTIAL
+from ident_service.model.likely_bodies import LikelyBodies
 
+_ROOM = 0.9  # of what base parameters may move, that the way to likely bodies may take
 _TRIANGLE = [(i, j) for i in range(4) for j in range(i + 1)]  # entries of Z, row by row
 
 
@@ -184,6 +187,67 @@ def _towards_prior(
         prior_distance=prior.divergence(delta),
         bound=solution.bound,
     )
+
+
+def roomier(
+    held: FeasibleEstimate,
+    base: BaseParameters,
+    conditions: FeasibleSet,
+    likely: LikelyBodies,
+    near: Near,
+) -> FeasibleEstimate:
+    """Leave the boundary of the set for bodies like the likely ones, by less than what is as good as the same.
+
+    Newton's method (`central.py`) needs room to begin: between links of tonnes whose masses cancel there is none.
+
+    Args:
+        held: constrained least squares, pressed against the set.
+        base: grouping of the parameters.
+        conditions: the set.
+        likely: bodies to be drawn to.
+        near: how far base parameters may move.
+
+    Returns:
+        `held` with other link values and nearly the same base parameters; `held` itself where the solver finds none.
+    """
+    delta = held.delta.copy()  # friction is drawn to where it is
+    links = np.array([name.rstrip("0123456789") in INERTIAL for name in conditions.names])
+    delta[links] = likely.delta[links]
+    delta = np.where(likely.drives > 0.0, likely.drives, delta)
+    prior = Prior("entropic", conditions.names, delta, 1.0)
+    try:
+        found = with_insets(lambda inside: _within(prior, base, conditions, near, inside), conditions, base, held.beta)
+    except (ParameterError, SolverError):
+        return held
+    beta = base.K @ found
+    inside = conditions.margin(found)[0]
+    if float(np.linalg.norm(near.moved(beta))) < 1.0 and inside > 0.0:
+        return replace(held, beta=beta, delta=found, margin=inside)
+    return held
+
+
+def _within(prior: Prior, base: BaseParameters, conditions: FeasibleSet, near: Near, inside: Array) -> Array:
+    """Link parameters of the least divergence from the prior whose base parameters are near others."""
+    n, links = len(prior.names), prior.whitened
+    problem = ConicProblem(n + 14 * len(links))
+    to_delta = np.zeros((n, n + 14 * len(links)))
+    to_delta[:, :n] = np.diag(prior.scales)
+    hold(problem, conditions, to_delta, inside)
+    still = np.flatnonzero(~near.moves)
+    problem.zero(base.K[still] @ to_delta, -near.origin[still])
+    rows = near.metric @ base.K @ to_delta
+    problem.second_order(np.vstack([np.zeros(rows.shape[1]), rows]), np.append(_ROOM, -near.metric @ near.origin))
+    objective, quadratic = np.zeros(rows.shape[1]), np.zeros(rows.shape[1])
+    quadratic[prior.euclidean] = 2.0
+    objective[prior.euclidean] = -2.0 * (prior.delta / prior.scales)[prior.euclidean]
+    for k, block in enumerate(links):
+        start = n + 14 * k
+        _logdet(problem, block, to_delta, start)
+        trace = block.F[[entry for entry, (i, j) in enumerate(triangle_entries(4)) if i == j]].sum(axis=0)
+        objective += trace @ to_delta
+        objective[start + 10 : start + 14] -= 1.0
+    size = float(np.max(np.abs(np.concatenate([near.origin, prior.delta])), initial=0.0))
+    return solve_inside(problem, objective, "likely bodies", to_delta, conditions, size, quadratic, OF_TESTS)[0]
 
 
 def _logdet(problem: ConicProblem, block: Block, to_delta: Array, start: int) -> None:
