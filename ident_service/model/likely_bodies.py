@@ -8,7 +8,7 @@ knowledge: they change no base parameter and no verdict.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -17,6 +17,7 @@ from ident_service.config.workspace import Capsule
 from ident_service.model.arm_model import ArmModel, control_model
 from ident_service.model.chain import Array
 from ident_service.model.layout import INERTIAL
+from ident_service.model.mechanism import read_mechanism
 
 # Of industrial and research arms: castings, motors and gears fill about half of a link's outline with metal.
 _DENSITY = 1500.0  # kg/m^3
@@ -36,11 +37,13 @@ class LikelyBodies:
         delta: of the links [SI], shape (layout.size,); joint terms are zero.
         drives: drive inertias alone [kg m^2 or kg], shape (layout.size,).
         source: whether all of them are the prior's, or some are guessed from geometry.
+        guessed: joints whose links are guessed.
     """
 
     delta: Array
     drives: Array
     source: Source
+    guessed: tuple[str, ...] = ()
 
 
 def likely_bodies(model: ArmModel) -> LikelyBodies:
@@ -72,7 +75,20 @@ def likely_bodies(model: ArmModel) -> LikelyBodies:
         wanted = float(np.clip(masses, total.lower - known, left)) if left > 0.0 else 0.1 * masses
         for place in guessed:
             delta[place] *= wanted / masses
-    return LikelyBodies(delta, _drives(model, delta), "geometry" if guessed else "prior")
+    names = tuple(chain.names[k] for k in range(chain.joints) if layout.inertial(k) in guessed)
+    return LikelyBodies(delta, _drives(model, delta), "geometry" if guessed else "prior", names)
+
+
+def with_urdf_bodies(model: ArmModel) -> ArmModel:
+    """Give the model every body of its URDF as its prior, those too that no real link has."""
+    kinematics = model.config.kinematics
+    if kinematics.urdf is None:
+        return model
+    bodies = read_mechanism(kinematics.urdf, "urdf", kinematics).bodies
+    prior = np.zeros(model.layout.size)
+    for link in range(model.layout.joints):
+        prior[model.layout.inertial(link)] = bodies[link]
+    return replace(model, prior=prior)
 
 
 def _drives(model: ArmModel, delta: Array) -> Array:

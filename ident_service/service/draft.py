@@ -27,6 +27,7 @@ class Draft:
         prior: names and values where the URDF's bodies are not those of real links; empty where they are.
         use: share of the limits that the motions take.
         seeds: of the two motions.
+        total_mass: largest of the arm [kg].
         truth: of the simulated arm.
         remarks: what was guessed, for people.
     """
@@ -40,6 +41,7 @@ class Draft:
     prior: dict[str, float] = field(default_factory=dict)
     use: float = LARGEST_USE
     seeds: tuple[int, int] = (1, 2)
+    total_mass: float = 0.0
     truth: dict[str, float] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
 
@@ -74,6 +76,8 @@ terms: [drive_inertia, viscous, coulomb, offset]
         parts.append(f"{units}\njoints:\n{rows}")
     if draft.prior:
         parts.append(f"prior: # guessed from lengths; SI units, in the link frames\n  {_flow(draft.prior)}\n")
+    if draft.total_mass:
+        parts.append(f"constraints: {{total_mass: {{upper: {draft.total_mass:g}}}}} # kg, twice what its links have\n")
     parts.append(f"control: {{rate: {RATE:g}}} # Hz\n")
     if draft.geometry:
         rows = "".join(f"  {_flow(name)}: {_flow(each)}\n" for name, each in draft.geometry.items())
@@ -83,7 +87,8 @@ terms: [drive_inertia, viscous, coulomb, offset]
         space["may_touch"] = [list(pair) for pair in draft.may_touch]
     parts.append(
         f"workspace: {_flow(space)} # m\n"
-        "# obstacles: {table: {half_space: {normal: [0, 0, 1], offset: -0.1}}} # what else must not be touched\n"
+        "# What else must not be touched, in the braces above, with motions that are clear of it (`ident design`):\n"
+        "#   obstacles: {table: {half_space: {normal: [0, 0, 1], offset: -0.1}}}\n"
     )
     parts.append(
         f"design: {{friction_guess: [{FRICTION_GUESS:g}, {FRICTION_GUESS:g}]}} # shares of the torque limits\n"

@@ -10,11 +10,9 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-import xml.etree.ElementTree as ET
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -25,10 +23,11 @@ from ident_service.config.workspace import BASE
 from ident_service.errors import ModelError, MotionRefused, UsageError
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.model.base import base_parameters, remarks_on_angles
 from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel, share_touching
-from ident_service.model.likely_bodies import drawn_about, likely_bodies, lines_of
-from ident_service.model.mechanism import count_mechanism
+from ident_service.model.likely_bodies import drawn_about, likely_bodies, lines_of, with_urdf_bodies
+from ident_service.model.mechanism import count_mechanism, read_mechanism
 from ident_service.model.outline import mesh_capsules
 from ident_service.model.rigid_body import InverseDynamics
 from ident_service.motion.guard import TORQUE_RATE, TORQUE_RATE_SHARE
@@ -37,8 +36,9 @@ from ident_service.motion.preflight.plan import stability_check
 from ident_service.record.files import write_atomically
 from ident_service.service.commission import require_clear_from_home
 from ident_service.service.draft import CLEARANCE, LARGEST_USE, RATE, Draft, in_yaml, short
+from ident_service.service.urdf_says import Said, arm_part, said_of
 
-_ARM = 3  # joints that make a branch an arm and not a gripper
+_MOST_TURNS = 8.0 * np.pi  # rad, from which a range is degrees
 _TURN, _SLIDE = np.pi, 0.5  # rad and m either way, of joints without limits
 _VELOCITY = {True: 2.0, False: 0.3}  # rad/s, m/s
 _SECONDS = 0.25  # in which a joint reaches its velocity, at most acceleration
@@ -58,15 +58,6 @@ _GLANCES, _GLANCE = 200, 1.3  # postures of a motion that are looked at first, a
 # Share of postures from which links that touch are no collision, by the joints between them: capsules of links around a
 # shoulder or a wrist reach into each other.
 _TOUCHES, _ALWAYS = {2: 0.3, 3: 0.6}, 0.95
-
-
-@dataclass(frozen=True)
-class Said:
-    """What a URDF says of a joint; None where it says nothing that could be meant."""
-
-    position: tuple[float, float] | None
-    velocity: float | None
-    effort: float | None
 
 
 def new_description(
@@ -109,7 +100,7 @@ def new_description(
         raise UsageError(f"{urdf}: cannot be read: {error}") from None
     file = TextFile(name=urdf.name, text=text)
     count_mechanism(file, "urdf")
-    draft = Draft(called, urdf.name, _part(text, file.name, base, tip))
+    draft = Draft(called, urdf.name, arm_part(text, file.name, base, tip))
     with tempfile.TemporaryDirectory() as staging:
         trial = Path(staging) / "arm.yaml"
         shutil.copyfile(urdf, trial.with_name(urdf.name))
@@ -118,8 +109,9 @@ def new_description(
             trial.write_text(in_yaml(draft), encoding="utf-8")
             return arm_model(load_arm(trial))
 
+        draft.remarks += _which(loaded(), draft)
         tell("joints and bodies")
-        _joints(draft, loaded(), _said(text))
+        _joints(draft, loaded(), said_of(text))
         _bodies(draft, loaded, urdf.parent)
         tell("a posture to begin in")
         model = _home(draft, loaded)
@@ -128,6 +120,7 @@ def new_description(
         _gains(draft, loaded)
         _motions(draft, loaded)
         loaded()
+    draft.remarks.append("workspace: nothing but the arm itself is kept clear of; add what stands around it")
     path.parent.mkdir(parents=True, exist_ok=True)
     if not beside.exists():
         write_atomically(beside, text)
@@ -140,89 +133,41 @@ def _plain(name: str) -> str:
     return found or "arm"
 
 
-def _part(text: str, file: str, base: str | None, tip: str | None) -> dict[str, Any]:
-    """Which part of the URDF is the arm: from `base`, or the root, along the branch with most joints to its gripper."""
-    try:
-        robot = ET.fromstring(text)  # noqa: S314 - counted before
-    except ET.ParseError as error:
-        raise ModelError(f"{file}: not well-formed XML: {error}") from None
-    part: dict[str, Any] = {"urdf": file}
-    if base is not None:
-        part["base"] = base
-    if tip is not None:
-        return part | {"tip": tip}
-    children: dict[str, list[tuple[str, str, bool]]] = {}
-    carried, leaders = set(), set()
-    for joint in robot.findall("joint"):
-        parent, child = (joint.find(role) for role in ("parent", "child"))
-        if parent is None or child is None:
-            continue
-        mimic = joint.find("mimic")
-        moves = joint.get("type") in ("revolute", "continuous", "prismatic") and mimic is None
-        if mimic is not None:
-            leaders.add(mimic.get("joint", ""))
-        children.setdefault(parent.get("link", ""), []).append((child.get("link", ""), joint.get("name", ""), moves))
-        carried.add(child.get("link", ""))
-    roots = [link.get("name", "") for link in robot.findall("link") if link.get("name", "") not in carried]
-    if base is None and len(roots) != 1:
-        raise ModelError(f"{file}: {len(roots)} links hang on no joint; name the arm's --base")
-
-    def depth(link: str) -> int:
-        return max((moves + depth(child) for child, _, moves in children.get(link, [])), default=0)
-
-    link, branched = roots[0] if base is None else base, False
-    while True:
-        ways = [(moves + depth(child), child, name, moves) for child, name, moves in children.get(link, [])]
-        ways = [way for way in ways if way[0] > 0]
-        if not ways:
-            break
-        longest = max(ways, key=lambda way: way[0])
-        count, onward, joint_name, moves = longest
-        # Where branches part that are no arms, or a joint leads others by mimicry, the gripper begins.
-        if count < _ARM and (len(ways) > 1 or (moves and joint_name in leaders)):
-            branched = True
-            break
-        branched = branched or len(ways) > 1 or len(children.get(link, [])) > 1
-        link = onward
-    return part | {"tip": link} if branched else part
-
-
-def _said(text: str) -> dict[str, Said]:
-    found = {}
-    for joint in ET.fromstring(text).findall("joint"):  # noqa: S314 - counted before
-        limit = joint.find("limit")
-
-        def number(key: str, limit: ET.Element | None = limit) -> float | None:
-            try:
-                value = float(limit.get(key, "nan")) if limit is not None else float("nan")
-            except ValueError:
-                return None
-            return value if np.isfinite(value) else None
-
-        lower, upper = number("lower"), number("upper")
-        ranged = lower is not None and upper is not None and lower < upper and joint.get("type") != "continuous"
-        position = (float(lower or 0.0), float(upper or 0.0)) if ranged else None
-        velocity, effort = number("velocity"), number("effort")
-        found[joint.get("name", "")] = Said(
-            position,
-            velocity if velocity is not None and 0.0 < velocity < 100.0 else None,
-            effort if effort is not None and 0.0 < effort < 1e5 else None,
-        )
-    return found
+def _which(model: ArmModel, draft: Draft) -> list[str]:
+    """What the arm is, where the file holds more."""
+    file = model.config.kinematics.urdf
+    if file is None or "tip" not in draft.part:
+        return []
+    held = read_mechanism(file, "urdf", model.config.kinematics).held
+    ends = f"from {draft.part.get('base', 'the root')} to {draft.part['tip']}, {model.chain.joints} joints"
+    more = f"; held: {', '.join(list(held)[:8])}{' ...' if len(held) > 8 else ''}" if held else ""
+    return [f"the arm: {ends}{more} (--base and --tip say otherwise)"]
 
 
 def _joints(draft: Draft, model: ArmModel, said: Mapping[str, Said]) -> None:
     """Limits of every joint: the URDF's, else guesses; torque limits that can hold the arm."""
     chain = model.chain
-    if model.prior is None:
-        likely = likely_bodies(model)
+    likely = likely_bodies(with_urdf_bodies(model))
+    if likely.guessed:
         draft.prior = _table(model, likely.delta)
-        draft.remarks.append("bodies: the URDF has none that could be real; they are guessed from its lengths")
-        model = ArmModel(model.config, model.chain, model.layout, likely.delta)
+        draft.remarks.append(
+            f"bodies of {', '.join(likely.guessed)}: rods; the URDF's have no mass, or an inertia that no body has"
+        )
+    model = replace(model, prior=likely.delta)
+    masses = [float(likely.delta[model.layout.inertial(link)][-1]) for link in range(chain.joints)]
+    draft.total_mass = short(2.0 * sum(masses), 3)
+    if remarks_on_angles(base_parameters(model.chain, model.layout)):
+        draft.part["snap"] = True
+        draft.remarks.append(
+            "kinematics: the URDF's angles are rounded multiples of 15 degrees; they are taken for exact"
+        )
     ranges = [
         (said[name].position if name in said else None) or ((-_TURN, _TURN) if turns else (-_SLIDE, _SLIDE))
         for name, turns in zip(chain.names, chain.revolute, strict=True)
     ]
+    for name, (low, high), turns in zip(chain.names, ranges, chain.revolute, strict=True):
+        if turns and high - low > _MOST_TURNS:
+            raise ModelError(f"{draft.urdf}: {name} turns from {low:g} to {high:g} rad: limits of a URDF are radians")
     gravity, inertia = _worst(model, ranges)
     for k, name in enumerate(chain.names):
         turns, one = chain.revolute[k], said.get(name, Said(None, None, None))
@@ -230,7 +175,10 @@ def _joints(draft: Draft, model: ArmModel, said: Mapping[str, Said]) -> None:
         acceleration = velocity / _SECONDS
         torque = one.effort or _HEAVY * (gravity[k] + 2.0 * inertia[k] * acceleration)
         if torque < _HEAVY * gravity[k]:
-            draft.remarks.append(f"{name}: its effort limit of {torque:g} hardly holds the arm ({gravity[k]:.3g})")
+            holds = "cannot hold" if torque < gravity[k] else "hardly holds"
+            draft.remarks.append(
+                f"{name}: its effort limit of {torque:g} {holds} the arm, which asks for {gravity[k]:.3g}"
+            )
         drive = _DRIVE * torque / velocity
         acceleration = min(acceleration, max(0.3 * torque / (inertia[k] + drive), 0.1 * velocity / _SECONDS))
         rate = min(TORQUE_RATE, TORQUE_RATE_SHARE * torque)
@@ -241,7 +189,7 @@ def _joints(draft: Draft, model: ArmModel, said: Mapping[str, Said]) -> None:
             if value is None
         ]
         if missing:
-            draft.remarks.append(f"{name}: {', '.join(missing)} limit guessed; the URDF has none")
+            draft.remarks.append(f"{name}: {', '.join(missing)} limit guessed; the URDF has none that could be meant")
         draft.joints[name] = {
             "position": [short(value) for value in ranges[k]],
             "velocity": short(velocity),

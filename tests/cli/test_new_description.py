@@ -20,7 +20,7 @@ from ident_service.model.arm_model import arm_model
 from ident_service.model.likely_bodies import drawn_about
 from ident_service.model.outline import capsule_around
 from ident_service.model.rigid_body import inertia_from_delta
-from ident_service.service.new_description import _part
+from ident_service.service.urdf_says import arm_part
 
 
 def box_stl(x: float, y: float, z: float) -> bytes:
@@ -130,14 +130,14 @@ def tree(*joints: tuple[str, str, str, str]) -> str:
 
 def test_the_arm_is_the_longest_branch_and_ends_where_its_gripper_begins() -> None:
     arm = [(f"j{k}", f"l{k}", f"l{k + 1}", "revolute") for k in range(5)]
-    assert _part(tree(*arm), "t", None, None) == {"urdf": "t"}
+    assert arm_part(tree(*arm), "t", None, None) == {"urdf": "t"}
     fingers = [("f1", "l5", "f1", "prismatic"), ("f2", "l5", "f2", "prismatic")]
-    assert _part(tree(*arm, *fingers), "t", None, None)["tip"] == "l5"
+    assert arm_part(tree(*arm, *fingers), "t", None, None)["tip"] == "l5"
     other = [(f"o{k}", "l0" if k == 0 else f"o{k}", f"o{k + 1}", "revolute") for k in range(3)]
-    assert _part(tree(*arm, *other), "t", None, None)["tip"] == "l5"
-    assert _part(tree(*arm), "t", "l1", "l3") == {"urdf": "t", "base": "l1", "tip": "l3"}
+    assert arm_part(tree(*arm, *other), "t", None, None)["tip"] == "l5"
+    assert arm_part(tree(*arm), "t", "l1", "l3") == {"urdf": "t", "base": "l1", "tip": "l3"}
     with pytest.raises(ModelError, match="--base"):
-        _part(tree(*arm, ("p", "elsewhere", "else", "revolute")), "t", None, None)
+        arm_part(tree(*arm, ("p", "elsewhere", "else", "revolute")), "t", None, None)
 
 
 @given(st.integers(0, 2**32 - 1))
