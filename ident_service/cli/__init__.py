@@ -7,6 +7,7 @@ nothing is computed here, and large libraries load only when a verb needs them.
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib.util
 import sys
 import time
@@ -89,7 +90,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         _own_packages_only()
         verb: Callable[[argparse.Namespace], Answer] = arguments.verb if arguments.server is None else remote.remotely
-        code, text, document = verb(arguments)
+        code, text, document = _asked(verb, arguments)
     except KeyboardInterrupt:
         # Asked twice, or by somebody who does not want to wait for what could be saved.
         print_to_person("ident: interrupted\n")
@@ -110,6 +111,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         discard(sys.stdout)
         return FAILED
     return code
+
+
+def _asked(verb: Callable[[argparse.Namespace], Answer], arguments: argparse.Namespace) -> Answer:
+    """What a verb answers; a name that no file can have is a wrong word, wherever it is noticed."""
+    try:
+        return verb(arguments)
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:
+            raise
+        raise UsageError(f"{str(error.filename)[:40]}...: this name is too long for a file") from None
 
 
 def parser() -> Parser:

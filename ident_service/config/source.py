@@ -81,9 +81,13 @@ def read_tree(path: Path, _chain: tuple[Path, ...] = (), *, upload: bool = False
     if upload and parent not in shipped_arms():
         raise ConfigError([tree.problem(("extends",), "extends: an uploaded description extends a shipped arm", path)])
     base_path = path.parent / parent
-    if not base_path.is_file():
-        base_path = shipped_arms().get(parent, base_path)
-    if not base_path.is_file():
+    try:
+        if not base_path.is_file():
+            base_path = shipped_arms().get(parent, base_path)
+        there = base_path.is_file()
+    except (OSError, ValueError) as error:  # a name that no file can have
+        raise ConfigError([tree.problem(("extends",), f"{parent[:40]}...: {error.args[-1]}", path)]) from None
+    if not there:
         raise ConfigError([tree.problem(("extends",), f"no such file: {base_path}", path)])
     base = read_tree(base_path, (*_chain, path))
     merged = _merge(base.value, tree.value)

@@ -53,6 +53,15 @@ def test_it_has_a_place(
     assert words in err
 
 
+def test_a_name_that_no_file_can_have_is_a_mistake(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "arm.yaml").write_text(f"format: ident-arm\nextends: {'y' * 5000}\n")
+    assert main(["config", "check", str(folder / "arm.yaml")]) == 2
+    assert "arm.yaml:2:1: yyyy" in capsys.readouterr().err
+    for words in (["config", "check"], ["new"], ["base"]):
+        assert main([*words, "z" * 5000]) == 2
+        assert "this name is too long for a file" in capsys.readouterr().err
+
+
 def test_without_a_mistake_it_is_good(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "arm.yaml").write_text(ARM)
     assert main(["config", "check", str(folder / "arm.yaml")]) == 0, capsys.readouterr().err
