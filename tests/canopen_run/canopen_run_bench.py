@@ -16,14 +16,31 @@ from typing import Any, Self
 import yaml
 
 from ident_service.cli import main
+from ident_service.service.arm_state import fault_file
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 PATIENCE = 60.0  # s of the machine's time; nothing is judged by it but what never happens
 TRIES = 5
 MOTION = {"kind": "seeded", "seed": 1, "base_frequency": 0.2, "harmonics": 5, "periods": 2}
 TORQUE_NOISE = [0.05, 0.02]
-# What a machine that stalls does to an arm in real time; a run that ended so is run again.
-STALLS = ("bus_silent", "clock_jump", "drive_watchdog", "feedback_gone", "late", "repeated_warnings", "lease_lost")
+# What a machine that stalls does to an arm in real time; a run that ended so is run again. 8250h is the emergency of a
+# drive whose torque frame is overdue, which may be heard before its watchdog's status.
+STALLS = (
+    "bus_silent",
+    "clock_jump",
+    "drive_watchdog",
+    "feedback_gone",
+    "late",
+    "repeated_warnings",
+    "lease_lost",
+    "8250h",
+)
+
+
+def acknowledge(arm: Path, name: str, state: Path) -> None:
+    """Acknowledge whatever is latched."""
+    for code in fault_file(state, name).latched():
+        assert main(["ack", str(arm), code, "--state", str(state)]) == 0
 
 
 def described(name: str, rate: float, kp: float, kd: float) -> dict[str, Any]:

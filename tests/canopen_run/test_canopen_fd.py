@@ -12,7 +12,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from canopen_run_bench import MOTION, STALLS, TRIES, Said, canopen, channel, checked, described, emulated, write
+from canopen_run_bench import (
+    MOTION,
+    STALLS,
+    TRIES,
+    Said,
+    acknowledge,
+    canopen,
+    channel,
+    checked,
+    described,
+    emulated,
+    write,
+)
 
 from drivers.canopen.bits import unstuffed
 from drivers.canopen.frame import Frame
@@ -149,6 +161,5 @@ def test_a_run_over_a_paced_wire_between_two_processes(tmp_path: Path) -> None:
                 if run.code() == 0:
                     return
         assert any(word in run.text for word in STALLS), run.text
-        for code in [word for word in STALLS if word in run.text]:
-            main(["ack", str(path), code, "--state", str(state)])
+        acknowledge(path, "wired", state)
     raise AssertionError("the machine stalls all the time")
