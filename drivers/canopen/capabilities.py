@@ -1,4 +1,4 @@
-"""What a drive can, held against what this driver needs: asked by SDO uploads, or foretold by its data sheet.
+"""Judge what a drive can against what this driver needs: asked by SDO uploads, or foretold by its data sheet.
 
 A drive's answer counts before its family (`profiles/`), the family before the file. What is indispensable and missing
 is a problem, with the object and the reason; what is optional and missing is told with what happens instead. Of what
@@ -68,7 +68,7 @@ _OTHERS: Sequence[Entry] = (
 
 @dataclass(frozen=True)
 class Found:
-    """What is known of a drive's entries.
+    """Hold what is known of a drive's entries.
 
     Attributes:
         there: keys (index << 8 | sub-index) of entries that it has.
@@ -83,11 +83,11 @@ class Found:
     asked: bool = True
 
     def has(self, entry: Entry) -> bool:
-        """Whether the drive has an entry."""
+        """Tell whether the drive has an entry."""
         return entry.key in self.there
 
     def get(self, entry: Entry) -> int | None:
-        """What an entry holds; None where that is not known."""
+        """Return what an entry holds; None where that is not known."""
         return self.values.get(entry.key)
 
     @property
@@ -99,7 +99,7 @@ class Found:
 
 @dataclass(frozen=True)
 class Problem:
-    """What is indispensable and missing: the object's index [h], and why it is needed, in words."""
+    """Name what is indispensable and missing: the object's index [h], and why it is needed, in words."""
 
     where: str
     why: str
@@ -110,7 +110,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class Capabilities:
-    """What one drive can, and what of it is taken.
+    """Hold what one drive can, and what of it is taken.
 
     Attributes:
         family: that it belongs to.

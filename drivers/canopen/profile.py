@@ -120,12 +120,12 @@ class Pdo:
 
     @property
     def on(self) -> Write:
-        """What makes it exist."""
+        """Return the write that makes the PDO valid."""
         return Write(self._entry(0), self.cob_id | (_NO_REMOTE if self.sent else 0), _NO_REMOTE)
 
     @property
     def off(self) -> Write:
-        """What ends it."""
+        """Return the write that makes the PDO invalid."""
         return Write(self._entry(0), self.on.value | _NOT_VALID, _NO_REMOTE)
 
     @property
@@ -241,7 +241,7 @@ class BusProfile:
         ]
 
     def identifiers(self, node: int) -> list[Write]:
-        """What SYNC and emergencies are; where a drive lacks an entry, it is so by CiA 301."""
+        """Return the COB-IDs of SYNC and emergencies; where a drive lacks an entry, it is so by CiA 301."""
         return [
             Write(od.SYNC_COB_ID, SYNC, _NO_REMOTE),
             Write(od.EMERGENCY_COB_ID, EMERGENCY + node, _NO_REMOTE),

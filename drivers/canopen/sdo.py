@@ -73,7 +73,7 @@ class Objects:
 
     @property
     def clock(self) -> Clock:
-        """Of the link."""
+        """Return the clock of the link."""
         return self._link.clock
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
@@ -112,7 +112,7 @@ class Objects:
         self._asked(what, self._client.download, entry.index, entry.sub, write.data)
 
     def holds(self, write: Write) -> bool:
-        """Whether an entry holds a value already; one that only can be written is taken not to. Raises as `read`."""
+        """Tell whether an entry holds a value already; one that can only be written does not. Raises as `read`."""
         try:
             return write.same(self.read(write.entry))
         except SdoRefused as refused:
@@ -126,7 +126,7 @@ class Objects:
             self.set(write)
 
     def ensure_if_there(self, write: Write) -> None:
-        """As `ensure`, but nothing where the drive has no such entry."""
+        """Do what `ensure` does, and nothing where the drive has no such entry."""
         if optional(self.holds, write) is False:
             self.set(write)
 

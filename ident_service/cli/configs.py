@@ -36,7 +36,7 @@ def _new(arguments: argparse.Namespace) -> Answer:
     words = (arguments.urdf, arguments.out, arguments.name, arguments.base, arguments.tip)
     path, guessed = new_description(*words, tell)
     lines = [f"{path}: a first description, and a simulated arm to try it with"]
-    lines += ["guessed:", *(f"  {line}" for line in guessed)] if guessed else []
+    lines += ["guessed or chosen:", *(f"  {line}" for line in guessed)] if guessed else []
     lines += ["next:", f"  ident config check {path}", f"  ident simulate {path}"]
     return DONE, "\n".join(lines), {"description": str(path), "guessed": list(guessed)}
 

@@ -2,7 +2,7 @@
 
 Motion tells base parameters only, and many bodies move alike. Who looks at link values expects those of the arm: of all
 bodies behind the same base parameters the nearest to these is chosen (`estimation/feasible/central.py`). They are no
-knowledge: they change no base parameter and no verdict.
+knowledge: they change no base parameter by more than a hundredth of its deviation.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ class Draft:
     Attributes:
         name: of the arm.
         urdf: name of the file beside the description.
-        part: `base`, `tip` and `lock` of its kinematics.
+        part: the keys of its kinematics.
         joints: keys of each joint.
         geometry: capsules of links whose meshes are replaced.
         may_touch: pairs that always touch.
@@ -56,7 +56,8 @@ def in_yaml(draft: Draft) -> str:
     guessed = "\n".join(f"#   {line}" for line in draft.remarks)
     head = f"""\
 # {draft.name}, begun by `ident new` from {draft.urdf}. Look through it before a real arm moves by it.
-{"# Guessed, as the URDF says nothing of it:" + chr(10) + guessed if guessed else "# Limits and bodies are the URDF's."}
+# Guessed or chosen:
+{guessed}
 format: ident-arm
 version: 1
 name: {_flow(draft.name)}
@@ -75,7 +76,9 @@ terms: [drive_inertia, viscous, coulomb, offset]
         rows = "".join(f"  {_flow(name)}:\n    {_flow(keys)}\n" for name, keys in draft.joints.items())
         parts.append(f"{units}\njoints:\n{rows}")
     if draft.prior:
-        parts.append(f"prior: # guessed from lengths; SI units, in the link frames\n  {_flow(draft.prior)}\n")
+        parts.append(
+            f"prior: # SI units, in the link frames; whose are guessed is said above\n  {_flow(draft.prior)}\n"
+        )
     if draft.total_mass:
         parts.append(f"constraints: {{total_mass: {{upper: {draft.total_mass:g}}}}} # kg, twice what its links have\n")
     parts.append(f"control: {{rate: {RATE:g}}} # Hz\n")

@@ -3,7 +3,7 @@
 What the URDF says is taken over; what it lacks is guessed as a careful person would, and said to be a guess in a
 comment. The simulated arm is another one than the prior: its links, drives and friction are drawn about it, so that
 identifying it shows what identification does. Before anything is written, the description is loaded, home and both
-motions are found clear, and the gains stable.
+motions are found clear; gains that are not stable are said to be.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from ident_service.service.draft import CLEARANCE, LARGEST_USE, RATE, Draft, in_
 from ident_service.service.urdf_says import Said, arm_part, said_of
 
 _MOST_TURNS = 8.0 * np.pi  # rad, from which a range is degrees
-_TURN, _SLIDE = np.pi, 0.5  # rad and m either way, of joints without limits
+_TURN, _SLIDE = 3.14, 0.5  # rad and m either way, of joints without limits
 _VELOCITY = {True: 2.0, False: 0.3}  # rad/s, m/s
 _SECONDS = 0.25  # in which a joint reaches its velocity, at most acceleration
 _FOLLOWS = {True: 0.2, False: 0.05}  # rad, m
@@ -50,10 +50,8 @@ _FRICTION = 0.03  # of the torque limit, Coulomb, and viscous at the velocity li
 _DRIVE = 0.02  # s in which a geared drive alone would reach its velocity limit with its torque limit
 _RATE_SHARE = 0.15  # of the torque rate that the guard lets through, that a motion's jerk may ask for
 _POSTURES, _SEED = 300, 20140101
-_USES, _SEEDS = (
-    (LARGEST_USE, 0.4, 0.25, 0.15, 0.08),
-    range(1, 9),
-)  # shares of the limits and seeds of motions that are tried
+_USES = (LARGEST_USE, 0.4, 0.25, 0.15, 0.08)  # shares of the limits that motions are tried with
+_SEEDS = range(1, 9)
 _GLANCES, _GLANCE = 200, 1.3  # postures of a motion that are looked at first, and clearances they must have
 # Share of postures from which links that touch are no collision, by the joints between them: capsules of links around a
 # shoulder or a wrist reach into each other.
@@ -191,11 +189,12 @@ def _joints(draft: Draft, model: ArmModel, said: Mapping[str, Said]) -> None:
         if missing:
             draft.remarks.append(f"{name}: {', '.join(missing)} limit guessed; the URDF has none that could be meant")
         draft.joints[name] = {
-            "position": [short(value) for value in ranges[k]],
-            "velocity": short(velocity),
+            # What the URDF says to the digit: a limit that is rounded may be wider than the arm's.
+            "position": list(ranges[k]),
+            "velocity": velocity,
             "acceleration": short(acceleration),
             "jerk": short(jerk),
-            "torque": short(torque),
+            "torque": torque if one.effort else short(torque),
             "following_error": _FOLLOWS[turns],
             "home": short(min(max(0.0, ranges[k][0]), ranges[k][1])),
             "kp": _GAINS[0][0],
@@ -232,7 +231,10 @@ def _bodies(draft: Draft, loaded: Callable[[], ArmModel], folder: Path) -> None:
     for owner, found in capsules.items():
         draft.geometry[owner] = [one.model_dump(by_alias=True, mode="json") for one in found]
     if unread:
-        draft.remarks.append(f"geometry: no mesh of {', '.join(unread)} could be read; capsules are guessed")
+        draft.remarks.append(
+            f"geometry: a mesh of {', '.join(unread)} could not be read; capsules are guessed where none of a link was,"
+            " and the base has none then"
+        )
     model = loaded()
     inner = (BASE, *chain.names)
     for (moving, other), share in share_touching(model, 2.0 * CLEARANCE, _POSTURES, _SEED).items():
@@ -266,13 +268,14 @@ def _home(draft: Draft, loaded: Callable[[], ArmModel]) -> ArmModel:
         roomy = free >= min(3.0 * CLEARANCE, float(free.max()))
         place = int(np.argmin(np.where(roomy, held, np.inf)))
     if not (free[place] > CLEARANCE and held[place] <= 1.0 / _HEAVY):
-        pair = collision.pairs[int(np.argmin(distances[place]))] if len(collision.pairs) else "gravity"
+        clear = free[place] > CLEARANCE
+        pair = "torque limits" if clear else collision.pairs[int(np.argmin(distances[place]))]
         raise MotionRefused(
             f"{draft.name}: none of {len(postures)} postures is clear and can be held ({pair}); is the URDF in metres"
             " and radians, and does its root stand on the ground?"
         )
     for name, value in zip(draft.joints, postures[place], strict=True):
-        draft.joints[name]["home"] = round(float(value), 2)
+        draft.joints[name]["home"] = short(float(value), 3)
     return loaded()
 
 

@@ -134,7 +134,7 @@ def open_for(
     torque = torque or model.config.identification.torque
     whole = open_recording(file, model.chain.names, fmt=form, transmission=gears, torque=torque)
     recording: Recording = KeptRecording(whole)
-    if isinstance(whole, McapRecording | MeasuredRecording) and (ended := _ended(file, recording)) is not None:
+    if isinstance(whole, McapRecording | MeasuredRecording) and (ended := _ended(whole, recording)) is not None:
         # A range that a person asks for beyond this end is empty, and the error says so.
         recording = RangeRecording(recording, 0.0, ended)
         recording.ended = ended
@@ -147,12 +147,12 @@ def open_for(
     return recording
 
 
-def _ended(file: Path, recording: Recording) -> float | None:
+def _ended(whole: McapRecording | MeasuredRecording, recording: Recording) -> float | None:
     """Say when a stop or a fault ended the motion of a recording of ours [s after its first sample]; None if neither.
 
     From then on brakes or the drives themselves hold the arm, and the recorded torque is not what acts on it.
     """
-    log = McapRecording(file)
+    log = whole if isinstance(whole, McapRecording) else McapRecording(whole.path)
     if not log.own:
         return None
     ends = (event.stamp_ns for event in log.read_extras().events if event.name == "ident" and event.message in _ENDS)

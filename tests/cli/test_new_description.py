@@ -14,6 +14,7 @@ from model.test_locked_joints import PANDA, joint, link
 
 from ident_service.cli import main
 from ident_service.config.load import load_arm
+from ident_service.config.schema import ArmConfig
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import arm_model
@@ -93,6 +94,52 @@ def test_meshes_become_capsules_around_them(tmp_path: Path) -> None:
         # The scale makes it 0.12 m either way along x, about 0.15 m.
         assert sorted((capsule.start[0], capsule.end[0])) == pytest.approx([0.03, 0.27], abs=0.002)
         assert capsule.radius == pytest.approx(np.hypot(0.03, 0.02), abs=0.002)
+
+
+BOUNDS = 'lower="-2.9" upper="2.9"'
+
+
+def described(tmp_path: Path, urdf: str, capsys: pytest.CaptureFixture[str]) -> tuple[ArmConfig, str]:
+    """What `ident new` makes of a URDF, and what it says was guessed."""
+    (tmp_path / "bars.urdf").write_text(urdf)
+    capsys.readouterr()
+    assert main(["new", str(tmp_path / "bars.urdf"), "--out", str(tmp_path / "bars.yaml"), "--json"]) == 0
+    return load_arm(tmp_path / "bars.yaml"), "\n".join(json.loads(capsys.readouterr().out)["guessed"])
+
+
+@pytest.mark.slow
+def test_limits_are_the_files_to_the_digit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config, said = described(tmp_path, BARS.replace(BOUNDS, 'lower="-2.90004" upper="2.89996"'), capsys)
+    assert all(one.position == (-2.90004, 2.89996) for one in config.joints.values())
+    # The two meshes are not there.
+    assert "a mesh of elbow, shoulder could not be read" in said
+    assert config.constraints.total_mass.upper == pytest.approx(6.0)
+
+
+@pytest.mark.slow
+def test_a_bad_body_is_named_and_the_good_one_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config, said = described(tmp_path, BARS.replace('<mass value="1.0"/>', '<mass value="0"/>'), capsys)
+    assert "bodies of elbow: rods" in said
+    prior = arm_model(config).prior
+    assert prior is not None
+    assert prior[arm_model(config).layout.inertial(0)][-1] == pytest.approx(2.0)
+    assert prior[arm_model(config).layout.inertial(1)][-1] > 0.0
+
+
+@pytest.mark.slow
+def test_rounded_angles_are_taken_for_exact(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rounded = BARS.replace('xyz="0.4 0 0" rpy="0 0 0"', 'xyz="0.4 0 0" rpy="1.5708 0 0"')
+    assert rounded != BARS
+    config, said = described(tmp_path, rounded, capsys)
+    assert config.kinematics.snap == ("rounded multiples" in said)
+    assert config.kinematics.snap
+
+
+def test_degrees_in_limits_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "bars.urdf").write_text(BARS.replace(BOUNDS, 'lower="-115" upper="115"'))
+    assert main(["new", str(tmp_path / "bars.urdf"), "--out", str(tmp_path / "bars.yaml")]) == 1
+    assert "shoulder turns from -115 to 115 rad: limits of a URDF are radians" in capsys.readouterr().err
+    assert not (tmp_path / "bars.yaml").exists()
 
 
 def test_what_is_there_is_not_written_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -205,7 +205,7 @@ class Session:
         """Judge a cycle in which drives miss something on purpose, and work out the torque that follows.
 
         What drives say of themselves is what is being tried, and is not judged here; neither are joints whose drives
-        have given up torque, but for their limits. Every other joint is held and guarded as before.
+        have given up torque, but for their position limits. Every other joint is held and guarded as before.
 
         Args:
             sample: of this cycle.
