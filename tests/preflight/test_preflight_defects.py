@@ -12,6 +12,7 @@ from flight_bench import FOREVER, TRUTH, Flight, FlightArm, check_of, joint_chan
 
 from drivers.arm import Sample, Watchdog
 from drivers.clock import VirtualClock
+from drivers.status import AxisStatus
 from ident_service.config.load import load_arm
 from ident_service.errors import ArmFault, DriverError
 from ident_service.model.arm_model import arm_model
@@ -416,6 +417,15 @@ def test_an_arm_that_goes_astray_while_drives_miss_a_heartbeat_is_let_go_at_once
     assert reason.endswith("the arm was let go")
     assert arm.silent_from is not None
     assert len(arm.torques) - arm.silent_from < 5
+
+
+def test_an_emergency_stop_ends_the_proof_at_once() -> None:
+    flight, arm = beating(0.0)
+    pressed = AxisStatus.POWERED | AxisStatus.EMERGENCY_STOP
+    arm.bent = lambda sample: replace(sample, status=(pressed, *sample.status[1:]))
+    assert "shoulder reports an emergency stop" in only_failure(flight.ticket(), "watchdog").reason
+    assert arm.silent_from is not None
+    assert len(arm.torques) - arm.silent_from < 3
 
 
 def test_an_interruption_leaves_the_arm_without_torque() -> None:

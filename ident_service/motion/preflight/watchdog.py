@@ -133,6 +133,8 @@ def watchdog_check(
                             return failed(CODE, "the drives do not report that they have power", REMEDY)
                 silent = (sample.stamp_ns - begin_ns) * 1e-9
                 for number, word in enumerate(status):
+                    if word & AxisStatus.EMERGENCY_STOP:
+                        strange.append(f"{dogs[number].drive} reports an emergency stop")
                     if number in gave_up or word & AxisStatus.POWERED:
                         continue
                     gave_up[number] = silent, word
@@ -162,7 +164,7 @@ def watchdog_check(
         found.append(measure(what, seconds, "s", joint=dog.drive, most=_most(dog, period, told)))
         # A host that is gone may be a fault to a drive; any other fault is no watchdog.
         fault = bool(word & AxisStatus.FAULT and not word & AxisStatus.WATCHDOG)
-        if fault or word & AxisStatus.EMERGENCY_STOP:
+        if fault:
             strange.append(f"{dog.drive} gave up for another reason ({word!r})")
     if moving is not None and travel is not None:
         unit = "rad" if model.chain.revolute[moving] else "m"
