@@ -196,7 +196,7 @@ def _joints(draft: Draft, model: ArmModel, said: Mapping[str, Said]) -> None:
             "jerk": short(jerk),
             "torque": torque if one.effort else short(torque),
             "following_error": _FOLLOWS[turns],
-            "home": short(min(max(0.0, ranges[k][0]), ranges[k][1])),
+            "home": min(max(0.0, ranges[k][0]), ranges[k][1]),
             "kp": _GAINS[0][0],
             "kd": _GAINS[0][1],
             "drive_inertia": short(drive, 3),

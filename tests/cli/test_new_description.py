@@ -107,10 +107,18 @@ def described(tmp_path: Path, urdf: str, capsys: pytest.CaptureFixture[str]) -> 
     return load_arm(tmp_path / "bars.yaml"), "\n".join(json.loads(capsys.readouterr().out)["guessed"])
 
 
+def described_anew(tmp_path: Path, urdf: str, capsys: pytest.CaptureFixture[str]) -> tuple[ArmConfig, str]:
+    """The same in a folder of its own."""
+    (tmp_path / "anew").mkdir()
+    return described(tmp_path / "anew", urdf, capsys)
+
+
 @pytest.mark.slow
 def test_limits_are_the_files_to_the_digit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config, said = described(tmp_path, BARS.replace(BOUNDS, 'lower="-2.90004" upper="2.89996"'), capsys)
     assert all(one.position == (-2.90004, 2.89996) for one in config.joints.values())
+    beyond_zero, _ = described_anew(tmp_path, BARS.replace(BOUNDS, 'lower="0.331613" upper="5.95157"'), capsys)
+    assert all(one.position == (0.331613, 5.95157) for one in beyond_zero.joints.values())
     # The two meshes are not there.
     assert "a mesh of elbow, shoulder could not be read" in said
     assert config.constraints.total_mass.upper == pytest.approx(6.0)
