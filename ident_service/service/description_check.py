@@ -21,6 +21,8 @@ from ident_service.motion.after_stop import AfterStop, after_stop
 from ident_service.motion.preflight.stability import StabilityReport, delay_of, stability
 from ident_service.service.bus import bus_lines, require_budget
 
+_NAMED = re.compile(r"kinematics\.(\w+): ")  # the key that a complaint about a mechanism begins with
+
 
 @dataclass(frozen=True)
 class CheckedDescription:
@@ -61,7 +63,7 @@ def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescri
     try:
         model = arm_model(config)
     except (ModelError, ParameterError) as error:
-        raise mistake(arm, _place(str(error)), str(error)) from None
+        raise mistake(arm, _place(str(error)), _NAMED.sub("", str(error), count=1)) from None
     for where in (("driver", "truth"), ("driver", "emulation", "truth")):
         _require_names(arm, model, where)
     budget = require_budget(arm, model.config)
@@ -79,7 +81,7 @@ def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescri
 
 def _place(message: str) -> tuple[str, ...]:
     """The keys that a model's complaint is about."""
-    if named := re.search(r"kinematics\.(\w+)", message):
+    if named := _NAMED.search(message):
         return ("kinematics", named.group(1))
     about = {"joints are configured as": "joints", "columns": "recording", "parameters this arm does not have": "prior"}
     return (next((key for words, key in about.items() if words in message), "kinematics"),)
