@@ -193,7 +193,10 @@ class Connection:
         raise AssertionError("the second try ends the loop")
 
     def _unreachable(self, error: Exception) -> ArmError:
-        return ArmError(f"{self.url}: cannot be reached: {error or type(error).__name__}")
+        # httpx has no class of its own for this.
+        unknown = "CERTIFICATE_VERIFY_FAILED" in str(error)
+        hint = "; SSL_CERT_FILE=FILE.pem names the authority that signed the daemon's certificate" if unknown else ""
+        return ArmError(f"{self.url}: cannot be reached: {error or type(error).__name__}{hint}")
 
     def _document(self, status: int, content: bytes) -> Any:
         try:

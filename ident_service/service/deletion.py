@@ -54,7 +54,7 @@ def delete_run(db: Database, state: Path, run: str, who: str, *, anyway: bool = 
     found = _of_run(db, row)
     _require_idle(db, f"the run {run}", _jobs_about(db, row["arm"], run))
     _require_none(f"the run {run}", found, anyway=anyway)
-    _delete_run(db, state, row, who)
+    forget_run(db, state, run, who)
     return found
 
 
@@ -102,13 +102,15 @@ def delete_arm(db: Database, state: Path, arm: str, who: str, *, anyway: bool = 
         except DriverError as error:
             raise InUse(f"the arm {arm} is being moved: {error}") from None
         for one in runs:
-            _delete_run(db, state, one, who)
+            forget_run(db, state, one["id"], who)
         for one in motions:
             _delete_motion(db, state, one, who)
-        gone = [_hide(arm_folder(state, arm))]
         place, own = state / DESCRIPTIONS, re.compile(re.escape(arm) + r"-[0-9a-f]{16}")
         with db.transaction():
+            if db.row("SELECT id FROM runs WHERE arm = ?", arm):
+                raise InUse(f"a run of the arm {arm} came meanwhile; delete the arm again")
             # In here, so that whoever adds the arm again finds its description, or does not.
+            gone = [_hide(arm_folder(state, arm))]
             gone += [_hide(path) for path in (place.iterdir() if place.is_dir() else ()) if own.fullmatch(path.name)]
             for table in ("schedules", "dues", "alarms", "acceptances", "reidentifications", "maintenance_events"):
                 db.write(f"DELETE FROM {table} WHERE arm = ?", arm)  # noqa: S608 - ours
@@ -185,8 +187,10 @@ def _require_none(what: str, found: list[Dependent], *, anyway: bool) -> None:
         )
 
 
-def _delete_run(db: Database, state: Path, row: Row, who: str) -> None:
-    run, gone = row["id"], _hide(state / RUNS / row["id"])
+def forget_run(db: Database, state: Path, run: str, who: str) -> None:
+    """Delete a run whatever refers to it: its folder first, then its row; raises UnknownId."""
+    row = known_run(db, run)
+    gone = _hide(state / RUNS / run)
     with db.transaction():
         # The hours that the arm has been driven are not forgotten.
         db.write("UPDATE schedules SET counted = counted - ? WHERE arm = ?", row["seconds"] or 0.0, row["arm"])

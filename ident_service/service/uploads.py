@@ -31,6 +31,7 @@ from typing import Final, Self
 from ident_service.errors import AlreadyThere, RecordingError, UnknownId, UsageError
 from ident_service.results.files import appearing_folder, write_atomically
 from ident_service.results.manifest import named_files, write_manifest
+from ident_service.service.deletion import forget_run
 from ident_service.service.registry.arms import known_arm
 from ident_service.service.registry.audit import note
 from ident_service.service.registry.database import Database
@@ -248,7 +249,13 @@ def complete_upload(db: Database, state: Path, upload: str, who: str) -> Upload:
                 raise RecordingError(announced.name, "arrived with another hash than was announced; send it again")
         shutil.rmtree(folder, ignore_errors=True)
     index_run(db, state, run)
-    note(db, who, "recording uploaded", run, arm=arm.name, name=announced.name, sha256=announced.sha256)
+    try:
+        with db.transaction():
+            known_arm(db, state, announced.arm)
+            note(db, who, "recording uploaded", run, arm=arm.name, name=announced.name, sha256=announced.sha256)
+    except UnknownId:  # somebody deleted the arm while all of the recording was read
+        forget_run(db, state, run, who)
+        raise
     return Upload(upload, announced, announced.bytes, run)
 
 

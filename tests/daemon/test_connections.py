@@ -19,6 +19,8 @@ from daemon.conftest import Asked, serving
 from daemon.served import daemon_process
 
 from benchmarks import stops
+from ident_service.client import IdentClient
+from ident_service.errors import ArmError
 from ident_service.service.api import connections
 from ident_service.service.api.connections import BODY_SECONDS, HEADER_SECONDS, Connection, Connections
 from ident_service.service.api.logs import AsideHandler, JsonLines, NotTooOften
@@ -211,8 +213,11 @@ def test_handshakes_that_do_not_go_on_have_a_time_too(state: Path, tmp_path: Pat
             assert silent.recv(100) == b""
             silent.close()
             assert client.post("/api/v1/stop") == {"arms": [], "jobs": []}
+            del os.environ["SSL_CERT_FILE"]
+            with pytest.raises(ArmError, match=r"SSL_CERT_FILE=FILE\.pem"), IdentClient(client.url, "none") as stranger:
+                stranger.arms()
     finally:
-        del os.environ["SSL_CERT_FILE"]
+        os.environ.pop("SSL_CERT_FILE", None)
 
 
 def test_a_log_that_nobody_reads_keeps_nobody() -> None:

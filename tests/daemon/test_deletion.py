@@ -13,6 +13,7 @@ from daemon.conftest import Asked, quick_text, serving
 from ident_service.cli import main
 from ident_service.config.load import load_arm
 from ident_service.motion.control_file import ControlFile
+from ident_service.service import deletion
 from ident_service.service.acceptance import accept
 from ident_service.service.arm_state import control_path, fault_file
 from ident_service.service.maintenance.schedules import When, add_schedule, known_schedule
@@ -22,7 +23,7 @@ from ident_service.service.registry.audit import trail
 from ident_service.service.registry.database import Database
 from ident_service.service.registry.runs import index_run, operating_seconds
 
-FIRST, SECOND = "20260101T000000Z-quick", "20260102T000000Z-quick"
+FIRST, SECOND, THIRD = (f"2026010{day}T000000Z-quick" for day in (1, 2, 3))
 
 
 @pytest.fixture
@@ -137,6 +138,27 @@ def test_an_arm_takes_with_it_what_is_its_own(filled: Asked, commissioned: Path)
     # An arm of that name begins anew.
     assert filled.post("/api/v1/arms", {"description": quick_text()}).status_code == 201
     assert filled.get("/api/v1/arms/quick").json()["accepted"] is None
+
+
+def test_a_run_that_comes_while_its_arm_is_deleted_keeps_the_arm(
+    filled: Asked, commissioned: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    db, state = filled.service.db, filled.service.state
+    real = deletion.forget_run
+
+    def while_another_comes(*words: Any) -> None:
+        real(*words)
+        if not (state / "runs" / THIRD).exists():
+            shutil.copytree(commissioned, state / "runs" / THIRD)
+            index_run(db, state, THIRD)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(deletion, "forget_run", while_another_comes)
+        status, answer = delete(filled, "arms/quick?anyway=true")
+    assert (status, "came meanwhile" in answer["error"]["message"]) == (409, True)
+    assert filled.get("/api/v1/arms/quick").status_code == 200
+    assert [run["id"] for run in filled.get("/api/v1/runs").json()] == [THIRD]
+    assert delete(filled, "arms/quick?anyway=true")[0] == 200
 
 
 def test_shipped_arms_stay(filled: Asked) -> None:

@@ -110,6 +110,22 @@ def test_a_disk_that_is_full_at_the_end_costs_the_upload_and_no_more(
     assert daemon.post(f"/api/v1/uploads/{upload}/complete").status_code == 201
 
 
+def test_a_recording_whose_arm_is_deleted_meanwhile_is_no_run(daemon: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert daemon.post("/api/v1/arms", {"description": quick_text()}).status_code == 201
+    upload = daemon.post("/api/v1/uploads", announced(b"mine", arm="quick")).json()["id"]
+    sent(daemon, upload, 0, b"mine")
+    whole = uploads.write_manifest
+
+    def while_the_arm_goes(folder: Path) -> None:
+        whole(folder)
+        assert daemon.ask("DELETE", "/api/v1/arms/quick").status_code == 200
+
+    monkeypatch.setattr(uploads, "write_manifest", while_the_arm_goes)
+    assert daemon.post(f"/api/v1/uploads/{upload}/complete").status_code == 404
+    assert daemon.get("/api/v1/runs").json() == []
+    assert list((daemon.service.state / "runs").iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ("changes", "status", "said"),
     [
