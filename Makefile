@@ -9,7 +9,7 @@ READY  := $(VENV)/.ready
 # Set, it has each of a thousand child processes of the tests compile the whole package anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test unit coverage lint types bench bench-design bench-canopen bench-serve bench-stops bench-viewers bench-peers campaign \
+.PHONY: demo test unit coverage collected lint types bench bench-design bench-canopen bench-serve bench-stops bench-viewers bench-peers campaign \
 	mutants test-socketcan test-foreign test-latest lock clean
 
 demo: $(READY)
@@ -17,9 +17,10 @@ demo: $(READY)
 	$(BIN)/ident simulate
 
 # What a machine lacks (README: system packages) is skipped with its reason; with CI=true it fails.
-test: lint types coverage
+test: $(READY)
+	$(MAKE) --jobs 4 --output-sync lint types coverage collected
 	$(TESTS) -m "not campaign and not realtime" $(GUARD_TESTS:%=--ignore=%)
-	$(BIN)/pytest -m "realtime and not campaign" $$(grep -rl "mark.realtime" tests --include "test_*.py")
+	$(BIN)/pytest -n 2 --dist loadfile -m "realtime and not campaign" $$(grep -rl "mark.realtime" tests --include "test_*.py")
 
 # Three workers for two cores: tests that talk to processes of their own also wait.
 TESTS := $(BIN)/pytest -n 3 --dist worksteal
@@ -33,6 +34,10 @@ GUARD_TESTS := $(addprefix tests/motion/test_motion_, guard.py guard_table.py ow
 coverage: $(READY)
 	$(TESTS) -m "not campaign" --cov-branch --cov-report=term-missing --cov-fail-under=100 \
 		$(GUARDED:%=--cov=ident_service.motion.%) $(GUARD_TESTS)
+
+# Beside the type checker, on the other core: else each worker of the tests compiles all of them at once.
+collected: $(READY)
+	$(BIN)/pytest --collect-only --quiet --quiet --no-summary >/dev/null
 
 lint: $(READY)
 	$(BIN)/ruff check .
@@ -95,7 +100,8 @@ lock: $(READY)
 		--output-file constraints.txt pyproject.toml
 
 # pip 25.3 is the first that holds build requirements to a lock.
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+# Without --no-compile, most of the time goes to modules that nothing here imports.
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
 $(READY): pyproject.toml $(LOCK)
 	@echo "making $(VENV) with $$($(PYTHON) -V): one to three minutes"
 	$(PYTHON) -m venv --clear $(VENV)

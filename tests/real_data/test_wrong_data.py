@@ -21,8 +21,8 @@ from ident_service.config.load import load_arm
 from ident_service.config.quantities import TextFile
 from ident_service.config.schema import ArmConfig, Identification
 from ident_service.errors import ConfigError, ModelError
-from ident_service.estimation.identify import identify
-from ident_service.model.arm_model import arm_model
+from ident_service.estimation.identify import Estimate, identify
+from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.record.open import open_recording
 from ident_service.record.recording import Block, Recording
 from ident_service.service.identification import unusable_because
@@ -70,15 +70,23 @@ def kuka(**changes: Any) -> ArmConfig:
     return load_arm("kuka_lwr4").model_copy(update={"identification": Identification(), **changes})
 
 
-def judged(change: Change, config: ArmConfig | None = None) -> tuple[str, ...]:
-    """Identify from the first recording, judge on the second, and give the reasons against using the result."""
-    model = arm_model(config or kuka())
-    recordings = [
+def changed(change: Change, model: ArmModel) -> list[Changed]:
+    """Return the recording to fit and the one to judge on."""
+    return [
         Changed(open_recording(DATA / KUKA.folder / str(name), model.chain.names, fmt=model.config.recording), change)
         for name in (KUKA.fitted, KUKA.judged)
     ]
-    estimate = identify(model, recordings[:1], recordings[1:])
-    return unusable_because(estimate, [(one, recording_quality(one, model)) for one in recordings])
+
+
+def judged(change: Change, config: ArmConfig | None = None) -> tuple[str, ...]:
+    """Identify from the first recording, judge on the second, and give the reasons against using the result."""
+    model = arm_model(config or kuka())
+    recordings = changed(change, model)
+    return objections(identify(model, recordings[:1], recordings[1:]), recordings)
+
+
+def objections(estimate: Estimate, recordings: list[Changed]) -> tuple[str, ...]:
+    return unusable_because(estimate, [(one, recording_quality(one, estimate.model)) for one in recordings])
 
 
 def nothing(position: np.ndarray, torque: np.ndarray) -> None:
@@ -132,13 +140,16 @@ def test_wrong_columns(change: Change, words: str) -> None:
 
 @pytest.mark.slow
 def test_a_spike_and_wrong_units_of_an_arm_without_limits() -> None:
-    bare = kuka(joints={})
-    (first, *_) = judged(spike, bare)
-    assert "lwr_3_joint jumps by 0.3" in first
-    (first, *_) = judged(thousandfold, bare)
-    assert "a torque of 3.94e+04 N m would hold" in first
-    (first, *_) = judged(degrees, bare)
-    assert "its torque error is" in first or "are the positions in degrees?" in first
+    bare = arm_model(kuka(joints={}))
+    sound = changed(nothing, bare)
+    estimate = identify(bare, sound[:1], sound[1:])  # so that only the recordings speak
+    assert objections(estimate, sound) == ()
+    (spiked, *_), (large, *_), (turned, *_) = (
+        objections(estimate, changed(one, bare)) for one in (spike, thousandfold, degrees)
+    )
+    assert "lwr_3_joint jumps by 0.3" in spiked
+    assert "a torque of 3.94e+04 N m would hold" in large
+    assert "are the positions in degrees?" in turned
 
 
 @pytest.mark.slow
