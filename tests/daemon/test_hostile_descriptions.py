@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from daemon.conftest import Asked
+from daemon.served import daemon_process
 
 from ident_service.errors import ConfigError
 from ident_service.service.api.checks import MOST_CHECKS
@@ -65,6 +66,20 @@ def test_a_mechanism_that_breaks_parsers_leaves_the_daemon_alive(
         answer = daemon.get("/api/v1/arms/spy/home")
         assert answer.status_code in (400, 422), answer.text
     assert daemon.get("/api/v1/arms").status_code == 200
+
+
+@pytest.mark.slow
+def test_the_daemon_itself_reads_no_urdf_that_is_new(state: Path) -> None:
+    configs = Path(__file__).resolve().parents[2] / "configs"
+    text = (configs / "threelink.yaml").read_text().replace("name: threelink", "name: mine")
+    upload = {"description": text, "files": {"threelink.urdf": (configs / "threelink.urdf").read_text()}}
+    with daemon_process(state) as (process, client):
+        assert client.post("/api/v1/descriptions/check", upload)["arm"] == "mine"
+        assert client.post("/api/v1/arms", upload)["name"] == "mine"
+        assert b"mine" in client.content("/arms/mine")
+        loaded = Path(f"/proc/{process.pid}/maps").read_text()
+    assert "libc" in loaded
+    assert "pinocchio" not in loaded
 
 
 def test_a_description_has_its_own_limit_of_size(daemon: Asked, state: Path) -> None:
