@@ -14,6 +14,7 @@ from drivers.arm import Sample, Watchdog
 from drivers.clock import VirtualClock
 from drivers.status import AxisStatus
 from ident_service.config.load import load_arm
+from ident_service.config.schema import ArmConfig
 from ident_service.errors import ArmFault, DriverError
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.faults import FAULTS
@@ -231,15 +232,34 @@ def test_a_posture_that_cannot_be_held_is_not_tried() -> None:
     untouched(flight)
 
 
-@pytest.mark.parametrize("load", [0.8, 3.0])
+@pytest.mark.parametrize("load", [0.8, 1.5, 3.0, 5.0])
 def test_a_load_that_the_model_does_not_know_shows_in_the_torque_that_holds(load: float) -> None:
     truth = TRUTH | {"m2": 1.0 + load, "lx2": -0.25, "Lyy2": 0.084 + 0.01, "Lzz2": 0.084 + 0.01}
     flight = Flight(changes={"driver": {"kind": "simulated", "truth": truth, "encoder_resolution": 2e-5}})
     ticket = flight.ticket()
     check = only_failure(ticket, "gravity")
+    assert check.reason.startswith("the arm is heavier than described")
     assert "load" in check.remedy
     assert verdicts(ticket)["direction"] is Verdict.SKIPPED
     assert verdicts(ticket)["watchdog"] is Verdict.SKIPPED
+
+
+@pytest.mark.parametrize("share", [0.3, 0.1])
+def test_an_arm_that_is_lighter_than_described_is_told_so(share: float) -> None:
+    truth = TRUTH | {"m1": 2.0 * share, "lx1": -0.5 * share, "m2": share, "lx2": -0.25 * share}
+    flight = Flight(changes={"driver": {"kind": "simulated", "truth": truth, "encoder_resolution": 2e-5}})
+    assert only_failure(flight.ticket(), "gravity").reason.startswith("the arm is lighter than described")
+
+
+def test_a_shipped_arm_with_a_load_in_its_hand_is_heavier_and_has_no_frozen_encoder() -> None:
+    tree = load_arm("planar2").model_dump(mode="json", by_alias=True)
+    truth = tree["driver"]["truth"]
+    truth["values"][truth["names"].index("m2")] = 2.0  # its shoulder sticks on the way down
+    config = ArmConfig.model_validate(tree)
+    ticket = preflight(from_config(config), arm_model(config), None, confirm=lambda _: config.name)
+    reason = only_failure(ticket, "gravity").reason
+    assert reason.startswith("the arm is heavier than described")
+    assert "shoulder sank by 0.00168 rad against 10.6 N m more than the model's" in reason
 
 
 @pytest.mark.parametrize("joint", [0, 1])

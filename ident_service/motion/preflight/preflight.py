@@ -26,6 +26,7 @@ from ident_service.model.threads import one_blas_thread
 from ident_service.motion.attended import attended
 from ident_service.motion.control import ComputedTorque
 from ident_service.motion.outside import admitting, reachable
+from ident_service.motion.preflight import gravity as weight
 from ident_service.motion.preflight.check import ABOUT_THE_MOTION, CODES, Check, Verdict, failed, skipped
 from ident_service.motion.preflight.delay import delay_of
 from ident_service.motion.preflight.direction import (
@@ -38,10 +39,7 @@ from ident_service.motion.preflight.direction import (
     sign_failure,
     strokes,
     went_against,
-    wrong_signs,
 )
-from ident_service.motion.preflight.gravity import HOLD, SETTLE, differences, gravity_check, held_torque, holdable
-from ident_service.motion.preflight.gravity import REMEDY as GRAVITY_REMEDY
 from ident_service.motion.preflight.look import (
     Looked,
     at_rest_check,
@@ -123,7 +121,7 @@ class _Gravity:
 
     def carried_by(self, held: Vector) -> bool:
         """Whether the torque that holds the arm is near enough to the model's; without words, between two cycles."""
-        difference, most = differences(held, self.torque, self.limits, self.friction)
+        difference, most = weight.differences(held, self.torque, self.limits, self.friction)
         return bool((difference <= most).all())
 
 
@@ -237,7 +235,7 @@ class _Preflight:
         self._passed(noise_check(looked, self.described, self.model, limits, session.mass))
         if any(c.verdict is Verdict.FAILED and c.code not in ABOUT_THE_MOTION for c in self.checks.values()):
             return None
-        if (impossible := holdable(session.gravity, self.model, limits)) is not None:
+        if (impossible := weight.holdable(session.gravity, self.model, limits)) is not None:
             self._passed(impossible, of_place=True)
             return None
         agreed = consent(self.model, looked.samples[-1], self.confirm)
@@ -263,10 +261,10 @@ class _Preflight:
         silent: Check | None = None
         try:
             session.energise()
-            held = session.follow(hold(session.home), SETTLE + max(HOLD, self.rate_seconds))
-            if planned and gravity.carried_by(held_torque(held, session.period)):
+            held = session.follow(hold(session.home), weight.SETTLE + max(weight.HOLD, self.rate_seconds))
+            if planned and gravity.carried_by(weight.held_torque(held, session.period)):
                 moved += (follow_stroke(session, one) for one in planned)
-                session.follow(hold(session.home), SETTLE)
+                session.follow(hold(session.home), weight.SETTLE)
                 if try_watchdog:
                     silent = watchdog_check(self.arm, self.model, session, hold(session.home).at)
             if silent is None:
@@ -276,7 +274,7 @@ class _Preflight:
             self._judged(session, gravity, held, planned, moved)
             if not isinstance(error, ArmFault):
                 raise
-            self._faulted(session, error)
+            self._faulted(session, gravity, error)
             raise _Ended from error
         with attended(self.arm):
             self._judged(session, gravity, held, planned, moved)
@@ -308,7 +306,7 @@ class _Preflight:
                 room = admitting(home, motion_limits(self.model.config), 0.0)
                 stroke = strokes(session, self.model, room, only=0)[0]
             session.energise()
-            session.follow(hold(home), SETTLE)
+            session.follow(hold(home), weight.SETTLE)
             half = DWELL + 0.5 * stroke.there.duration
             session.follow(stroke, half)
             moving = watchdog_check(self.arm, self.model, session, lambda time: stroke.at(half + time), stroke.joint)
@@ -331,8 +329,8 @@ class _Preflight:
             rate = loop_rate_check(stamps, session.period, self.arm.clock.lock_step, before)
             if rate is not before:
                 self._passed(rate)
-            torque = held_torque(held, session.period)
-            self._passed(gravity_check(torque, gravity.torque, self.model, gravity.limits, gravity.friction))
+            torque = weight.held_torque(held, session.period)
+            self._passed(weight.gravity_check(torque, gravity.torque, self.model, gravity.limits, gravity.friction))
         if planned and len(moved) == len(planned):
             answers = [
                 answer(trace_of(rows, session.period), stroke, session)
@@ -360,22 +358,18 @@ class _Preflight:
 
         return work
 
-    def _faulted(self, session: Session, error: ArmFault) -> None:
+    def _faulted(self, session: Session, gravity: _Gravity, error: ArmFault) -> None:
         """Find out what ended the loop: what the fault says failed, a joint that went the wrong way, or else."""
-        at = "direction" if "gravity" in self.checks else "gravity"
+        if "gravity" not in self.checks:
+            self._passed(weight.not_held(session, self.model, gravity.limits, gravity.friction, error))
+            return
         if (remedy := remedy_of(error)) is not None:
-            self._passed(failed(at, str(error), remedy))
+            self._passed(failed("direction", str(error), remedy))
             return
         trace = session.trace()
         astray = int(np.argmax(np.abs(trace.position[-1] - trace.reference[-1])))
         name = self.model.chain.names[astray]
-        if at == "gravity":
-            if wrong := wrong_signs(trace, session):
-                self._passed(sign_failure(wrong, self.model, str(error)))
-            else:
-                remedy = f"{GRAVITY_REMEDY} Check the signs of encoders and torques too."
-                self._passed(failed("gravity", f"the arm could not be held where it stands: {error}", remedy))
-        elif went_against(trace, astray, session):
+        if went_against(trace, astray, session):
             self._passed(sign_failure([astray], self.model, str(error)))
         else:
             remedy = f"Free {name} if something blocks it or a brake holds it; check its encoder and its signs."
