@@ -83,6 +83,8 @@ class Sample:
             to add to `status`.
         measured_torque: what drives measured until this stamp [N m or N], shape (joints,), NaN where none reported in
             this cycle; None where none ever did.
+        stamp_doubt_ns: how much earlier than `stamp_ns` they may have been sampled [ns], where the computer stalled
+            between the request and its stamp; else 0.
         torque_difference: by how much their last reports are more than what drives were told [N m or N], shape
             (joints,), with what a sound drive may take to follow allowed for; None where nothing is to be compared.
     """
@@ -101,6 +103,7 @@ class Sample:
     drives: tuple[str, ...] = ()
     measured_torque: Vector | None = None
     torque_difference: Vector | None = None
+    stamp_doubt_ns: int = 0
 
 
 @dataclass(frozen=True)

@@ -371,6 +371,7 @@ class CanopenArm(Arm):
             tuple(self._reports.new(buses.codecs, self._cycle, self.clock.now_ns())),
             measured_torque=self._measured.torque,
             torque_difference=self._measured.difference if self._enabled else None,
+            stamp_doubt_ns=buses.stamp_doubt_ns,
         )
 
     def _statuses(self, drives: Sequence[Drive]) -> tuple[int, ...]:

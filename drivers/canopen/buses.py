@@ -33,6 +33,8 @@ LISTEN = 0.12  # s before we send anything; another host's heartbeat comes withi
 AWAKE = 2.0  # s within which every drive must answer
 LEAST = 0.5  # of a period, from SYNC on, that positions are waited for in any case
 SETTLED = 5  # cycles in a row with everybody's position before an arm counts as open
+_MISSED = 0.25  # of a period late, and the slot is left to the next
+_DOUBT = 0.1  # of a period: sending a SYNC takes less, unless this computer stalls
 _ASK = bytes([0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0])  # SDO upload of the device type, which every node has
 
 
@@ -54,6 +56,7 @@ class Buses:
         clock: of the links.
         complete: whether every drive answered in the last cycle.
         lost: positions that did not come in their cycle, so far.
+        stamp_doubt_ns: of the last cycle, see `Sample`.
         modes: of operation, that control words of each drive come with.
         withheld: kinds of watchdogs that are not fed, so that they can be seen to act.
     """
@@ -69,7 +72,7 @@ class Buses:
         self.codecs = [BusCodec(profile) for profile in profiles]
         self.clock: Clock = links[0].clock
         self.complete = False
-        self.lost = 0
+        self.lost = self.stamp_doubt_ns = 0
         self._links = list(links)
         self._pairs = list(zip(self.codecs, self._links, strict=True))
         self._at: dict[int, tuple[BusCodec, Link]] = {}
@@ -222,7 +225,10 @@ class Buses:
         """
         begin_ns = self.clock.now_ns() if self._next_ns is None else self._next_ns
         self.clock.sleep_until_ns(begin_ns)
-        begin_ns += max(0, self.clock.now_ns() - begin_ns) // self._period_ns * self._period_ns
+        late_ns = self.clock.now_ns() - begin_ns
+        if late_ns > _MISSED * self._period_ns:  # drives go on with the torque that they have
+            begin_ns += -(-late_ns // self._period_ns) * self._period_ns
+            self.clock.sleep_until_ns(begin_ns)
         self._next_ns = begin_ns + self._period_ns
         torques = [[] if counts is None else codec.torque_frames(counts) for codec in self.codecs]
         for (codec, link), frames in zip(self._pairs, torques, strict=True):
@@ -230,11 +236,13 @@ class Buses:
                 codec.receive(heard)
             for frame in frames:
                 link.send(frame)
+        before_ns = self.clock.now_ns()
         if "sync_loss" not in self.withheld:
             for codec, link in self._pairs:
                 link.send(codec.sync())
         # Not before: a drive acts when it hears SYNC.
         stamp_ns = self.clock.now_ns()
+        self.stamp_doubt_ns = stamp_ns - before_ns if stamp_ns - before_ns > _DOUBT * self._period_ns else 0
         for codec in self.codecs:
             codec.begin_cycle(stamp_ns)
         deadline = max(begin_ns + round(RECEIVE * self._period_ns), stamp_ns + self._least_ns)

@@ -237,6 +237,11 @@ def _further(count: int) -> list[str]:
     return [f"  and {count - _MOST_MISSED} more, in --json"] if count > _MOST_MISSED else []
 
 
+def _in_time(lateness: dict[str, Any]) -> str:
+    late = int(lateness["late_or_lost"])
+    return f"{100.0 * (1.0 - late / max(1, lateness['count'] + late)):.2f} % of the cycles in time, {late} late or lost"
+
+
 def _report_text(report: dict[str, Any]) -> str:
     frames = f"can.log: {report['frames_logged']}\n" if "frames_logged" in report else ""
     warnings = ", ".join(f"{code} {count} times" for code, count in report["warnings"].items()) or "none"
@@ -250,7 +255,7 @@ def _report_text(report: dict[str, Any]) -> str:
     return (
         f"{ended}\n"
         f"woke late by below {lateness['median_below_us']:g} us (median), {lateness['p999_below_us']:g} us (99.9 %), "
-        f"at worst {lateness['worst_us']:.0f} us\n"
+        f"at worst {lateness['worst_us']:.0f} us; {_in_time(lateness)}\n"
         f"computed for below {compute['median_below_us']:g} us (median), {compute['p999_below_us']:g} us (99.9 %), "
         f"at worst {compute['worst_us']:.0f} us\n"
         f"{frames}"

@@ -22,6 +22,9 @@ class Control(GrownSection):
     to the torque for the reference's velocity. It stays below 1: friction that is smaller than expected would otherwise
     be overcompensated, and push the arm ahead of its reference at every reversal.
 
+    A stall of this computer of up to `longest_stall` [s] ends no motion, 10 ms or one period by default: the drives go
+    on with the last torque meanwhile. It is at most half of the time after which they would stop by themselves.
+
     `after_stop` says what follows a stop: `brake` for drives with brakes, and for arms that gravity does not move,
     which need not say it; `hold`: held under control until a person confirms that the arm is supported or home;
     `lower`: lowered under damped control until it rests, or its lowest point is at `floor` [m above the base's origin].
@@ -32,7 +35,8 @@ class Control(GrownSection):
     after_stop: Literal["brake", "hold", "lower"] | None = None
     floor: Number | None = None
     friction_feedforward: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.8
-    later = frozenset({"after_stop", "floor", "friction_feedforward"})
+    longest_stall: Annotated[float, Field(strict=True, gt=0, le=0.02)] | None = None
+    later = frozenset({"after_stop", "floor", "friction_feedforward", "longest_stall"})
 
 
 def disagreements(control: Control, joints: Sequence[str]) -> Iterator[tuple[tuple[str, ...], str]]:

@@ -73,7 +73,7 @@ class ComputedTorque:
             position: measured [rad or m], shape (joints,).
             valid: where `position` is fresh; elsewhere the arm is taken to have gone on as it went.
             reference: where it should be.
-            elapsed: since the update before [s]; one period when None.
+            elapsed: since the update before [s]; one period when None; 0 where nobody knows, and the velocity stays.
 
         Returns:
             Torque [N m or N], shape (joints,), not yet limited.
@@ -123,7 +123,8 @@ class ComputedTorque:
         gain = self._gain if seconds == self._period else _gain(self._cutoff, seconds)
         if not valid.all():
             position = np.where(valid, position, self.position + seconds * self.velocity)
-        self.velocity = self.velocity + gain * ((position - self.position) / seconds - self.velocity)
+        if seconds > 0.0:
+            self.velocity = self.velocity + gain * ((position - self.position) / seconds - self.velocity)
         self.position = position
         return position
 

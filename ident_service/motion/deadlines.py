@@ -10,11 +10,30 @@ one: a loop that loses more than `LATE * FOLLOWS` of every period still falls be
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Iterable
+
+from drivers.arm import Watchdog
 from ident_service.motion.faults import Fault, Findings
 
+# A stall that is survived, and the share of the cycles of a second that may be late or lost: the last torque stands
+# meanwhile. libfranka goes on through 20 lost packets at 1 kHz, and calls a success rate below 95 % too low.
+LONGEST_STALL, SUCCESS = 0.010, 0.95  # s, or one period where that is longer
 LATE = 0.25  # periods late that a cycle may be (FIELDBUS.md: OWD counts periods above 1.25 times the nominal one)
 FOLLOWS = 1.0 / 32.0  # of the difference from the schedule that the schedule takes over, each cycle
 LONGEST_GAP = 20  # periods without a cycle, through which nobody guarded the arm (libfranka's lost packets)
+
+
+def longest_stall(described: float | None, period: float, watchdogs: Iterable[Watchdog]) -> float:
+    """Return the longest stall that a motion survives [s].
+
+    Args:
+        described: `control.longest_stall` of the arm's description [s].
+        period: of the loop [s].
+        watchdogs: of the drives. Half of the shortest time is the most: what comes late must not come too late.
+    """
+    times = [one.seconds for one in watchdogs if one.seconds is not None]
+    return min([max(LONGEST_STALL, period) if described is None else described, *(0.5 * time for time in times)])
 
 
 class Elapsed:
@@ -22,17 +41,28 @@ class Elapsed:
 
     Where cycles come late or are skipped, velocities are differences over what has really passed. Stamps that make no
     sense are the guard's matter; nobody shall divide by them.
+
+    Attributes:
+        known: whether both samples were taken when their stamps say, so that a velocity can be told from them.
     """
 
     def __init__(self, period: float) -> None:
         """`period` [s] of the loop."""
         self._period, self._period_ns = period, round(period * 1e9)
         self._before_ns: int | None = None
+        self._doubt_ns = 0
+        self.known = True
 
-    def __call__(self, stamp_ns: int) -> float:
-        """The time since the last call's stamp [s], from half a period to `LONGEST_GAP`; a period at first."""
-        gap_ns = self._period_ns if self._before_ns is None else stamp_ns - self._before_ns
-        self._before_ns = stamp_ns
+    def __call__(self, stamp_ns: int, doubt_ns: int = 0) -> float:
+        """The time since the last call's stamp [s], from half a period to `LONGEST_GAP`; a period at first.
+
+        Args:
+            stamp_ns: of a sample [ns].
+            doubt_ns: how much earlier it may have been taken [ns]; the time from one that was is the longest possible.
+        """
+        gap_ns = self._period_ns if self._before_ns is None else stamp_ns - self._before_ns + self._doubt_ns
+        self.known = doubt_ns == self._doubt_ns == 0
+        self._before_ns, self._doubt_ns = stamp_ns, doubt_ns
         return (
             self._period
             if gap_ns == self._period_ns
@@ -45,57 +75,95 @@ class Deadlines:
 
     Attributes:
         lateness_ns: of the last cycle, against the typical one of those before it [ns].
-        elapsed: from the sample before the last one to the last one [s], see `Elapsed`.
+        elapsed: from the sample before the last one to the last one, at most [s], see `Elapsed`.
+        known: whether `elapsed` is what passed between the two.
+        lost: cycles that were late or never came, so far.
     """
 
-    def __init__(self, findings: Findings, period: float, *, scheduled_stamps: bool = False) -> None:
+    def __init__(
+        self,
+        findings: Findings,
+        period: float,
+        *,
+        scheduled_stamps: bool = False,
+        longest_stall: float = LONGEST_STALL,
+    ) -> None:
         """Begin.
 
         Args:
             findings: makes the faults.
             period: of the loop [s].
             scheduled_stamps: what the arm says of its stamps (`ArmDescription`).
+            longest_stall: that is survived [s].
         """
-        self.lateness_ns = 0
+        self.lateness_ns = self.lost = 0
         self.elapsed = period
+        self._stall_ns = round(1e9 * longest_stall)
+        self._most_lost = (1.0 - SUCCESS) / period
+        self._recent: deque[tuple[int, int]] = deque()  # stamps [ns] of the last second, and cycles lost before each
+        self._recently = 0
         self._of = Elapsed(period)
         self._findings = findings
         self._scheduled = scheduled_stamps
         self._period_ns = round(period * 1e9)
         self._late_ns = round(LATE * period * 1e9)
         self._stamp_ns: int | None = None
-        self._woken_ns = 0
+        self._woken_ns = self._doubt_ns = 0
         self._expected_ns: int | None = None
 
-    def cycle(self, stamp_ns: int, woken_ns: int) -> Fault | None:
+    @property
+    def known(self) -> bool:
+        """Whether `elapsed` is what passed between the last two samples."""
+        return self._of.known
+
+    def cycle(self, stamp_ns: int, woken_ns: int, doubt_ns: int = 0) -> Fault | None:
         """Judge a cycle.
 
         Args:
             stamp_ns: of its sample [ns].
             woken_ns: the loop's clock after the exchange [ns].
+            doubt_ns: how much earlier than its stamp the sample may have been taken [ns].
 
         Returns:
             The fault found, if any.
         """
         period = self._period_ns
-        self.elapsed = self._of(stamp_ns)
+        self.elapsed = self._of(stamp_ns, doubt_ns)
         came_ns = woken_ns if self._scheduled else stamp_ns
         off = 0 if self._expected_ns is None else came_ns - self._expected_ns
         self.lateness_ns = lateness = max(0, off)
         # After a whole period's lateness the schedule begins anew: nobody catches up with bursts.
         self._expected_ns = came_ns - off + round(FOLLOWS * off) + period if lateness < period else None
+        doubted_ns, self._doubt_ns = self._doubt_ns, doubt_ns
         before, self._stamp_ns = self._stamp_ns, stamp_ns
         woken_before, self._woken_ns = self._woken_ns, woken_ns
         if before is None:
             return None
         gap, slept = stamp_ns - before, woken_ns - woken_before
-        if 0 < gap <= period + self._late_ns and lateness <= self._late_ns:
+        if gap + doubted_ns > 0 and gap <= period + self._late_ns and lateness <= self._late_ns:
             return None
-        if gap <= 0:
+        if gap + doubted_ns <= 0:
             return self._findings.found("clock_jump", f"consecutive stamps are {gap * 1e-6:g} ms apart")
         if slept > LONGEST_GAP * period:
             return self._findings.found("bus_silent", f"for {slept * 1e-6:g} ms there was no cycle")
         if gap > LONGEST_GAP * period:
             return self._findings.found("clock_jump", f"consecutive stamps are {gap * 1e-6:g} ms apart")
-        late = max(gap - period, lateness)
-        return self._findings.found("late_cycle", f"a cycle came {late * 1e-6:g} ms late")
+        return self._late(stamp_ns, max(gap - period, lateness))
+
+    def _late(self, stamp_ns: int, late_ns: int) -> Fault:
+        """Count a late cycle, and what was lost before it: too long a stall, or too many, are a fault."""
+        lost = max(1, round(late_ns / self._period_ns))
+        self.lost += lost
+        self._recent.append((stamp_ns, lost))
+        self._recently += lost
+        while self._recent[0][0] <= stamp_ns - 1_000_000_000:
+            self._recently -= self._recent.popleft()[1]
+        found = self._findings.found("late_cycle", f"a cycle came {late_ns * 1e-6:g} ms late")
+        if late_ns > self._stall_ns:
+            what = f"this computer stalled for {late_ns * 1e-6:.3g} ms, {self._stall_ns * 1e-6:g} ms are survived"
+            return self._findings.found("late_cycles", what)
+        if self._recently > self._most_lost:
+            within = f"{self._recently} of the {1e9 / self._period_ns:.0f} cycles of a second"
+            what = f"this computer kept {within} waiting or lost them, {self._most_lost:.0f} are survived"
+            return self._findings.found("late_cycles", what)
+        return found

@@ -101,7 +101,8 @@ FAULTS: dict[str, Rule] = {
     "drive_warning": Rule(_WARN, "temperature, voltage or current near its limit; see the drive's manual"),
     "torque_limited": Rule(_WARN, "the drive itself gives less torque than it was asked for"),
     "strange_frame": Rule(_WARN, "a bus that is too full, a wrong node number, or another device on it"),
-    "late_cycle": Rule(_WARN, "the machine was busy with something else", often=5, becomes="late_cycles"),
+    # `deadlines.py` says when it is too late, or too often; the others of a second are survived.
+    "late_cycle": Rule(_WARN, "the machine was busy with something else", often=WINDOW - 1),
     # The loop can still be trusted to stop the arm.
     "repeated_warnings": Rule(_STOP, "what is bridged once must not go on"),
     "late_cycles": Rule(_STOP, "this machine does not keep the rate; look for other load and at its scheduling"),

@@ -79,7 +79,7 @@ class Guard:
         self.findings = Findings()
         self.rate = np.minimum(TORQUE_RATE, TORQUE_RATE_SHARE * limits.torque) * period
         self._names, self._limits, self._period = joint_names, limits, period
-        self._elapsed, self._max_age = period, max_age
+        self._elapsed, self._known, self._max_age = period, True, max_age
         self._units = tuple("rad" if turns else "m" for turns in revolute or (True,) * joints)
         self._contact = contact if contact is not None and contact.pairs else None
         self._pairs = contact.pairs if contact is not None else ()
@@ -120,6 +120,8 @@ class Guard:
         answer: Vector | None = None,
         elapsed: float | None = None,
         feedforward: Vector | float = 0.0,
+        *,
+        known: bool = True,
     ) -> tuple[Flags, Fault | None]:
         """Judge a sample.
 
@@ -130,6 +132,7 @@ class Guard:
             correction: of the torque before this sample, what the errors added to it [N m or N], shape (joints,).
             answer: the acceleration in it [rad/s^2 or m/s^2], shape (joints,); without, nothing is owed.
             elapsed: since the sample before [s]; one period when None.
+            known: whether that is so; if not, it is the longest that it may be.
             feedforward: friction in the torque before this sample [N m or N], shape (joints,), which pushes a joint
                 against its own friction as the correction does.
 
@@ -137,7 +140,7 @@ class Guard:
             Which axes' positions may be used, and the most severe fault found, if any.
         """
         self.findings.cycle += 1
-        self._elapsed = self._period if elapsed is None else elapsed
+        self._elapsed, self._known = self._period if elapsed is None else elapsed, known
         answered = bool(sample.valid.all())
         self._count_still(sample, correction + feedforward)
         self._count_unchanged(sample, velocity)
@@ -217,7 +220,12 @@ class Guard:
         np.subtract(position, self._position, out=jump)
         np.subtract(jump, velocity * self._elapsed, out=jump)
         np.abs(jump, out=jump)
+        self._bounds[-1] = self._farthest()
         return bool((self._values <= self._bounds).all())
+
+    def _farthest(self) -> Vector:
+        """How far a position may be from the expected one [rad or m], shape (joints,)."""
+        return self._jump if self._known else self._jump * (self._elapsed / self._period)
 
     def _plain(self, sample: Sample) -> bool:
         """Whether nothing else is wrong: encoders, status, torque, the space the arm may be in."""
@@ -253,7 +261,7 @@ class Guard:
         position = sample.position
         # A window that only grew with the age would let the second reading of a wrong position in.
         expected = self._position + velocity * (self._elapsed + self._period * self._age)
-        jumped = sample.valid & (np.abs(position - expected) > self._jump)
+        jumped = sample.valid & (np.abs(position - expected) > self._farthest())
         usable = sample.valid & ~jumped
         self._jumps = np.where(jumped, self._jumps + 1, 0)
         self._age = np.where(usable, 0, np.maximum(self._age + 1, sample.age))

@@ -114,15 +114,14 @@ class Loop:
             raise self._end(self.guard.findings.found("driver", str(error))) from error
         woken_ns, stamp_ns = self.arm.clock.now_ns(), sample.stamp_ns
         self.last.append(sample)
-        found = self.deadlines.cycle(stamp_ns, woken_ns)
+        found = self.deadlines.cycle(stamp_ns, woken_ns, sample.stamp_doubt_ns)
         if found is not None:
             self._react(found, stamp_ns)
         reference = self.course.at(stamp_ns)
         if self.states.state is State.DONE:
             return None
         free = self._lowering is not None or self.states.state is State.STOPPED
-        if free:  # no position is asked for
-            reference = rest(self.control.position)
+        reference = rest(self.control.position) if free else reference  # no position is asked for
         usable, fault = self.guard.feedback(
             sample,
             reference,
@@ -131,6 +130,7 @@ class Loop:
             self.control.answer,
             self.deadlines.elapsed,
             self.control.feedforward,
+            known=self.deadlines.known,
         )
         torque, torque_fault = self.guard.torque(self._law(sample, usable, reference, free))
         compute_ns = self.arm.clock.now_ns() - woken_ns
@@ -146,7 +146,7 @@ class Loop:
 
     def _law(self, sample: Sample, usable: Flags, reference: Setpoint, free: bool) -> Vector:
         """The torque wanted [N m or N], shape (joints,)."""
-        elapsed = self.deadlines.elapsed
+        elapsed = self.deadlines.elapsed if self.deadlines.known else 0.0
         if not free:
             return self.control.torque(sample.position, usable, reference, elapsed)
         needed, lowering = self._needed / REST_CYCLES, self._lowering

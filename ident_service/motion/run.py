@@ -25,7 +25,7 @@ from ident_service.motion.attended import attended
 from ident_service.motion.control import ComputedTorque
 from ident_service.motion.controls import Controls, StopWhen
 from ident_service.motion.course import Course
-from ident_service.motion.deadlines import Deadlines
+from ident_service.motion.deadlines import Deadlines, longest_stall
 from ident_service.motion.faults import FAULTS, HOLD
 from ident_service.motion.guard import Guard
 from ident_service.motion.latch import Latch
@@ -54,6 +54,7 @@ class RunReport:
         warnings: how often each mild fault was seen.
         finished_at: of a run that was finished early and is DONE, how much of its excitation was made [s]; else None.
         not_finished: why a run that was to be finished early went on; empty for any other.
+        late: cycles that were late or never came.
     """
 
     state: State
@@ -63,6 +64,7 @@ class RunReport:
     warnings: dict[str, int]
     finished_at: float | None = None
     not_finished: str = ""
+    late: int = 0
 
 
 def run(
@@ -179,6 +181,7 @@ class _Run:
             dict(loop.guard.findings.warnings),
             loop.course.finished_at if self.states.state is State.DONE else None,
             loop.course.not_finished,
+            loop.deadlines.lost,
         )
 
     def _prepared(self) -> tuple[Loop, Vector]:
@@ -244,7 +247,12 @@ class _Run:
                 held=self.plan.held,
             ),
             self.states,
-            Deadlines(guard.findings, period, scheduled_stamps=described.scheduled_stamps),
+            Deadlines(
+                guard.findings,
+                period,
+                scheduled_stamps=described.scheduled_stamps,
+                longest_stall=longest_stall(model.config.control.longest_stall, period, self.arm.watchdogs()),
+            ),
             self.controls,
             self.sink,
             self.latch,

@@ -27,7 +27,6 @@ from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.urdf import urdf_text
 from ident_service.motion.checks import MAX_AGE
 from ident_service.motion.controls import Switches
-from ident_service.motion.faults import FAULTS
 from ident_service.motion.latch import Latch
 from ident_service.motion.run import Sink, run
 from ident_service.motion.states import State
@@ -90,7 +89,7 @@ PROMISES: dict[FaultKind, Promise] = {
     FaultKind.EMERGENCY_STOP: Promise({"emergency_stop"}, within=1),
     FaultKind.LOAD_ATTACHED: Promise(UNTRUE, size=2.0),
     FaultKind.BUS_GONE: Promise({"driver"}, duration=10**6, within=1),
-    FaultKind.LATE_CYCLE: Promise({"late_cycles"}, size=0.4e-3, duration=50, within=FAULTS["late_cycle"].often + 1),
+    FaultKind.LATE_CYCLE: Promise({"late_cycles"}, size=12e-3, duration=1, within=1),  # 10 ms are survived
     FaultKind.CLOCK_JUMP: Promise({"clock_jump"}, size=-0.05, within=1),
 }
 

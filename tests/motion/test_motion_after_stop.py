@@ -259,7 +259,7 @@ def test_drives_and_their_own_reaction_come_before_any_holding(kind: FaultKind, 
 
 @pytest.mark.slow
 def test_a_controlled_stop_after_a_fault_is_held_too() -> None:
-    rig = Rig(on_a_table(), Fault(STOP, FaultKind.LATE_CYCLE, None, 50, 0.4e-3))
+    rig = Rig(on_a_table(), Fault(STOP, FaultKind.LATE_CYCLE, None, 1, 12e-3))
     with pytest.raises(ArmFault, match="late_cycles"):
         rig.run(stop=10**9, confirm=3000)
     assert rig.told(LOWERS) - rig.told(WAITS) >= 3000

@@ -115,6 +115,15 @@ def test_after_skipped_cycles_the_arm_is_expected_where_it_has_gone_meanwhile(sk
     is_fault(fault, "encoder_jump", 1)
 
 
+def test_where_nobody_knows_how_long_it_took_no_position_on_the_way_is_a_jump() -> None:
+    velocity, longest = 0.9 * LIMITS.velocity, 8 * PERIOD
+    for way in (velocity * PERIOD, velocity * longest):
+        assert Bench().see(HOME + way, velocity=velocity, elapsed=longest, known=False) == ([True, True], None)
+    usable, fault = Bench().see(HOME + 16 * WINDOW * unit(1), velocity=velocity, elapsed=longest, known=False)
+    assert usable == [True, False]
+    is_fault(fault, "encoder_jump", 1)
+
+
 def test_one_jump_is_discarded_and_forgiven() -> None:
     bench = Bench()
     for _ in range(3):

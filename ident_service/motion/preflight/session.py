@@ -250,12 +250,13 @@ class Session:
 
     def _led(self, sample: Sample, setpoint: Setpoint, given_up: Flags) -> Vector:
         """The control law's torque for a sample that the guard has judged [N m or N], shape (joints,)."""
-        since, control = self._since(sample.stamp_ns), self._control
+        since, control = self._since(sample.stamp_ns, sample.stamp_doubt_ns), self._control
         velocity, correction = (np.where(given_up, 0.0, of) for of in (control.velocity, control.correction))
-        usable, fault = self._guard.feedback(sample, setpoint, velocity, correction, elapsed=since)
+        known = self._since.known
+        usable, fault = self._guard.feedback(sample, setpoint, velocity, correction, elapsed=since, known=known)
         if fault is not None and fault.reaction is not Reaction.WARN:
             raise ArmFault(fault.code, fault.message, [row[0] for row in self._rows[-100:]])
-        return control.torque(sample.position, usable, setpoint, since)
+        return control.torque(sample.position, usable, setpoint, since if known else 0.0)
 
     def _against_friction(self, setpoint: Setpoint, learning: float) -> Vector:
         """Torque that moving joints need besides the model's, learned from how they lag [N m or N], shape (joints,)."""

@@ -1,0 +1,137 @@
+"""The computer stalls in a motion: short stalls are survived, long ones and too many end it by their name."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from canopen_run_bench import canopen, described, write
+from motion.motion_bench import Story
+
+from drivers.canopen.arm import CanopenArm
+from drivers.canopen.frame import Frame
+from drivers.canopen.profile import SYNC
+from ident_service.config.load import load_arm
+from ident_service.errors import ArmFault
+from ident_service.excitation.plan import excitation
+from ident_service.model.arm_model import arm_model
+from ident_service.motion.controls import StopWhen
+from ident_service.motion.run import RunReport, run
+from sim_backend.pucks.lock_step import LockStepArm, LockStepLink
+
+RATE = 500.0
+MS = 1_000_000
+MOTION = {"kind": "seeded", "seed": 1, "base_frequency": 0.4, "harmonics": 2, "periods": 1}
+
+
+@dataclass
+class StallingLink:
+    """A bus on which the host stalls about some of its SYNCs.
+
+    Attributes:
+        stalls: for how long [ms], by the number of the SYNC since the motion began.
+        before: whether it stalls before the frame is out, not after.
+    """
+
+    inner: LockStepLink
+    stalls: dict[int, float]
+    before: bool
+    sent: int = -1
+    syncs: list[int] = field(default_factory=list)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.inner, name)
+
+    def send(self, frame: Frame) -> None:
+        """Stall about it, if it is one of those."""
+        ms = 0.0
+        if frame.identifier == SYNC and self.sent >= 0:
+            ms = self.stalls.get(self.sent, 0.0)
+            self.sent += 1
+        if self.before:
+            self._sleep(ms)
+        self.inner.send(frame)
+        if frame.identifier == SYNC:
+            self.syncs.append(self.inner.clock.now_ns())
+        if not self.before:
+            self._sleep(ms)
+
+    def _sleep(self, ms: float) -> None:
+        if ms:
+            self.inner.clock.sleep_until_ns(self.inner.clock.now_ns() + round(ms * MS))
+
+
+@dataclass
+class Moved:
+    """A motion through stalls: what came of it, and how the arm really moved."""
+
+    link: StallingLink
+    story: Story
+    report: RunReport | None
+    fault: ArmFault | None
+    speed: np.ndarray
+
+
+def moved(folder: Path, stalls: dict[int, float], *, before: bool = False, **control: Any) -> Moved:
+    tree = canopen(described("stalling", RATE, 225.0, 30.0), {"interface": "lock_step"}, 1, torque_deadline=0.1)
+    tree["motions"] = {"identification": MOTION, "validation": MOTION}
+    tree["control"] |= control
+    config = load_arm(write(folder, tree))
+    behind, model, story, links = LockStepArm(config), arm_model(config), Story(), list[StallingLink]()
+    speeds = list[np.ndarray]()
+    behind.emulator.observer = lambda truth: speeds.append(np.abs(truth.velocity))
+    arm = CanopenArm(config, lambda _: links.append(StallingLink(behind.link(0), stalls, before)) or list(links))
+    report = fault = None
+    with arm:
+        links[0].sent = 0
+        try:
+            motion = excitation(model, "identification")
+            report = run(arm, model, motion, story, StopWhen(lambda: False), hold_seconds=0.1)
+        except ArmFault as error:
+            fault = error
+    return Moved(links[0], story, report, fault, np.array(speeds).max(axis=0))
+
+
+def undisturbed(seen: Moved) -> None:
+    """All was done, and the stalls were taken for nothing but late cycles; SYNC kept to its grid, without bursts."""
+    assert seen.fault is None
+    assert seen.report is not None
+    assert seen.report.state.value == "done"
+    assert set(seen.report.warnings) == {"late_cycle"}
+    assert (seen.speed < 1.1 * np.array([2.0, 3.0])).all()
+    slots = (np.array(seen.link.syncs) - seen.link.syncs[0]) * 1e-9 * RATE
+    assert np.diff(slots).min() > (0.4 if seen.link.before else 0.99)  # one that was stalled itself comes between
+    assert np.isclose(slots, np.rint(slots), atol=1e-6).sum() >= len(slots) - 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("before", [False, True], ids=["after the frame", "before the frame"])
+def test_a_stall_of_nine_milliseconds_about_a_sync_is_survived_wherever_it_comes(tmp_path: Path, before: bool) -> None:
+    seen = moved(tmp_path, {900: 5.0, 1100: 9.0, 1300: 9.0, 1301: 9.0}, before=before)
+    undisturbed(seen)
+    assert seen.report is not None
+    assert seen.report.late >= 4 + 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("stalls", "control", "said"),
+    [
+        ({1000: 13.0}, {}, "this computer stalled for 1[23].* ms, 10 ms are survived"),
+        ({1000: 9.0}, {"longest_stall": 0.005}, "this computer stalled for .* ms, 5 ms are survived"),
+        ({1000 + 40 * k: 9.0 for k in range(9)}, {}, "this computer kept .* of the 500 cycles of a second waiting"),
+    ],
+    ids=["too long", "longer than described", "too many"],
+)
+def test_a_stall_that_is_too_long_or_comes_too_often_is_a_controlled_stop_of_its_own_name(
+    tmp_path: Path, stalls: dict[int, float], control: dict[str, float], said: str
+) -> None:
+    seen = moved(tmp_path, stalls, **control)
+    assert seen.fault is not None
+    assert seen.fault.code == "late_cycles"
+    assert re.search(said, str(seen.fault))
+    assert seen.story.states[-3:] == ["exciting", "stopping", "stopped"]
