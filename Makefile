@@ -9,7 +9,7 @@ READY  := $(VENV)/.ready
 # Set, it has each of a thousand child processes of the tests compile the whole package anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test unit coverage collected lint types bench bench-design bench-canopen bench-serve bench-stops bench-viewers bench-peers campaign \
+.PHONY: demo test unit coverage collected lint types bench bench-design bench-canopen bench-serve bench-stops bench-viewers bench-realtime bench-peers campaign \
 	mutants test-socketcan test-foreign test-latest lock clean
 
 demo: $(READY)
@@ -64,6 +64,10 @@ bench-stops: $(READY)
 
 bench-viewers: $(READY)
 	$(BIN)/python -m benchmarks.viewers
+
+# Ten tries each of two arms on emulated drives, by the machine's clock.
+bench-realtime: $(READY)
+	$(BIN)/python -m benchmarks.realtime
 
 # The command beside the script that somebody would write instead.
 bench-peers: $(READY)
