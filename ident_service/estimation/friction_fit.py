@@ -15,17 +15,13 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from ident_service.config.schema import FrictionShape
-from ident_service.estimation.equations import Equations
-from ident_service.estimation.friction_trials import FOLDS, FrictionTrials
-from ident_service.estimation.least_squares import unit_columns, weighted_least_squares
+from ident_service.estimation.friction_trials import FrictionTrials, Moments, ridge
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
-from ident_service.model.information import Information
 from ident_service.model.layout import INERTIAL
 from ident_service.record.recording import Recording
 
@@ -139,29 +135,21 @@ class _Search:
     def best(self, values: _Numbers, trials: Sequence[_Numbers], *, predicting: bool = False) -> _Numbers:
         """Per drive, the trial that leaves its joint the smallest residual, or predicts its torque best."""
         # Joints weigh alike in all trials, as the values that were best so far have it.
-        weights = weighted_least_squares(self._equations(values).total).weights
+        weights = Moments.sum(self._moments(values)).weights()
+        terms = _own_terms(self.model, self.base)
         left = []
         for trial in trials:
-            gathered = self._equations(values | trial)
-            beta = _solved(gathered.total, weights)
-            terms = _own_terms(self.model, self.base)
-            left.append(_unpredicted(gathered, beta, terms) if predicting else gathered.total.squared_residuals(beta))
+            thirds = self._moments(values | trial)
+            total = Moments.sum(thirds)
+            beta = total.solved(weights)
+            left.append(_unpredicted(thirds, beta, terms) if predicting else total.squared_residuals(beta))
         choice = np.argmin(np.array(left), axis=0)
         return values | {
             key: np.array([trials[index][key][drive] for drive, index in enumerate(choice)]) for key in trials[0]
         }
 
-    def _equations(self, values: _Numbers) -> Equations:
-        return self.trials.equations(values["presliding"], values["stribeck_velocity"])
-
-
-def _solved(information: Information, weights: Array) -> Array:
-    """Solve eq. 60 alone, without what `least_squares` says about its quality."""
-    R = information.stacked(weights)
-    unit, seen = unit_columns(R[:, :-1])
-    # By columns of unit length, with pivots: a shape may make two columns of a drive alike.
-    columns = np.where(seen, R[:, :-1], 0.0) / unit
-    return np.asarray(scipy.linalg.lstsq(columns, R[:, -1], cond=1e-10, lapack_driver="gelsy")[0] / unit)
+    def _moments(self, values: _Numbers) -> tuple[Moments, ...]:
+        return self.trials.moments(values["presliding"], values["stribeck_velocity"])
 
 
 def _own_terms(model: ArmModel, base: BaseParameters) -> NDArray[np.bool_]:
@@ -169,26 +157,23 @@ def _own_terms(model: ArmModel, base: BaseParameters) -> NDArray[np.bool_]:
     return np.asarray(base.base % model.layout.per_link >= len(INERTIAL))
 
 
-def _unpredicted(gathered: Equations, beta: Array, terms: NDArray[np.bool_]) -> Array:
+def _unpredicted(thirds: Sequence[Moments], beta: Array, terms: NDArray[np.bool_]) -> Array:
     """Per joint, the squared errors of each third as predicted from the other two, shape (joints,)."""
-    thirds = [part for part in np.array_split(np.arange(len(gathered.blocks)), FOLDS) if len(part)]
-    if len(thirds) < FOLDS:
-        return gathered.total.squared_residuals(beta)
-    merged = [Information.sum([gathered.blocks[index] for index in part]) for part in thirds]
-    total = np.zeros(gathered.total.joints)
-    for joint, support in enumerate(gathered.total.supports):
-        own = terms[support]
+    if min(int(third.rows.min()) for third in thirds) == 0:
+        return Moments.sum(thirds).squared_residuals(beta)
+    total = np.zeros(len(thirds[0].products))
+    for joint, support in enumerate(thirds[0].supports):
+        own = np.flatnonzero(terms[support])
         # What is left of the torque when the rest of the arm has had its share: columns of the joint's terms, and it.
-        left = []
-        for part in merged:
-            factor = part.factors[joint]
-            rest = factor[:, -1] - factor[:, :-1][:, ~own] @ beta[support[~own]]
-            left.append((factor[:, :-1][:, own], rest))
-        for number, (columns, rest) in enumerate(left):
-            others = [pair for other, pair in enumerate(left) if other != number]
-            told, torque = (np.concatenate(parts) for parts in zip(*others, strict=True))
-            friction = np.linalg.lstsq(told, torque, rcond=None)[0]
-            total[joint] += float(np.sum((rest - columns @ friction) ** 2))
+        rest = np.zeros((len(support) + 1, len(own) + 1))
+        rest[own, np.arange(len(own))] = 1.0
+        rest[:-1, -1] = np.where(terms[support], 0.0, -beta[support])
+        rest[-1, -1] = 1.0
+        left = [rest.T @ third.products[joint] @ rest for third in thirds]
+        for number, unseen in enumerate(left):
+            told = sum(other for place, other in enumerate(left) if place != number)
+            error = np.append(-ridge(told[:-1, :-1], told[:-1, -1]), 1.0)
+            total[joint] += max(float(error @ unseen @ error), 0.0)
     return total
 
 

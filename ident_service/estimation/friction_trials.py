@@ -1,8 +1,9 @@
 """Equations of the same motion for many shapes of its friction, without reading or smoothing anything again.
 
 A shape changes two columns per drive: the direction of its Coulomb friction and that direction times the Stribeck
-curve. All others, and the torque, are kept as an orthogonal basis Q and their triangle R, per joint and third of the
-samples. Equations with new columns F then have the factor `[[R, Q^T F], [0, R_F]]` with R_F of `F - Q Q^T F`.
+curve. All others, and the torque, are kept as a table X with their products `X^T X`, per joint and third of the samples.
+Equations with new columns F then have the products `[[X^T X, X^T F], [F^T X, F^T F]]`: their residuals are as good as
+from orthogonal factors, as only trials are compared by them.
 
 The direction at a sample needs no look at the samples before it: between two reversals it is an exponential in the
 distance travelled since (`direction.py`), so the distances of reversals and of samples are all that is kept.
@@ -32,21 +33,70 @@ FOLDS = 3
 _MOST_ROWS = 30_000  # samples that are kept; of longer recordings every second, every fourth ...
 _CHANGING: tuple[JointTerm, ...] = ("coulomb", "stribeck")
 _GAP = 1.5  # periods: what is longer is no step between neighbours
+_LEAST_COLUMN = 1e-14  # of the longest
+_RIDGE = 1e-12  # of a column's squared length: columns that are alike share what they explain
+_SETTLED = 1e-6  # of a weight
+_MOST_ROUNDS = 100
 
 
 @dataclass(frozen=True)
-class _Kept:
-    """Columns that no trial changes, of one joint in one third of the samples.
+class Moments:
+    """Products of the equations' columns, from which least squares can be solved.
 
     Attributes:
-        samples: which kept samples its rows are, shape (rows,).
-        Q: orthonormal basis of the columns and the torque, shape (rows, k).
-        R: `[columns | torque] = Q R`, shape (k, columns + 1).
+        supports: per joint, which base parameters it feels, increasing.
+        products: per joint, `[H_b | tau]^T [H_b | tau]` of its support, shape (k + 1, k + 1).
+        rows: equations of each joint, shape (joints,).
+        base: number of base parameters.
     """
 
-    samples: NDArray[np.intp]
-    Q: Array
-    R: Array
+    supports: tuple[NDArray[np.intp], ...]
+    products: tuple[Array, ...]
+    rows: NDArray[np.int64]
+    base: int
+
+    @staticmethod
+    def sum(parts: Sequence[Moments]) -> Moments:
+        """All parts together."""
+        products = tuple(sum(of[1:], of[0]) for of in zip(*(part.products for part in parts), strict=True))
+        return Moments(parts[0].supports, products, np.sum([part.rows for part in parts], axis=0), parts[0].base)
+
+    def solved(self, weights: Array) -> Array:
+        """Minimise the squared residuals, each joint's equations multiplied by its weight; shape (base,)."""
+        total = np.zeros((self.base, self.base))
+        right = np.zeros(self.base)
+        for support, product, weight in zip(self.supports, self.products, weights, strict=True):
+            total[np.ix_(support, support)] += weight**2 * product[:-1, :-1]
+            right[support] += weight**2 * product[:-1, -1]
+        return ridge(total, right)
+
+    def weights(self) -> Array:
+        """Give what the joints' equations are multiplied by so that their residuals are alike, shape (joints,)."""
+        torques = np.array([product[-1, -1] for product in self.products])
+        floor = 1e-9 * np.sqrt(torques / np.maximum(self.rows, 1))
+        weights = np.ones(len(self.products))
+        for _ in range(_MOST_ROUNDS):
+            left = np.sqrt(self.squared_residuals(self.solved(weights)) / np.maximum(self.rows, 1))
+            deviations = np.maximum(left, np.maximum(floor, np.finfo(float).tiny))
+            before, weights = weights, np.exp(np.mean(np.log(deviations))) / deviations
+            if np.all(np.abs(weights - before) <= _SETTLED * weights):
+                break
+        return weights
+
+    def squared_residuals(self, beta: Array) -> Array:
+        """Per joint, the sum of squared torque errors of `beta` [N^2 m^2 or N^2], shape (joints,)."""
+        tried = [np.append(-beta[support], 1.0) for support in self.supports]
+        found = [one @ product @ one for one, product in zip(tried, self.products, strict=True)]
+        return np.maximum(found, 0.0)
+
+
+def ridge(products: Array, right: Array) -> Array:
+    """Solve normal equations of columns that may be alike, or unseen: those get no more than they need."""
+    sizes = np.diag(products)
+    seen = sizes > _LEAST_COLUMN**2 * sizes.max(initial=0.0)
+    unit = np.sqrt(np.where(seen, sizes, 1.0))
+    scaled = np.where(np.outer(seen, seen), products, 0.0) / np.outer(unit, unit) + _RIDGE * np.eye(len(unit))
+    return np.asarray(np.linalg.solve(scaled + np.diag(~seen * 1.0), np.where(seen, right, 0.0) / unit) / unit)
 
 
 @dataclass
@@ -148,13 +198,9 @@ class FrictionTrials:
         self._rate = np.concatenate(rates)
         self._lengths = [len(rate) for rate in rates]
         self._rows = len(self._rate)
-        self._parts = []
-        for third in np.array_split(np.arange(self._rows), FOLDS):
-            part = []
-            for joint in range(joints):
-                Q, R = np.linalg.qr(np.concatenate(tables[joint])[third])
-                part.append(_Kept(third, Q, R))
-            self._parts.append(part)
+        self._tables = [np.concatenate(table) for table in tables]
+        self._thirds = [slice(int(part[0]), int(part[-1]) + 1) for part in np.array_split(np.arange(self._rows), FOLDS)]
+        self._products = [[table[third].T @ table[third] for table in self._tables] for third in self._thirds]
         if still := [name for joint, name in enumerate(model.chain.names) if not moved[joint]]:
             raise RecordingError(
                 recordings[0].path,
@@ -181,6 +227,35 @@ class FrictionTrials:
             last = times[-1]
 
     @one_blas_thread()
+    def moments(self, presliding: Array, stribeck_velocity: Array) -> tuple[Moments, ...]:
+        """Give the products of the equations for one shape of the friction, of each third of the samples.
+
+        Args:
+            presliding: x0 per drive [rad or m], shape (drives,).
+            stribeck_velocity: v_s per drive [rad/s or m/s], shape (drives,).
+        """
+        used = self._friction(presliding, stribeck_velocity)
+        found: list[list[Array]] = [[] for _ in self._thirds]
+        for joint, table in enumerate(self._tables):
+            fixed, new, places = self._places(joint)
+            F = self._new_columns(new, used)
+            size = len(self._supports[joint]) + 1
+            for parts, kept, third in zip(found, self._products, self._thirds, strict=True):
+                product = np.empty((size, size))
+                product[np.ix_(fixed, fixed)] = kept[joint]
+                if new:
+                    across = table[third].T @ F[third]
+                    product[np.ix_(fixed, places)] = across
+                    product[np.ix_(places, fixed)] = across.T
+                    product[np.ix_(places, places)] = F[third].T @ F[third]
+                parts.append(product)
+        joints = len(self._tables)
+        return tuple(
+            Moments(self._supports, tuple(parts), np.full(joints, third.stop - third.start), self._size)
+            for parts, third in zip(found, self._thirds, strict=True)
+        )
+
+    @one_blas_thread()
     def equations(self, presliding: Array, stribeck_velocity: Array) -> Equations:
         """Give the equations for one shape of the friction, in `FOLDS` blocks of consecutive samples.
 
@@ -188,6 +263,24 @@ class FrictionTrials:
             presliding: x0 per drive [rad or m], shape (drives,).
             stribeck_velocity: v_s per drive [rad/s or m/s], shape (drives,).
         """
+        used = self._friction(presliding, stribeck_velocity)
+        factors: list[list[Array]] = [[] for _ in self._thirds]
+        for joint, table in enumerate(self._tables):
+            fixed, new, places = self._places(joint)
+            rows = np.empty((len(table), len(self._supports[joint]) + 1), order="F")
+            rows[:, fixed] = table
+            if new:
+                rows[:, places] = self._new_columns(new, used)
+            for parts, third in zip(factors, self._thirds, strict=True):
+                parts.append(triangle(rows[third]))
+        joints = len(self._tables)
+        blocks = tuple(
+            Information(self._supports, tuple(parts), np.full(joints, third.stop - third.start), self._size)
+            for parts, third in zip(factors, self._thirds, strict=True)
+        )
+        return Equations(blocks, self._rows)
+
+    def _friction(self, presliding: Array, stribeck_velocity: Array) -> dict[JointTerm, Array]:
         direction = np.column_stack(
             [travel.direction(float(x0)) for travel, x0 in zip(self._travels, presliding, strict=True)]
         )
@@ -195,13 +288,7 @@ class FrictionTrials:
             "coulomb": direction,
             "stribeck": direction * np.exp(-((self._rate / stribeck_velocity) ** 2)),
         }
-        used = {term: self._filtered(values[term]) for term in self._columns}
-        blocks = []
-        for part in self._parts:
-            factors = [self._factor(joint, kept, used) for joint, kept in enumerate(part)]
-            rows = np.array([len(kept.samples) for kept in part], dtype=np.int64)
-            blocks.append(Information(self._supports, tuple(factors), rows, self._size))
-        return Equations(tuple(blocks), self._rows)
+        return {term: self._filtered(values[term]) for term in self._columns}
 
     def _filtered(self, values: Array) -> Array:
         if not any(self._filters):
@@ -211,25 +298,21 @@ class FrictionTrials:
             [low_pass(part, *made) if made else part for part, made in zip(parts, self._filters, strict=True)]
         )
 
-    def _factor(self, joint: int, kept: _Kept, used: dict[JointTerm, Array]) -> Array:
-        support, fixed = self._supports[joint], self._kept_columns[joint]
-        factor = np.zeros((len(kept.R) + 2 * len(self._travels), len(support) + 1))
-        where = np.searchsorted(support, fixed)
-        factor[: len(kept.R), where] = kept.R[:, :-1]
-        factor[: len(kept.R), -1] = kept.R[:, -1]
+    def _places(self, joint: int) -> tuple[NDArray[np.intp], list[tuple[JointTerm, int, float]], list[int]]:
+        """Say where in a joint's rows the kept columns and the torque stand, which are new, and where those stand."""
+        support = self._supports[joint]
+        fixed = np.append(np.searchsorted(support, self._kept_columns[joint]), len(support))
         new, places = [], []
         for term, columns in self._columns.items():
             for drive, column in enumerate(columns):
-                if share := self._coupling[drive, joint]:
-                    new.append(share * used[term][kept.samples, drive])
+                if share := float(self._coupling[drive, joint]):
+                    new.append((term, drive, share))
                     places.append(int(np.searchsorted(support, column)))
-        if new:
-            F = np.column_stack(new)
-            inside = kept.Q.T @ F
-            beyond = triangle(F - kept.Q @ inside)
-            factor[: len(kept.R), places] = inside
-            factor[len(kept.R) : len(kept.R) + len(beyond), places] = beyond
-        return triangle(factor[: len(kept.R) + len(new)])
+        return fixed, new, places
+
+    def _new_columns(self, new: Sequence[tuple[JointTerm, int, float]], used: dict[JointTerm, Array]) -> Array:
+        columns = [share * used[term][:, drive] for term, drive, share in new]
+        return np.column_stack(columns) if columns else np.zeros((self._rows, 0))
 
 
 def _full_rate(recording: Recording, model: ArmModel) -> Iterator[tuple[Array, Array]]:
