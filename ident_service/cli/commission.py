@@ -48,7 +48,7 @@ def add(verbs: Verbs) -> None:
     sub.add_argument("--method", choices=["ols", "wls", "huber", "iv"], help="default: the arm's")
     sub.add_argument("--prior", choices=["none", "euclidean", "entropic"], help="draw the estimate to the arm's prior")
     sub.add_argument("--prior-weight", type=weight, metavar="W", help="default: chosen on held-out data")
-    sub.add_argument("--delay", type=delay, metavar="SECONDS", help="of the torque's stamps, or 'estimate'")
+    sub.add_argument("--delay", type=delay, metavar="SECONDS", help="of the torque's stamps, 'estimate' or 'choose'")
     sub.add_argument(
         "--bootstrap", type=replicates, default=0, metavar="N", help="replicates of the constrained estimate"
     )

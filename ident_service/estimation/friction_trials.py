@@ -1,9 +1,8 @@
 """Equations of the same motion for many shapes of its friction, without reading or smoothing anything again.
 
 A shape changes two columns per drive: the direction of its Coulomb friction and that direction times the Stribeck
-curve. All others, and the torque, are kept as a table X with their products `X^T X`, per joint and third of the samples.
-Equations with new columns F then have the products `[[X^T X, X^T F], [F^T X, F^T F]]`: their residuals are as good as
-from orthogonal factors, as only trials are compared by them.
+curve. All others, and the torque, are kept as a table X with products `X^T X`, per joint and third of the samples.
+Equations with new columns F then have the products `[[X^T X, X^T F], [F^T X, F^T F]]`.
 
 The direction at a sample needs no look at the samples before it: between two reversals it is an exponential in the
 distance travelled since (`direction.py`), so the distances of reversals and of samples are all that is kept.
@@ -11,7 +10,7 @@ distance travelled since (`direction.py`), so the distances of reversals and of 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 from ident_service.config.schema import JointTerm
 from ident_service.errors import RecordingError
 from ident_service.estimation.equations import Equations, Rows, equation_rows
+from ident_service.estimation.moments import Moments
 from ident_service.estimation.smoothing import windows
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters
@@ -33,70 +33,6 @@ FOLDS = 3
 _MOST_ROWS = 30_000  # samples that are kept; of longer recordings every second, every fourth ...
 _CHANGING: tuple[JointTerm, ...] = ("coulomb", "stribeck")
 _GAP = 1.5  # periods: what is longer is no step between neighbours
-_LEAST_COLUMN = 1e-14  # of the longest
-_RIDGE = 1e-12  # of a column's squared length: columns that are alike share what they explain
-_SETTLED = 1e-6  # of a weight
-_MOST_ROUNDS = 100
-
-
-@dataclass(frozen=True)
-class Moments:
-    """Products of the equations' columns, from which least squares can be solved.
-
-    Attributes:
-        supports: per joint, which base parameters it feels, increasing.
-        products: per joint, `[H_b | tau]^T [H_b | tau]` of its support, shape (k + 1, k + 1).
-        rows: equations of each joint, shape (joints,).
-        base: number of base parameters.
-    """
-
-    supports: tuple[NDArray[np.intp], ...]
-    products: tuple[Array, ...]
-    rows: NDArray[np.int64]
-    base: int
-
-    @staticmethod
-    def sum(parts: Sequence[Moments]) -> Moments:
-        """All parts together."""
-        products = tuple(sum(of[1:], of[0]) for of in zip(*(part.products for part in parts), strict=True))
-        return Moments(parts[0].supports, products, np.sum([part.rows for part in parts], axis=0), parts[0].base)
-
-    def solved(self, weights: Array) -> Array:
-        """Minimise the squared residuals, each joint's equations multiplied by its weight; shape (base,)."""
-        total = np.zeros((self.base, self.base))
-        right = np.zeros(self.base)
-        for support, product, weight in zip(self.supports, self.products, weights, strict=True):
-            total[np.ix_(support, support)] += weight**2 * product[:-1, :-1]
-            right[support] += weight**2 * product[:-1, -1]
-        return ridge(total, right)
-
-    def weights(self) -> Array:
-        """Give what the joints' equations are multiplied by so that their residuals are alike, shape (joints,)."""
-        torques = np.array([product[-1, -1] for product in self.products])
-        floor = 1e-9 * np.sqrt(torques / np.maximum(self.rows, 1))
-        weights = np.ones(len(self.products))
-        for _ in range(_MOST_ROUNDS):
-            left = np.sqrt(self.squared_residuals(self.solved(weights)) / np.maximum(self.rows, 1))
-            deviations = np.maximum(left, np.maximum(floor, np.finfo(float).tiny))
-            before, weights = weights, np.exp(np.mean(np.log(deviations))) / deviations
-            if np.all(np.abs(weights - before) <= _SETTLED * weights):
-                break
-        return weights
-
-    def squared_residuals(self, beta: Array) -> Array:
-        """Per joint, the sum of squared torque errors of `beta` [N^2 m^2 or N^2], shape (joints,)."""
-        tried = [np.append(-beta[support], 1.0) for support in self.supports]
-        found = [one @ product @ one for one, product in zip(tried, self.products, strict=True)]
-        return np.maximum(found, 0.0)
-
-
-def ridge(products: Array, right: Array) -> Array:
-    """Solve normal equations of columns that may be alike, or unseen: those get no more than they need."""
-    sizes = np.diag(products)
-    seen = sizes > _LEAST_COLUMN**2 * sizes.max(initial=0.0)
-    unit = np.sqrt(np.where(seen, sizes, 1.0))
-    scaled = np.where(np.outer(seen, seen), products, 0.0) / np.outer(unit, unit) + _RIDGE * np.eye(len(unit))
-    return np.asarray(np.linalg.solve(scaled + np.diag(~seen * 1.0), np.where(seen, right, 0.0) / unit) / unit)
 
 
 @dataclass
@@ -163,7 +99,7 @@ class FrictionTrials:
         """Read the recordings.
 
         Args:
-            recordings: to read, each twice.
+            recordings: to read, each twice; rows are kept, those of long recordings thinned.
             model: the arm; its configuration says how to smooth.
             base: grouping of its parameters.
 
@@ -184,20 +120,24 @@ class FrictionTrials:
         kept = [[column for column in support if int(column) not in changing] for support in self._supports]
         self._kept_columns = kept
         self._travels = [_Travel() for _ in range(joints)]
-        rates, self._filters = [], []
+        rates, keeps, slopes, self._filters = [], [], [], []
         tables: list[list[Array]] = [[] for _ in range(joints)]
         moved = np.zeros(joints, dtype=bool)
         for recording in recordings:
-            time, rate, moving, columns = _thinned_rows(recording, model, base, kept)
-            self._follow(recording, model, time, rate)
-            self._filters.append(_filter(model, time))
-            rates.append(rate)
-            moved |= moving
-            for table, more in zip(tables, columns, strict=True):
+            part = _thinned_rows(recording, model, base, kept)
+            self._follow(recording, model, part.time, part.rate)
+            self._filters.append(_filter(model, part.time))
+            rates.append(part.rate)
+            keeps.append(part.keep)
+            slopes.append(part.slopes)
+            moved |= part.moved
+            for table, more in zip(tables, part.tables, strict=True):
                 table.append(more)
-        self._rate = np.concatenate(rates)
+        self._rate, self._slopes = np.concatenate(rates), np.concatenate(slopes)
+        self._keep: NDArray[np.bool_] = np.concatenate(keeps)
         self._lengths = [len(rate) for rate in rates]
         self._rows = len(self._rate)
+        self._joints = range(joints)
         self._tables = [np.concatenate(table) for table in tables]
         self._thirds = [slice(int(part[0]), int(part[-1]) + 1) for part in np.array_split(np.arange(self._rows), FOLDS)]
         self._products = [[table[third].T @ table[third] for table in self._tables] for third in self._thirds]
@@ -206,6 +146,11 @@ class FrictionTrials:
                 recordings[0].path,
                 f"{', '.join(still)}: never faster than identification.reversal.speed, nothing to identify from",
             )
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        return len(self._tables)
 
     def _follow(self, recording: Recording, model: ArmModel, time: Array, rate: Array) -> None:
         for drive, travel in enumerate(self._travels):
@@ -257,28 +202,57 @@ class FrictionTrials:
 
     @one_blas_thread()
     def equations(self, presliding: Array, stribeck_velocity: Array) -> Equations:
-        """Give the equations for one shape of the friction, in `FOLDS` blocks of consecutive samples.
+        """Give the equations for one shape of the friction, in `FOLDS` blocks, rows near standstill apart.
 
         Args:
             presliding: x0 per drive [rad or m], shape (drives,).
             stribeck_velocity: v_s per drive [rad/s or m/s], shape (drives,).
         """
         used = self._friction(presliding, stribeck_velocity)
-        factors: list[list[Array]] = [[] for _ in self._thirds]
-        for joint, table in enumerate(self._tables):
-            fixed, new, places = self._places(joint)
-            rows = np.empty((len(table), len(self._supports[joint]) + 1), order="F")
-            rows[:, fixed] = table
-            if new:
-                rows[:, places] = self._new_columns(new, used)
-            for parts, third in zip(factors, self._thirds, strict=True):
-                parts.append(triangle(rows[third]))
-        joints = len(self._tables)
-        blocks = tuple(
-            Information(self._supports, tuple(parts), np.full(joints, third.stop - third.start), self._size)
-            for parts, third in zip(factors, self._thirds, strict=True)
-        )
-        return Equations(blocks, self._rows)
+        blocks: list[Information] = []
+        near: list[Information] = []
+        for third in self._thirds:
+            for found, which in ((blocks, self._keep[third]), (near, ~self._keep[third])):
+                factors = [triangle(self._rows_of(joint, used, third)[which[:, joint]]) for joint in self._joints]
+                found.append(Information(self._supports, tuple(factors), np.sum(which, axis=0), self._size))
+        return Equations(tuple(blocks), self._rows, tuple(near))
+
+    @one_blas_thread()
+    def later_torques(self, stribeck_velocity: Array) -> Callable[[float], tuple[Information, ...]]:
+        """Give the rows in motion, per third, as a function of how much later [s] the torque is stamped.
+
+        The torque between its samples is that of its first two derivatives: good for delays that are short beside the
+        period of the filter's cut-off. Where a joint turns round friction looks like a delay; those rows are left out.
+
+        Args:
+            stribeck_velocity: v_s per drive [rad/s or m/s], shape (drives,).
+        """
+        used = self._friction(np.zeros(len(self._travels)), stribeck_velocity)
+        counts = [np.sum(self._keep[third], axis=0) for third in self._thirds]
+        factors = [
+            [
+                triangle(
+                    np.column_stack([self._rows_of(joint, used, third), self._slopes[third, :, joint]])[
+                        self._keep[third, joint]
+                    ]
+                )
+                for joint in self._joints
+            ]
+            for third in self._thirds
+        ]
+
+        def shifted(factor: Array, seconds: float) -> Array:
+            columns = factor[:, :-2].copy()
+            columns[:, -1] += seconds * factor[:, -2] + 0.5 * seconds**2 * factor[:, -1]
+            return triangle(columns)
+
+        def of(seconds: float) -> tuple[Information, ...]:
+            return tuple(
+                Information(self._supports, tuple(shifted(one, seconds) for one in part), count.copy(), self._size)
+                for part, count in zip(factors, counts, strict=True)
+            )
+
+        return of
 
     def _friction(self, presliding: Array, stribeck_velocity: Array) -> dict[JointTerm, Array]:
         direction = np.column_stack(
@@ -298,7 +272,7 @@ class FrictionTrials:
             [low_pass(part, *made) if made else part for part, made in zip(parts, self._filters, strict=True)]
         )
 
-    def _places(self, joint: int) -> tuple[NDArray[np.intp], list[tuple[JointTerm, int, float]], list[int]]:
+    def _places(self, joint: int) -> tuple[NDArray[np.intp], list[tuple[JointTerm, int, float]], NDArray[np.intp]]:
         """Say where in a joint's rows the kept columns and the torque stand, which are new, and where those stand."""
         support = self._supports[joint]
         fixed = np.append(np.searchsorted(support, self._kept_columns[joint]), len(support))
@@ -308,7 +282,16 @@ class FrictionTrials:
                 if share := float(self._coupling[drive, joint]):
                     new.append((term, drive, share))
                     places.append(int(np.searchsorted(support, column)))
-        return fixed, new, places
+        return fixed, new, np.array(places, dtype=np.intp)
+
+    def _rows_of(self, joint: int, used: dict[JointTerm, Array], part: slice) -> Array:
+        """Give a joint's columns and its torque as the last, shape (rows, k + 1)."""
+        fixed, new, places = self._places(joint)
+        rows = np.empty((part.stop - part.start, len(self._supports[joint]) + 1), order="F")
+        rows[:, fixed] = self._tables[joint][part]
+        if new:
+            rows[:, places] = self._new_columns(new, used)[part]
+        return rows
 
     def _new_columns(self, new: Sequence[tuple[JointTerm, int, float]], used: dict[JointTerm, Array]) -> Array:
         columns = [share * used[term][:, drive] for term, drive, share in new]
@@ -328,8 +311,8 @@ def _full_rate(recording: Recording, model: ArmModel) -> Iterator[tuple[Array, A
 
 def _thinned_rows(
     recording: Recording, model: ArmModel, base: BaseParameters, columns: Sequence[Sequence[int]]
-) -> tuple[Array, Array, NDArray[np.bool_], list[Array]]:
-    """Give times [s], drive velocities, which joints move, and per joint its columns with the torque as the last."""
+) -> _Part:
+    """Read a recording's rows; a joint's table has its columns with the torque as the last."""
     parts: list[_Part] = []
     every, count, seen = 1, 0, 0
     for rows in equation_rows(recording, model, base):
@@ -339,11 +322,20 @@ def _thinned_rows(
         count += len(picked)
         if count > 2 * _MOST_ROWS:
             parts = [_joined(parts, 2)]
-            every, count = 2 * every, len(parts[0][0])
+            every, count = 2 * every, len(parts[0].time)
     return _joined(parts, 1)
 
 
-_Part = tuple[Array, Array, NDArray[np.bool_], list[Array]]
+@dataclass(frozen=True)
+class _Part:
+    """Thinned rows: times [s], drive velocities, rows in motion, the torque's two derivatives, tables per joint."""
+
+    time: Array
+    rate: Array
+    keep: NDArray[np.bool_]
+    slopes: Array
+    moved: NDArray[np.bool_]
+    tables: list[Array]
 
 
 def _part(rows: Rows, picked: NDArray[np.intp], columns: Sequence[Sequence[int]], model: ArmModel) -> _Part:
@@ -351,18 +343,26 @@ def _part(rows: Rows, picked: NDArray[np.intp], columns: Sequence[Sequence[int]]
         np.column_stack([rows.H_b[joint][np.array(own)[:, None], picked].T, rows.torque[picked, joint]])
         for joint, own in enumerate(columns)
     ]
+    slopes = np.zeros((len(rows.time), 2, rows.torque.shape[1]))
+    if len(rows.time) > 2:
+        slopes[:, 0] = np.gradient(rows.torque, rows.time, axis=0)
+        slopes[:, 1] = np.gradient(slopes[:, 0], rows.time, axis=0)
     moved: NDArray[np.bool_] = np.logical_or.reduce(rows.moving)
-    return rows.time[picked], rows.velocity[picked] @ model.chain.coupling.T, moved, tables
+    rate = rows.velocity[picked] @ model.chain.coupling.T
+    return _Part(rows.time[picked], rate, rows.keep[picked], slopes[picked], moved, tables)
 
 
 def _joined(parts: Sequence[_Part], every: int) -> _Part:
-    time, rate, moving, tables = zip(*parts, strict=True)
-    moved: NDArray[np.bool_] = np.logical_or.reduce(moving)
-    return (
-        np.concatenate(time)[::every],
-        np.concatenate(rate)[::every],
-        moved,
-        [np.concatenate(joint)[::every] for joint in zip(*tables, strict=True)],
+    def whole(arrays: Iterable[Array]) -> Array:
+        return np.concatenate(list(arrays))[::every]
+
+    return _Part(
+        whole(part.time for part in parts),
+        whole(part.rate for part in parts),
+        np.concatenate([part.keep for part in parts])[::every],
+        whole(part.slopes for part in parts),
+        np.logical_or.reduce([part.moved for part in parts]),
+        [whole(joint) for joint in zip(*(part.tables for part in parts), strict=True)],
     )
 
 

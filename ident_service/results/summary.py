@@ -10,6 +10,7 @@ import numpy as np
 from ident_service.estimation.doubt import IDENTIFIED_BELOW, NEGLIGIBLE_TORQUE, WEAK_BELOW
 from ident_service.estimation.identify import Candidate, Estimate
 from ident_service.estimation.least_squares import TorqueError
+from ident_service.model.layout import NO_STRIBECK
 from ident_service.model.likely_bodies import IN_WORDS
 from ident_service.results.rows_and_filter import how_fitted, wrapped
 
@@ -91,7 +92,9 @@ def _found_before(estimate: Estimate) -> list[str]:
     if presliding.any():
         lines.append("pre-sliding way [rad or m]: " + " ".join(f"{value:.2g}" for value in presliding))
     if model.layout.stribeck_velocity:
-        velocities = " ".join(f"{value:.2g}" for value in model.layout.stribeck_velocity)
+        velocities = " ".join(
+            f"{value:.2g}" if value > NO_STRIBECK else "none" for value in model.layout.stribeck_velocity
+        )
         lines.append(f"Stribeck velocity [rad/s or m/s]: {velocities}")
     if (prepared.torque_scales != 1.0).any():
         lines.append("measured torques multiplied by: " + " ".join(f"{value:.4g}" for value in prepared.torque_scales))
