@@ -167,14 +167,17 @@ class _Search:
     def best(self, values: _Numbers, trials: Sequence[_Numbers], *, predicting: bool = False) -> _Numbers:
         """Per drive, the trial that leaves its joint the smallest residual, or predicts its torque best."""
         # Joints weigh alike in all trials, as the values that were best so far have it.
-        weights = Moments.sum(self._moments(values)).weights()
+        weights = self._moments(values)[0].weights()
         terms = _own_terms(self.model, self.base)
         left = []
         for trial in trials:
-            thirds = self._moments(values | trial)
-            total = Moments.sum(thirds)
+            (total,) = self._moments(values | trial)
             beta = total.solved(weights)
-            left.append(_unpredicted(thirds, beta, terms) if predicting else total.squared_residuals(beta))
+            left.append(
+                _unpredicted(self._moments(values | trial, self.trials.thirds), beta, terms)
+                if predicting
+                else total.squared_residuals(beta)
+            )
         choice = np.argmin(np.array(left), axis=0)
         return values | {
             key: np.array([trials[index][key][drive] for drive, index in enumerate(choice)]) for key in trials[0]
@@ -205,8 +208,8 @@ class _Search:
     def _equations(self, values: _Numbers) -> Equations:
         return self.trials.equations(values["presliding"], values["stribeck_velocity"])
 
-    def _moments(self, values: _Numbers) -> tuple[Moments, ...]:
-        return self.trials.moments(values["presliding"], values["stribeck_velocity"])
+    def _moments(self, values: _Numbers, parts: Sequence[slice] | None = None) -> list[Moments]:
+        return self.trials.moments(values["presliding"], values["stribeck_velocity"], parts)
 
 
 def _own_terms(model: ArmModel, base: BaseParameters) -> NDArray[np.bool_]:
@@ -216,8 +219,6 @@ def _own_terms(model: ArmModel, base: BaseParameters) -> NDArray[np.bool_]:
 
 def _unpredicted(thirds: Sequence[Moments], beta: Array, terms: NDArray[np.bool_]) -> Array:
     """Per joint, the squared errors of each third as predicted from the other two, shape (joints,)."""
-    if min(int(third.rows.min()) for third in thirds) == 0:
-        return Moments.sum(thirds).squared_residuals(beta)
     total = np.zeros(len(thirds[0].products))
     for joint, support in enumerate(thirds[0].supports):
         own = np.flatnonzero(terms[support])

@@ -139,8 +139,9 @@ class FrictionTrials:
         self._rows = len(self._rate)
         self._joints = range(joints)
         self._tables = [np.concatenate(table) for table in tables]
-        self._thirds = [slice(int(part[0]), int(part[-1]) + 1) for part in np.array_split(np.arange(self._rows), FOLDS)]
-        self._products = [[table[third].T @ table[third] for table in self._tables] for third in self._thirds]
+        self.thirds = [slice(self._rows * k // FOLDS, self._rows * (k + 1) // FOLDS) for k in range(FOLDS)]
+        self._products: dict[tuple[int, int, int], Array] = {}
+        self._places = [self._places_of(joint) for joint in self._joints]
         if still := [name for joint, name in enumerate(model.chain.names) if not moved[joint]]:
             raise RecordingError(
                 recordings[0].path,
@@ -172,33 +173,45 @@ class FrictionTrials:
             last = times[-1]
 
     @one_blas_thread()
-    def moments(self, presliding: Array, stribeck_velocity: Array) -> tuple[Moments, ...]:
-        """Give the products of the equations for one shape of the friction, of each third of the samples.
+    def moments(
+        self, presliding: Array, stribeck_velocity: Array, parts: Sequence[slice] | None = None
+    ) -> list[Moments]:
+        """Give the products of the equations for one shape of the friction.
 
         Args:
             presliding: x0 per drive [rad or m], shape (drives,).
             stribeck_velocity: v_s per drive [rad/s or m/s], shape (drives,).
+            parts: of the samples, one result each, such as `thirds`; all together when None.
         """
         used = self._friction(presliding, stribeck_velocity)
-        found: list[list[Array]] = [[] for _ in self._thirds]
+        wanted = [slice(0, self._rows)] if parts is None else list(parts)
+        found: list[list[Array]] = [[] for _ in wanted]
         for joint, table in enumerate(self._tables):
-            fixed, new, places = self._places(joint)
-            F = self._new_columns(new, used)
+            fixed, new, places = self._places[joint]
             size = len(self._supports[joint]) + 1
-            for parts, kept, third in zip(found, self._products, self._thirds, strict=True):
+            F = self._new_columns(new, used)
+            for products, part in zip(found, wanted, strict=True):
                 product = np.empty((size, size))
-                product[np.ix_(fixed, fixed)] = kept[joint]
+                product[fixed[:, None], fixed] = self._kept_products(joint, part)
                 if new:
-                    across = table[third].T @ F[third]
-                    product[np.ix_(fixed, places)] = across
-                    product[np.ix_(places, fixed)] = across.T
-                    product[np.ix_(places, places)] = F[third].T @ F[third]
-                parts.append(product)
-        joints = len(self._tables)
-        return tuple(
-            Moments(self._supports, tuple(parts), np.full(joints, third.stop - third.start), self._size)
-            for parts, third in zip(found, self._thirds, strict=True)
-        )
+                    across = table[part].T @ F[part]
+                    product[fixed[:, None], places] = across
+                    product[places[:, None], fixed] = across.T
+                    product[places[:, None], places] = F[part].T @ F[part]
+                products.append(product)
+        counts = [part.stop - part.start for part in wanted]
+        return [
+            Moments(self._supports, tuple(products), np.full(self.joints, count), self._size)
+            for products, count in zip(found, counts, strict=True)
+        ]
+
+    def _kept_products(self, joint: int, part: slice) -> Array:
+        """Give X^T X of a joint's kept columns and torque, computed once for each part."""
+        key = (joint, part.start, part.stop)
+        if key not in self._products:
+            rows = self._tables[joint][part]
+            self._products[key] = rows.T @ rows
+        return self._products[key]
 
     @one_blas_thread()
     def equations(self, presliding: Array, stribeck_velocity: Array) -> Equations:
@@ -211,7 +224,7 @@ class FrictionTrials:
         used = self._friction(presliding, stribeck_velocity)
         blocks: list[Information] = []
         near: list[Information] = []
-        for third in self._thirds:
+        for third in self.thirds:
             for found, which in ((blocks, self._keep[third]), (near, ~self._keep[third])):
                 factors = [triangle(self._rows_of(joint, used, third)[which[:, joint]]) for joint in self._joints]
                 found.append(Information(self._supports, tuple(factors), np.sum(which, axis=0), self._size))
@@ -228,7 +241,7 @@ class FrictionTrials:
             stribeck_velocity: v_s per drive [rad/s or m/s], shape (drives,).
         """
         used = self._friction(np.zeros(len(self._travels)), stribeck_velocity)
-        counts = [np.sum(self._keep[third], axis=0) for third in self._thirds]
+        counts = [np.sum(self._keep[third], axis=0) for third in self.thirds]
         factors = [
             [
                 triangle(
@@ -238,7 +251,7 @@ class FrictionTrials:
                 )
                 for joint in self._joints
             ]
-            for third in self._thirds
+            for third in self.thirds
         ]
 
         def shifted(factor: Array, seconds: float) -> Array:
@@ -272,7 +285,7 @@ class FrictionTrials:
             [low_pass(part, *made) if made else part for part, made in zip(parts, self._filters, strict=True)]
         )
 
-    def _places(self, joint: int) -> tuple[NDArray[np.intp], list[tuple[JointTerm, int, float]], NDArray[np.intp]]:
+    def _places_of(self, joint: int) -> tuple[NDArray[np.intp], list[tuple[JointTerm, int, float]], NDArray[np.intp]]:
         """Say where in a joint's rows the kept columns and the torque stand, which are new, and where those stand."""
         support = self._supports[joint]
         fixed = np.append(np.searchsorted(support, self._kept_columns[joint]), len(support))
@@ -286,7 +299,7 @@ class FrictionTrials:
 
     def _rows_of(self, joint: int, used: dict[JointTerm, Array], part: slice) -> Array:
         """Give a joint's columns and its torque as the last, shape (rows, k + 1)."""
-        fixed, new, places = self._places(joint)
+        fixed, new, places = self._places[joint]
         rows = np.empty((part.stop - part.start, len(self._supports[joint]) + 1), order="F")
         rows[:, fixed] = self._tables[joint][part]
         if new:

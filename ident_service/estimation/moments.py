@@ -6,7 +6,6 @@ same; estimates themselves come from factors (`least_squares.py`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,18 +35,12 @@ class Moments:
     rows: NDArray[np.int64]
     base: int
 
-    @staticmethod
-    def sum(parts: Sequence[Moments]) -> Moments:
-        """All parts together."""
-        products = tuple(sum(of[1:], of[0]) for of in zip(*(part.products for part in parts), strict=True))
-        return Moments(parts[0].supports, products, np.sum([part.rows for part in parts], axis=0), parts[0].base)
-
     def solved(self, weights: Array) -> Array:
         """Minimise the squared residuals, each joint's equations multiplied by its weight; shape (base,)."""
         total = np.zeros((self.base, self.base))
         right = np.zeros(self.base)
         for support, product, weight in zip(self.supports, self.products, weights, strict=True):
-            total[np.ix_(support, support)] += weight**2 * product[:-1, :-1]
+            total[support[:, None], support] += weight**2 * product[:-1, :-1]
             right[support] += weight**2 * product[:-1, -1]
         return ridge(total, right)
 
