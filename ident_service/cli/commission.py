@@ -153,6 +153,7 @@ def _exit_code(estimate: Estimate, unusable: Sequence[str]) -> int:
 
 
 def _estimate_document(estimate: Estimate, unusable: Sequence[str]) -> dict[str, Any]:
+    from ident_service.results.link_values import implausible_links
     from ident_service.results.parameter_file import convex_document
     from ident_service.results.rows_and_filter import how_fitted
 
@@ -164,6 +165,7 @@ def _estimate_document(estimate: Estimate, unusable: Sequence[str]) -> dict[str,
         "feasible": estimate.feasible,
         "margin": estimate.margin,
         "relative_error_percent": own.identification.relative_percent,
+        "implausible_links": list(implausible_links(estimate)),
         "rows_and_filter": list(how_fitted(estimate)),
         "validation": [
             {"recording": score.recording, "relative_error_percent": score.error.relative_percent}
