@@ -19,7 +19,12 @@ from ident_service.estimation.feasible.convex import convex_least_squares
 from ident_service.estimation.feasible.feasible_set import SetName
 from ident_service.estimation.identify import Estimate, identify
 from ident_service.estimation.least_squares import LeastSquares
-from ident_service.estimation.plausibility import reasons_against, reasons_in_recording, remarks_on_limits
+from ident_service.estimation.plausibility import (
+    reasons_against,
+    reasons_in_length,
+    reasons_in_recording,
+    remarks_on_limits,
+)
 from ident_service.estimation.proof.sdpa import bpfc_sdpa, bpft_sdpa, fbpe_sdpa
 from ident_service.model.arm_model import arm_model
 from ident_service.model.chain import Array
@@ -194,7 +199,13 @@ def unusable_because(estimate: Estimate, found: Sequence[tuple[Recording, Qualit
     """Say why an estimate must not be used, from the recordings that it knows and from its errors."""
     model = estimate.model
     seen = (reasons_in_recording(recording.path.name, one.joints, model) for recording, one in found)
-    return (*(reason for reasons in seen for reason in reasons), *reasons_against(estimate))
+    fitted = set(estimate.recordings)
+    seconds = sum(one.duration_s for recording, one in found if (recording.path.name, recording.sha256) in fitted)
+    return (
+        *(reason for reasons in seen for reason in reasons),
+        *reasons_against(estimate),
+        *reasons_in_length(estimate, seconds),
+    )
 
 
 def _config(config: ArmConfig, request: Request) -> ArmConfig:
