@@ -32,6 +32,7 @@ from ident_service.record.recording import Recording
 _SETTLED = 1e-6  # s
 _MOST_ROUNDS = 30
 _STEP, _STEPS = 2e-3, 4  # s and number: least and most steps, of at least a sample, in the search for a delay
+_FINEST = 0.1  # steps; a smaller difference is none
 _LARGEST = 0.2  # s; beyond this the channels do not belong together
 
 
@@ -118,11 +119,13 @@ def choose_delay(
     best = min((0, -1, 1), key=error)
     while best and abs(best) < _STEPS and error(best + int(np.sign(best))) < error(best):
         best += int(np.sign(best))
-    finest = float(best)
-    if best and abs(best) < _STEPS:
+    found = float(best)
+    if abs(best) < _STEPS:
         low, middle, high = (error(best + k) for k in (-1, 0, 1))
-        finest += 0.5 * (low - high) / (low - 2.0 * middle + high)
-    found = min((float(best), finest), key=error)
+        bend = low - 2.0 * middle + high
+        vertex = 0.5 * (low - high) / bend if bend > 0.0 else 0.0  # of the parabola through the three
+        if abs(vertex) > _FINEST:
+            found = min((found, found + vertex), key=error)
     ways = {f"{1e3 * steps * step:.3g} ms": steps for steps in (0.0, found or min((-1.0, 1.0), key=error))}
     choice = clearly_chosen("delay", {name: tried[steps] for name, steps in ways.items()})
     return step * ways[choice.value], choice
