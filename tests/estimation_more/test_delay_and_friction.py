@@ -127,7 +127,7 @@ def test_a_delay_beyond_reason_is_refused() -> None:
         estimate_delay([late(0.35)], model, base)
 
 
-@pytest.mark.parametrize(("seconds", "taken"), [(0.0, False), (0.0015, True), (0.006, True), (-0.01, True)])
+@pytest.mark.parametrize(("seconds", "taken"), [(0.0, False), (0.003, True), (0.006, True), (-0.01, True)])
 def test_a_delay_is_chosen_where_there_is_one(seconds: float, taken: bool) -> None:
     model, _, _ = two_links()
     estimate = identify(with_options(model, plain_options(smoothing=SMOOTH, delay="choose")), [late(seconds)])
