@@ -37,12 +37,23 @@ class Moments:
 
     def solved(self, weights: Array) -> Array:
         """Minimise the squared residuals, each joint's equations multiplied by its weight; shape (base,)."""
-        total = np.zeros((self.base, self.base))
-        right = np.zeros(self.base)
+        return ridge(*self._normal(weights))
+
+    def estimate(self) -> tuple[Array, Array]:
+        """Minimise the squared residuals; give the estimate and its deviations (eq. 81), shape (base,) each."""
+        total, right = self._normal(np.ones(len(self.products)))
+        beta = ridge(total, right)
+        variance = float(self.squared_residuals(beta).sum()) / max(int(self.rows.sum()) - self.base, 1)
+        inverse = ridge(total, np.eye(self.base))
+        variances = np.where(np.diag(inverse) > 0.0, variance * np.diag(inverse), np.inf)
+        return beta, np.sqrt(variances)
+
+    def _normal(self, weights: Array) -> tuple[Array, Array]:
+        total, right = np.zeros((self.base, self.base)), np.zeros(self.base)
         for support, product, weight in zip(self.supports, self.products, weights, strict=True):
             total[support[:, None], support] += weight**2 * product[:-1, :-1]
             right[support] += weight**2 * product[:-1, -1]
-        return ridge(total, right)
+        return total, right
 
     def weights(self) -> Array:
         """Give what the joints' equations are multiplied by so that their residuals are alike, shape (joints,)."""
@@ -65,9 +76,15 @@ class Moments:
 
 
 def ridge(products: Array, right: Array) -> Array:
-    """Solve normal equations of columns that may be alike, or unseen: those get no more than they need."""
+    """Solve normal equations of columns that may be alike, or unseen: those get no more than they need, or zero.
+
+    Args:
+        products: of the columns, shape (columns, columns).
+        right: their products with what is to be explained, shape (columns,) or (columns, cases).
+    """
     sizes = np.diag(products)
     seen = sizes > _LEAST_COLUMN**2 * sizes.max(initial=0.0)
-    unit = np.sqrt(np.where(seen, sizes, 1.0))
-    scaled = np.where(np.outer(seen, seen), products, 0.0) / np.outer(unit, unit) + _RIDGE * np.eye(len(unit))
-    return np.asarray(np.linalg.solve(scaled + np.diag(~seen * 1.0), np.where(seen, right, 0.0) / unit) / unit)
+    unit = np.sqrt(np.where(seen, sizes, np.inf))
+    scaled = products / np.outer(unit, unit)
+    np.fill_diagonal(scaled, 1.0 + _RIDGE)
+    return np.asarray((np.linalg.solve(scaled, (right.T / unit).T).T / unit).T)

@@ -71,11 +71,11 @@ def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_off
         SolverError: the solver stopped without an optimum.
     """
     require_place(out)
-    require_replaceable(out)
     if not run.is_dir():
         raise UsageError(f"{run}: not a folder; give the folder of results of the arm without the load")
     if out.exists() and out.samefile(run):
         raise UsageError(f"{out}: would replace the arm's own parameters; give another folder")
+    require_replaceable(out)
     side = read_side(run)
     arm = known_arm(side)
     known = side.content.get("torque")  # the difference of two torques is the load's only where both are of one kind
