@@ -26,6 +26,7 @@ from ident_service.model.base import base_parameters
 from ident_service.model.regressor import joint_regressor
 from ident_service.model.rigid_body import pinocchio_model
 from ident_service.motion.factory import make_arm
+from ident_service.record.kept import KeptRecording
 from ident_service.record.open import open_recording
 from ident_service.results.parameter_file import parameters_document, write_parameters
 from ident_service.service.commission import record_motion
@@ -100,7 +101,7 @@ def _estimation(model: ArmModel, folder: Path) -> list[Row]:
     names = model.chain.names
 
     def whole() -> None:
-        estimate = identify(model, [open_recording(path, names)])
+        estimate = identify(model, [KeptRecording(open_recording(path, names))])  # as the command reads it
         write_parameters(folder / "parameters.json", parameters_document(estimate))
 
     base = base_parameters(model.chain, model.layout)

@@ -48,7 +48,7 @@ def add(verbs: Verbs) -> None:
     sub.add_argument("--method", choices=["ols", "wls", "huber", "iv"], help="default: the arm's")
     sub.add_argument("--prior", choices=["none", "euclidean", "entropic"], help="draw the estimate to the arm's prior")
     sub.add_argument("--prior-weight", type=weight, metavar="W", help="default: chosen on held-out data")
-    sub.add_argument("--delay", type=delay, metavar="SECONDS", help="of the torque's stamps, or 'estimate'")
+    sub.add_argument("--delay", type=delay, metavar="SECONDS", help="of the torque's stamps, 'estimate' or 'choose'")
     sub.add_argument(
         "--bootstrap", type=replicates, default=0, metavar="N", help="replicates of the constrained estimate"
     )
@@ -153,6 +153,7 @@ def _exit_code(estimate: Estimate, unusable: Sequence[str]) -> int:
 
 
 def _estimate_document(estimate: Estimate, unusable: Sequence[str]) -> dict[str, Any]:
+    from ident_service.results.link_values import implausible_links
     from ident_service.results.parameter_file import convex_document
     from ident_service.results.rows_and_filter import how_fitted
 
@@ -164,6 +165,7 @@ def _estimate_document(estimate: Estimate, unusable: Sequence[str]) -> dict[str,
         "feasible": estimate.feasible,
         "margin": estimate.margin,
         "relative_error_percent": own.identification.relative_percent,
+        "implausible_links": list(implausible_links(estimate)),
         "rows_and_filter": list(how_fitted(estimate)),
         "validation": [
             {"recording": score.recording, "relative_error_percent": score.error.relative_percent}

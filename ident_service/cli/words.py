@@ -197,13 +197,13 @@ def _positive(text: str, otherwise: str) -> float:
 
 
 def delay(text: str) -> float | str:
-    """Seconds, or the word that asks for them to be found."""
-    if text == "estimate":
+    """Seconds, or a word that asks for them to be found."""
+    if text in ("estimate", "choose"):
         return text
     try:
         value = float(text)
     except ValueError:
         value = float("nan")
     if not abs(value) < 1.0:
-        raise argparse.ArgumentTypeError("a delay is a number of seconds below 1, or 'estimate'")
+        raise argparse.ArgumentTypeError("a delay is a number of seconds below 1, 'estimate' or 'choose'")
     return value

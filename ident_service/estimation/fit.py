@@ -15,7 +15,7 @@ import numpy as np
 from ident_service.config.schema import Method
 from ident_service.estimation import instruments, robust
 from ident_service.estimation.choices import Choice, chosen, held_out_error
-from ident_service.estimation.delay import Delay, estimate_delay, with_delay
+from ident_service.estimation.delay import Delay, choose_delay, estimate_delay, with_delay
 from ident_service.estimation.doubt import uncertainty, widening
 from ident_service.estimation.equations import Equations, equations
 from ident_service.estimation.feasible.central import Near
@@ -23,7 +23,7 @@ from ident_service.estimation.feasible.feasibility import constrained_least_squa
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.feasible.priors import residual_deviation
 from ident_service.estimation.feasible.torque_scales import constrained_least_squares_with_scales, scale_bounds
-from ident_service.estimation.friction_fit import fit_friction
+from ident_service.estimation.friction_fit import fit_friction, friction_trials, to_be_fitted
 from ident_service.estimation.instruments import instrumental_variables
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares, weighted_least_squares
 from ident_service.estimation.robust import held_out_errors, huber
@@ -33,6 +33,7 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.layout import INERTIAL
+from ident_service.record.grid import grid
 from ident_service.record.recording import Recording
 
 SAME = 0.01  # of its deviation: a parameter that changes by less is as good as the same
@@ -100,7 +101,7 @@ def prepare(
         recordings: to fit to.
         model: the arm.
         base: grouping of the parameters.
-        conditions: that torque constants are found under.
+        conditions: that torque constants are found under, and choices judged.
         validation: what will be judged on; only whether it has velocities is looked at.
 
     Raises:
@@ -109,12 +110,26 @@ def prepare(
         SolverError: the solver stopped without an optimum.
     """
     model, choices = _with_velocity(recordings, validation, model, base)
-    delay = None
+    delay, wanted = None, model.config.identification.delay
     # Before the friction, whose turning round would take a delay for a longer way.
-    if model.config.identification.delay == "estimate":
+    if wanted == "estimate":
         delay = estimate_delay(recordings, model, base)
         model = with_delay(model, delay.seconds)
-    model = fit_friction(recordings, model, base)
+    trials = None
+    if wanted == "choose":
+        seconds = 0.0
+        # A period's derivatives are those of its harmonics, and its torque has no filter.
+        if model.config.identification.period is None:
+            trials = friction_trials(recordings, model, base)
+            period = min(grid(recording, model.config.recording).period_s for recording in recordings)
+            seconds, choice = choose_delay(trials, period, base, conditions)
+            choices += () if choice is None else (choice,)
+        model = with_delay(model, seconds)
+        trials = trials if seconds == 0.0 else None
+    if trials is None and to_be_fitted(model):
+        trials = friction_trials(recordings, model, base)
+    model, shapes = fit_friction(trials, model, base, conditions)
+    choices += shapes
     gathered = gather(recordings, model, base)
     scales = np.ones(model.chain.joints)
     if bounds := scale_bounds(model.config, model.chain.names):

@@ -6,6 +6,9 @@ searches begin differently, the numbers in turn or all their pairs at once, beca
 Between their results decides what predicts better: the recordings are cut into thirds, and each third's torque is
 predicted by friction fitted to the other two, inertias being those of the whole. A shape that only explains what it has
 seen, such as a spike at a few reversals, loses there. Nothing but the recordings that are fitted to is looked at.
+
+An arm without pre-sliding, or without Stribeck friction, is the alternative: it is taken where it predicts held-out
+thirds clearly better (`choices.py`).
 """
 
 from __future__ import annotations
@@ -15,18 +18,20 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from ident_service.config.schema import FrictionShape
+from ident_service.estimation.choices import Choice, clearly_chosen, held_out_thirds
 from ident_service.estimation.equations import Equations
-from ident_service.estimation.friction_trials import FOLDS, FrictionTrials
-from ident_service.estimation.least_squares import unit_columns, weighted_least_squares
+from ident_service.estimation.feasible.feasible_set import FeasibleSet
+from ident_service.estimation.friction_trials import FrictionTrials
+from ident_service.estimation.least_squares import weighted_least_squares
+from ident_service.estimation.moments import Moments, ridge
+from ident_service.estimation.standstill import standstill_shares
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
-from ident_service.model.information import Information
-from ident_service.model.layout import INERTIAL
+from ident_service.model.layout import INERTIAL, NO_STRIBECK
 from ident_service.record.recording import Recording
 
 # No gear gives by more than three degrees before it slips; a Stribeck velocity is a small share of full speed.
@@ -34,6 +39,8 @@ _GRIDS: dict[str, Array] = {
     "presliding": np.array([0.0, *np.geomspace(3e-4, 0.05, 8)]),
     "stribeck_velocity": np.geomspace(0.02, 0.8, 8),
 }
+# What stands for none of it: nothing is left of Stribeck friction at a speed that is ever recorded.
+_NONE = {"presliding": 0.0, "stribeck_velocity": NO_STRIBECK}
 _FINER = np.array([0.6, 0.8, 1.0, 1.25, 1.6])
 _ROUNDS = 2
 _RATE = 125.0  # Hz; friction changes slowly enough to be fitted on fewer rows
@@ -51,23 +58,41 @@ def with_friction(model: ArmModel, shape: FrictionShape) -> ArmModel:
     return replace(model, config=config, layout=replace(model.layout, stribeck_velocity=velocities))
 
 
-def fit_friction(recordings: Sequence[Recording], model: ArmModel, base: BaseParameters) -> ArmModel:
-    """The arm with every number that its configuration leaves to be fitted.
-
-    Args:
-        recordings: to fit to.
-        model: the arm; `identification.friction` says what to fit.
-        base: grouping of its parameters, which these numbers do not change.
+def friction_trials(recordings: Sequence[Recording], model: ArmModel, base: BaseParameters) -> FrictionTrials:
+    """Read recordings for trials of friction, on fewer rows than the estimate has.
 
     Raises:
         RecordingError: a recording cannot be used.
     """
+    return FrictionTrials(recordings, _thinned(model, recordings), base)
+
+
+def to_be_fitted(model: ArmModel) -> tuple[str, ...]:
+    """Name the numbers of the friction's shape that are left to be fitted, and mean something for this arm."""
+    shape, terms = model.config.identification.friction, set(model.layout.terms)
+    if not {"coulomb", "stribeck"} & terms:
+        return ()
+    return tuple(
+        key for key in _GRIDS if getattr(shape, key) == "fit" and (key != "stribeck_velocity" or "stribeck" in terms)
+    )
+
+
+def fit_friction(
+    trials: FrictionTrials | None, model: ArmModel, base: BaseParameters, conditions: FeasibleSet | None = None
+) -> tuple[ArmModel, tuple[Choice, ...]]:
+    """Fit every number that the configuration leaves to be fitted.
+
+    Args:
+        trials: of the recordings that are fitted to; None is for where nothing is to be fitted.
+        model: the arm; `identification.friction` says what to fit.
+        base: grouping of its parameters, which these numbers do not change.
+        conditions: that choices are judged under; nothing is chosen when None.
+
+    Returns:
+        The arm with its numbers, and for each kind whether it was fitted or left out.
+    """
     shape = model.config.identification.friction
-    wanted = [key for key in _GRIDS if getattr(shape, key) == "fit"]
-    if "stribeck" not in model.layout.terms:
-        wanted = [key for key in wanted if key != "stribeck_velocity"]
-    if not {"coulomb", "stribeck"} & set(model.layout.terms):
-        wanted = []
+    wanted = to_be_fitted(model)
     joints = model.chain.joints
     values = {
         key: np.full(joints, 0.1 if key == "stribeck_velocity" else 0.0)
@@ -75,13 +100,16 @@ def fit_friction(recordings: Sequence[Recording], model: ArmModel, base: BasePar
         else np.broadcast_to(np.asarray(getattr(shape, key), dtype=float), (joints,)).copy()
         for key in _GRIDS
     }
-    if wanted:
-        search = _Search(FrictionTrials(recordings, _thinned(model, recordings), base), model, base)
+    choices: list[Choice] = []
+    if wanted and trials is not None:
+        search = _Search(trials, model, base)
         found = [
             search.finer(start, wanted) for start in (search.in_turn(values, wanted), search.pairs(values, wanted))
         ]
-        values = search.best(values, found, predicting=True)
-    return with_friction(model, _shape(values))
+        start, values = values, search.best(values, found, predicting=True)
+        if conditions is not None:
+            values, choices = search.chosen(start, values, wanted, conditions)
+    return with_friction(model, _shape(values)), tuple(choices)
 
 
 def at_the_edge(shape: FrictionShape, joints: Sequence[str], terms: Sequence[str]) -> tuple[str, ...]:
@@ -98,7 +126,7 @@ def at_the_edge(shape: FrictionShape, joints: Sequence[str], terms: Sequence[str
             continue
         grid = _GRIDS[key]
         for name, value in zip(joints, np.broadcast_to(np.asarray(getattr(shape, key)), len(joints)), strict=True):
-            if value >= grid[-1] or (0.0 < value <= grid[0]):
+            if value >= grid[-1] or (_NONE[key] < value <= grid[0]):
                 edge = "largest" if value >= grid[-1] else "smallest"
                 found.append(f"{name}: its {what} of {value:g} is the {edge} that is searched")
     return tuple(found)
@@ -139,29 +167,49 @@ class _Search:
     def best(self, values: _Numbers, trials: Sequence[_Numbers], *, predicting: bool = False) -> _Numbers:
         """Per drive, the trial that leaves its joint the smallest residual, or predicts its torque best."""
         # Joints weigh alike in all trials, as the values that were best so far have it.
-        weights = weighted_least_squares(self._equations(values).total).weights
+        weights = self._moments(values)[0].weights()
+        terms = _own_terms(self.model, self.base)
         left = []
         for trial in trials:
-            gathered = self._equations(values | trial)
-            beta = _solved(gathered.total, weights)
-            terms = _own_terms(self.model, self.base)
-            left.append(_unpredicted(gathered, beta, terms) if predicting else gathered.total.squared_residuals(beta))
+            (total,) = self._moments(values | trial)
+            beta = total.solved(weights)
+            left.append(
+                _unpredicted(self._moments(values | trial, self.trials.thirds), beta, terms)
+                if predicting
+                else total.squared_residuals(beta)
+            )
         choice = np.argmin(np.array(left), axis=0)
         return values | {
             key: np.array([trials[index][key][drive] for drive, index in enumerate(choice)]) for key in trials[0]
         }
 
+    def chosen(
+        self, start: _Numbers, fitted: _Numbers, wanted: Sequence[str], conditions: FeasibleSet
+    ) -> tuple[_Numbers, list[Choice]]:
+        """Leave out each kind, the others fitted anew, and see whether held-out thirds are clearly better without."""
+        values, choices = fitted, []
+        gathered = self._equations(fitted)
+        shares = standstill_shares(gathered)
+        weights = weighted_least_squares(gathered.with_near(shares).total).weights
+        for key in wanted:
+            if np.all(values[key] <= _NONE[key]):
+                continue
+            without = start | {key: np.full_like(values[key], _NONE[key])}
+            others = [other for other in wanted if other != key and not np.all(values[other] <= _NONE[other])]
+            without = self.finer(self.in_turn(without, others), others)
+            errors = {
+                name: held_out_thirds(self._equations(way).with_near(shares).blocks, weights, self.base, conditions)
+                for name, way in (("fit", values), ("none", without))
+            }
+            choices.append(clearly_chosen(f"friction.{key}", errors))
+            values = values if choices[-1].value == "fit" else without
+        return values, choices
+
     def _equations(self, values: _Numbers) -> Equations:
         return self.trials.equations(values["presliding"], values["stribeck_velocity"])
 
-
-def _solved(information: Information, weights: Array) -> Array:
-    """Solve eq. 60 alone, without what `least_squares` says about its quality."""
-    R = information.stacked(weights)
-    unit, seen = unit_columns(R[:, :-1])
-    # By columns of unit length, with pivots: a shape may make two columns of a drive alike.
-    columns = np.where(seen, R[:, :-1], 0.0) / unit
-    return np.asarray(scipy.linalg.lstsq(columns, R[:, -1], cond=1e-10, lapack_driver="gelsy")[0] / unit)
+    def _moments(self, values: _Numbers, parts: Sequence[slice] | None = None) -> list[Moments]:
+        return self.trials.moments(values["presliding"], values["stribeck_velocity"], parts)
 
 
 def _own_terms(model: ArmModel, base: BaseParameters) -> NDArray[np.bool_]:
@@ -169,26 +217,21 @@ def _own_terms(model: ArmModel, base: BaseParameters) -> NDArray[np.bool_]:
     return np.asarray(base.base % model.layout.per_link >= len(INERTIAL))
 
 
-def _unpredicted(gathered: Equations, beta: Array, terms: NDArray[np.bool_]) -> Array:
+def _unpredicted(thirds: Sequence[Moments], beta: Array, terms: NDArray[np.bool_]) -> Array:
     """Per joint, the squared errors of each third as predicted from the other two, shape (joints,)."""
-    thirds = [part for part in np.array_split(np.arange(len(gathered.blocks)), FOLDS) if len(part)]
-    if len(thirds) < FOLDS:
-        return gathered.total.squared_residuals(beta)
-    merged = [Information.sum([gathered.blocks[index] for index in part]) for part in thirds]
-    total = np.zeros(gathered.total.joints)
-    for joint, support in enumerate(gathered.total.supports):
-        own = terms[support]
+    total = np.zeros(len(thirds[0].products))
+    for joint, support in enumerate(thirds[0].supports):
+        own = np.flatnonzero(terms[support])
         # What is left of the torque when the rest of the arm has had its share: columns of the joint's terms, and it.
-        left = []
-        for part in merged:
-            factor = part.factors[joint]
-            rest = factor[:, -1] - factor[:, :-1][:, ~own] @ beta[support[~own]]
-            left.append((factor[:, :-1][:, own], rest))
-        for number, (columns, rest) in enumerate(left):
-            others = [pair for other, pair in enumerate(left) if other != number]
-            told, torque = (np.concatenate(parts) for parts in zip(*others, strict=True))
-            friction = np.linalg.lstsq(told, torque, rcond=None)[0]
-            total[joint] += float(np.sum((rest - columns @ friction) ** 2))
+        rest = np.zeros((len(support) + 1, len(own) + 1))
+        rest[own, np.arange(len(own))] = 1.0
+        rest[:-1, -1] = np.where(terms[support], 0.0, -beta[support])
+        rest[-1, -1] = 1.0
+        left = [rest.T @ third.products[joint] @ rest for third in thirds]
+        for number, unseen in enumerate(left):
+            told = np.sum([other for place, other in enumerate(left) if place != number], axis=0)
+            error = np.append(-ridge(told[:-1, :-1], told[:-1, -1]), 1.0)
+            total[joint] += max(float(error @ unseen @ error), 0.0)
     return total
 
 

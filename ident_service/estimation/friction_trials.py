@@ -1,8 +1,8 @@
 """Equations of the same motion for many shapes of its friction, without reading or smoothing anything again.
 
 A shape changes two columns per drive: the direction of its Coulomb friction and that direction times the Stribeck
-curve. All others, and the torque, are kept as an orthogonal basis Q and their triangle R, per joint and third of the
-samples. Equations with new columns F then have the factor `[[R, Q^T F], [0, R_F]]` with R_F of `F - Q Q^T F`.
+curve. All others, and the torque, are kept as a table X with products `X^T X`, per joint and third of the samples.
+Equations with new columns F then have the products `[[X^T X, X^T F], [F^T X, F^T F]]`.
 
 The direction at a sample needs no look at the samples before it: between two reversals it is an exponential in the
 distance travelled since (`direction.py`), so the distances of reversals and of samples are all that is kept.
@@ -10,7 +10,7 @@ distance travelled since (`direction.py`), so the distances of reversals and of 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ident_service.config.schema import JointTerm
 from ident_service.errors import RecordingError
 from ident_service.estimation.equations import Equations, Rows, equation_rows
+from ident_service.estimation.moments import Moments
 from ident_service.estimation.smoothing import windows
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters
@@ -32,21 +33,6 @@ FOLDS = 3
 _MOST_ROWS = 30_000  # samples that are kept; of longer recordings every second, every fourth ...
 _CHANGING: tuple[JointTerm, ...] = ("coulomb", "stribeck")
 _GAP = 1.5  # periods: what is longer is no step between neighbours
-
-
-@dataclass(frozen=True)
-class _Kept:
-    """Columns that no trial changes, of one joint in one third of the samples.
-
-    Attributes:
-        samples: which kept samples its rows are, shape (rows,).
-        Q: orthonormal basis of the columns and the torque, shape (rows, k).
-        R: `[columns | torque] = Q R`, shape (k, columns + 1).
-    """
-
-    samples: NDArray[np.intp]
-    Q: Array
-    R: Array
 
 
 @dataclass
@@ -113,7 +99,7 @@ class FrictionTrials:
         """Read the recordings.
 
         Args:
-            recordings: to read, each twice.
+            recordings: to read, each twice; rows are kept, those of long recordings thinned.
             model: the arm; its configuration says how to smooth.
             base: grouping of its parameters.
 
@@ -134,32 +120,38 @@ class FrictionTrials:
         kept = [[column for column in support if int(column) not in changing] for support in self._supports]
         self._kept_columns = kept
         self._travels = [_Travel() for _ in range(joints)]
-        rates, self._filters = [], []
+        rates, keeps, slopes, self._filters = [], [], [], []
         tables: list[list[Array]] = [[] for _ in range(joints)]
         moved = np.zeros(joints, dtype=bool)
         for recording in recordings:
-            time, rate, moving, columns = _thinned_rows(recording, model, base, kept)
-            self._follow(recording, model, time, rate)
-            self._filters.append(_filter(model, time))
-            rates.append(rate)
-            moved |= moving
-            for table, more in zip(tables, columns, strict=True):
+            part = _thinned_rows(recording, model, base, kept)
+            self._follow(recording, model, part.time, part.rate)
+            self._filters.append(_filter(model, part.time))
+            rates.append(part.rate)
+            keeps.append(part.keep)
+            slopes.append(part.slopes)
+            moved |= part.moved
+            for table, more in zip(tables, part.tables, strict=True):
                 table.append(more)
-        self._rate = np.concatenate(rates)
+        self._rate, self._slopes = np.concatenate(rates), np.concatenate(slopes)
+        self._keep: NDArray[np.bool_] = np.concatenate(keeps)
         self._lengths = [len(rate) for rate in rates]
         self._rows = len(self._rate)
-        self._parts = []
-        for third in np.array_split(np.arange(self._rows), FOLDS):
-            part = []
-            for joint in range(joints):
-                Q, R = np.linalg.qr(np.concatenate(tables[joint])[third])
-                part.append(_Kept(third, Q, R))
-            self._parts.append(part)
+        self._joints = range(joints)
+        self._tables = [np.concatenate(table) for table in tables]
+        self.thirds = [slice(self._rows * k // FOLDS, self._rows * (k + 1) // FOLDS) for k in range(FOLDS)]
+        self._products: dict[tuple[int, int, int], Array] = {}
+        self._places = [self._places_of(joint) for joint in self._joints]
         if still := [name for joint, name in enumerate(model.chain.names) if not moved[joint]]:
             raise RecordingError(
                 recordings[0].path,
                 f"{', '.join(still)}: never faster than identification.reversal.speed, nothing to identify from",
             )
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        return len(self._tables)
 
     def _follow(self, recording: Recording, model: ArmModel, time: Array, rate: Array) -> None:
         for drive, travel in enumerate(self._travels):
@@ -181,13 +173,101 @@ class FrictionTrials:
             last = times[-1]
 
     @one_blas_thread()
+    def moments(
+        self, presliding: Array, stribeck_velocity: Array, parts: Sequence[slice] | None = None
+    ) -> list[Moments]:
+        """Give the products of the equations for one shape of the friction.
+
+        Args:
+            presliding: x0 per drive [rad or m], shape (drives,).
+            stribeck_velocity: v_s per drive [rad/s or m/s], shape (drives,).
+            parts: of the samples, one result each, such as `thirds`; all together when None.
+        """
+        used = self._friction(presliding, stribeck_velocity)
+        wanted = [slice(0, self._rows)] if parts is None else list(parts)
+        found: list[list[Array]] = [[] for _ in wanted]
+        for joint, table in enumerate(self._tables):
+            fixed, new, places = self._places[joint]
+            size = len(self._supports[joint]) + 1
+            F = self._new_columns(new, used)
+            for products, part in zip(found, wanted, strict=True):
+                product = np.empty((size, size))
+                product[fixed[:, None], fixed] = self._kept_products(joint, part)
+                if new:
+                    across = table[part].T @ F[part]
+                    product[fixed[:, None], places] = across
+                    product[places[:, None], fixed] = across.T
+                    product[places[:, None], places] = F[part].T @ F[part]
+                products.append(product)
+        counts = [part.stop - part.start for part in wanted]
+        return [
+            Moments(self._supports, tuple(products), np.full(self.joints, count), self._size)
+            for products, count in zip(found, counts, strict=True)
+        ]
+
+    def _kept_products(self, joint: int, part: slice) -> Array:
+        """Give X^T X of a joint's kept columns and torque, computed once for each part."""
+        key = (joint, part.start, part.stop)
+        if key not in self._products:
+            rows = self._tables[joint][part]
+            self._products[key] = rows.T @ rows
+        return self._products[key]
+
+    @one_blas_thread()
     def equations(self, presliding: Array, stribeck_velocity: Array) -> Equations:
-        """Give the equations for one shape of the friction, in `FOLDS` blocks of consecutive samples.
+        """Give the equations for one shape of the friction, in `FOLDS` blocks, rows near standstill apart.
 
         Args:
             presliding: x0 per drive [rad or m], shape (drives,).
             stribeck_velocity: v_s per drive [rad/s or m/s], shape (drives,).
         """
+        used = self._friction(presliding, stribeck_velocity)
+        blocks: list[Information] = []
+        near: list[Information] = []
+        for third in self.thirds:
+            for found, which in ((blocks, self._keep[third]), (near, ~self._keep[third])):
+                factors = [triangle(self._rows_of(joint, used, third)[which[:, joint]]) for joint in self._joints]
+                found.append(Information(self._supports, tuple(factors), np.sum(which, axis=0), self._size))
+        return Equations(tuple(blocks), self._rows, tuple(near))
+
+    @one_blas_thread()
+    def later_torques(self, stribeck_velocity: Array) -> Callable[[float], tuple[Information, ...]]:
+        """Give the rows in motion, per third, as a function of how much later [s] the torque is stamped.
+
+        The torque between its samples is that of its first two derivatives: good for delays that are short beside the
+        period of the filter's cut-off. Where a joint turns round friction looks like a delay; those rows are left out.
+
+        Args:
+            stribeck_velocity: v_s per drive [rad/s or m/s], shape (drives,).
+        """
+        used = self._friction(np.zeros(len(self._travels)), stribeck_velocity)
+        counts = [np.sum(self._keep[third], axis=0) for third in self.thirds]
+        factors = [
+            [
+                triangle(
+                    np.column_stack([self._rows_of(joint, used, third), self._slopes[third, :, joint]])[
+                        self._keep[third, joint]
+                    ]
+                )
+                for joint in self._joints
+            ]
+            for third in self.thirds
+        ]
+
+        def shifted(factor: Array, seconds: float) -> Array:
+            columns = factor[:, :-2].copy()
+            columns[:, -1] += seconds * factor[:, -2] + 0.5 * seconds**2 * factor[:, -1]
+            return triangle(columns)
+
+        def of(seconds: float) -> tuple[Information, ...]:
+            return tuple(
+                Information(self._supports, tuple(shifted(one, seconds) for one in part), count.copy(), self._size)
+                for part, count in zip(factors, counts, strict=True)
+            )
+
+        return of
+
+    def _friction(self, presliding: Array, stribeck_velocity: Array) -> dict[JointTerm, Array]:
         direction = np.column_stack(
             [travel.direction(float(x0)) for travel, x0 in zip(self._travels, presliding, strict=True)]
         )
@@ -195,13 +275,7 @@ class FrictionTrials:
             "coulomb": direction,
             "stribeck": direction * np.exp(-((self._rate / stribeck_velocity) ** 2)),
         }
-        used = {term: self._filtered(values[term]) for term in self._columns}
-        blocks = []
-        for part in self._parts:
-            factors = [self._factor(joint, kept, used) for joint, kept in enumerate(part)]
-            rows = np.array([len(kept.samples) for kept in part], dtype=np.int64)
-            blocks.append(Information(self._supports, tuple(factors), rows, self._size))
-        return Equations(tuple(blocks), self._rows)
+        return {term: self._filtered(values[term]) for term in self._columns}
 
     def _filtered(self, values: Array) -> Array:
         if not any(self._filters):
@@ -211,25 +285,30 @@ class FrictionTrials:
             [low_pass(part, *made) if made else part for part, made in zip(parts, self._filters, strict=True)]
         )
 
-    def _factor(self, joint: int, kept: _Kept, used: dict[JointTerm, Array]) -> Array:
-        support, fixed = self._supports[joint], self._kept_columns[joint]
-        factor = np.zeros((len(kept.R) + 2 * len(self._travels), len(support) + 1))
-        where = np.searchsorted(support, fixed)
-        factor[: len(kept.R), where] = kept.R[:, :-1]
-        factor[: len(kept.R), -1] = kept.R[:, -1]
+    def _places_of(self, joint: int) -> tuple[NDArray[np.intp], list[tuple[JointTerm, int, float]], NDArray[np.intp]]:
+        """Say where in a joint's rows the kept columns and the torque stand, which are new, and where those stand."""
+        support = self._supports[joint]
+        fixed = np.append(np.searchsorted(support, self._kept_columns[joint]), len(support))
         new, places = [], []
         for term, columns in self._columns.items():
             for drive, column in enumerate(columns):
-                if share := self._coupling[drive, joint]:
-                    new.append(share * used[term][kept.samples, drive])
+                if share := float(self._coupling[drive, joint]):
+                    new.append((term, drive, share))
                     places.append(int(np.searchsorted(support, column)))
+        return fixed, new, np.array(places, dtype=np.intp)
+
+    def _rows_of(self, joint: int, used: dict[JointTerm, Array], part: slice) -> Array:
+        """Give a joint's columns and its torque as the last, shape (rows, k + 1)."""
+        fixed, new, places = self._places[joint]
+        rows = np.empty((part.stop - part.start, len(self._supports[joint]) + 1), order="F")
+        rows[:, fixed] = self._tables[joint][part]
         if new:
-            F = np.column_stack(new)
-            inside = kept.Q.T @ F
-            beyond = triangle(F - kept.Q @ inside)
-            factor[: len(kept.R), places] = inside
-            factor[len(kept.R) : len(kept.R) + len(beyond), places] = beyond
-        return triangle(factor[: len(kept.R) + len(new)])
+            rows[:, places] = self._new_columns(new, used)[part]
+        return rows
+
+    def _new_columns(self, new: Sequence[tuple[JointTerm, int, float]], used: dict[JointTerm, Array]) -> Array:
+        columns = [share * used[term][:, drive] for term, drive, share in new]
+        return np.column_stack(columns) if columns else np.zeros((self._rows, 0))
 
 
 def _full_rate(recording: Recording, model: ArmModel) -> Iterator[tuple[Array, Array]]:
@@ -245,8 +324,8 @@ def _full_rate(recording: Recording, model: ArmModel) -> Iterator[tuple[Array, A
 
 def _thinned_rows(
     recording: Recording, model: ArmModel, base: BaseParameters, columns: Sequence[Sequence[int]]
-) -> tuple[Array, Array, NDArray[np.bool_], list[Array]]:
-    """Give times [s], drive velocities, which joints move, and per joint its columns with the torque as the last."""
+) -> _Part:
+    """Read a recording's rows; a joint's table has its columns with the torque as the last."""
     parts: list[_Part] = []
     every, count, seen = 1, 0, 0
     for rows in equation_rows(recording, model, base):
@@ -256,11 +335,20 @@ def _thinned_rows(
         count += len(picked)
         if count > 2 * _MOST_ROWS:
             parts = [_joined(parts, 2)]
-            every, count = 2 * every, len(parts[0][0])
+            every, count = 2 * every, len(parts[0].time)
     return _joined(parts, 1)
 
 
-_Part = tuple[Array, Array, NDArray[np.bool_], list[Array]]
+@dataclass(frozen=True)
+class _Part:
+    """Thinned rows: times [s], drive velocities, rows in motion, the torque's two derivatives, tables per joint."""
+
+    time: Array
+    rate: Array
+    keep: NDArray[np.bool_]
+    slopes: Array
+    moved: NDArray[np.bool_]
+    tables: list[Array]
 
 
 def _part(rows: Rows, picked: NDArray[np.intp], columns: Sequence[Sequence[int]], model: ArmModel) -> _Part:
@@ -268,18 +356,26 @@ def _part(rows: Rows, picked: NDArray[np.intp], columns: Sequence[Sequence[int]]
         np.column_stack([rows.H_b[joint][np.array(own)[:, None], picked].T, rows.torque[picked, joint]])
         for joint, own in enumerate(columns)
     ]
+    slopes = np.zeros((len(rows.time), 2, rows.torque.shape[1]))
+    if len(rows.time) > 2:
+        slopes[:, 0] = np.gradient(rows.torque, rows.time, axis=0)
+        slopes[:, 1] = np.gradient(slopes[:, 0], rows.time, axis=0)
     moved: NDArray[np.bool_] = np.logical_or.reduce(rows.moving)
-    return rows.time[picked], rows.velocity[picked] @ model.chain.coupling.T, moved, tables
+    rate = rows.velocity[picked] @ model.chain.coupling.T
+    return _Part(rows.time[picked], rate, rows.keep[picked], slopes[picked], moved, tables)
 
 
 def _joined(parts: Sequence[_Part], every: int) -> _Part:
-    time, rate, moving, tables = zip(*parts, strict=True)
-    moved: NDArray[np.bool_] = np.logical_or.reduce(moving)
-    return (
-        np.concatenate(time)[::every],
-        np.concatenate(rate)[::every],
-        moved,
-        [np.concatenate(joint)[::every] for joint in zip(*tables, strict=True)],
+    def whole(arrays: Iterable[Array]) -> Array:
+        return np.concatenate(list(arrays))[::every]
+
+    return _Part(
+        whole(part.time for part in parts),
+        whole(part.rate for part in parts),
+        np.concatenate([part.keep for part in parts])[::every],
+        whole(part.slopes for part in parts),
+        np.logical_or.reduce([part.moved for part in parts]),
+        [whole(joint) for joint in zip(*(part.tables for part in parts), strict=True)],
     )
 
 

@@ -117,7 +117,7 @@ def _motion(
     position, velocity, acceleration = (np.fft.irfft(spectrum * harmonics**order, length, axis=0) for order in range(3))
     if held:
         torque = 0.5 * (torque + np.roll(torque, 1, axis=0))
-    if options.delay != "estimate" and options.delay:
+    if not isinstance(options.delay, str) and options.delay:
         torque = np.fft.irfft(np.fft.rfft(torque, axis=0) * np.exp(harmonics * float(options.delay)), length, axis=0)
     C = np.eye(joints) if coupling is None else coupling
     rate = velocity @ C.T

@@ -27,6 +27,7 @@ WRONG_SIGN = 8.0  # deviations by which friction is negative
 CONSTRAINED_WORSE_WITH_SIGN, PERHAPS_WRONG_SIGN = 1.3, 4.0  # both together
 MIRRORED_FROM, MIRRORED_WORSE = 20.0, 1.4  # percent, and times the unconstrained error, from which a joint is turned
 MIRRORED = 1.3  # times smaller is its error with the torque negated, and again near the unconstrained one
+ENOUGH_MOTION, UNKNOWN_OF_LITTLE_MOTION = 10.0, 0.2  # s, and share of the base parameters
 _OUTSIDE = 0.1  # of a joint's range: what limits of a description may be off
 _NOISE = 1e-3  # of a joint's range: what an encoder's noise at a limit may be
 _TURNS = 100.0  # rad, for joints without limits
@@ -44,6 +45,36 @@ def reasons_against(estimate: Estimate) -> tuple[str, ...]:
     """
     own = estimate.candidates[estimate.chosen]
     return (*_errors(own), *_against_the_unconstrained(estimate))
+
+
+def reasons_in_length(estimate: Estimate, seconds: float) -> tuple[str, ...]:
+    """Say why so short a motion tells too little, as that before a fault; empty where it tells enough.
+
+    A short motion that leaves much unidentified predicts itself and nothing else. Where other recordings validate the
+    estimate, their errors judge it.
+
+    Args:
+        estimate: to judge.
+        seconds: that the recordings it was fitted to last.
+    """
+    rows = estimate.prepared.equations.moving.rows
+    moved = seconds * float(rows.max(initial=0)) / max(estimate.samples, 1)
+    unknown, size = estimate.verdicts.count("unidentified"), estimate.base.size
+    # Stribeck friction of a drive that is never slow has no effect.
+    unseen = [
+        expression
+        for expression, deviation in zip(estimate.base.expressions, estimate.standard_deviations, strict=True)
+        if not np.isfinite(deviation) and not expression.startswith("fs")
+    ]
+    if estimate.candidates[estimate.chosen].validation or moved >= ENOUGH_MOTION:
+        return ()
+    if unknown <= UNKNOWN_OF_LITTLE_MOTION * size and not unseen:
+        return ()
+    what = f"{unknown} of its {size} base parameters are unidentified" + (", some not seen at all" if unseen else "")
+    return (
+        f"it was fitted to {moved:.1f} s of motion, and {what}: it predicts that motion and perhaps no other; record at"
+        f" least {ENOUGH_MOTION:g} s, or validate it on another motion (--validate)",
+    )
 
 
 def reasons_in_recording(recording: str, joints: Sequence[JointQuality], model: ArmModel) -> tuple[str, ...]:

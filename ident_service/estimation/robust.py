@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from ident_service.estimation.equations import Equations, Rows, equation_rows, equations
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares
+from ident_service.estimation.moments import Moments
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
-from ident_service.model.information import Information, supports, triangle
+from ident_service.model.information import supports
 from ident_service.model.threads import one_blas_thread
 from ident_service.record.recording import Recording
 
@@ -99,11 +100,10 @@ def held_out_errors(
     errors, torques = np.zeros(2), 0.0
     for number in range(_FOLDS):
         rest, unseen = spread.without(number), spread.only(number)
-        plain = ordinary_least_squares(rest.information(), start.weights).beta
+        plain = rest.moments().solved(start.weights)
         robust, _ = rest.huber(plain, _FOLD_ROUNDS)
-        seen = unseen.information()
-        errors += [float(np.sum(start.weights**2 * seen.squared_residuals(beta))) for beta in (plain, robust)]
-        torques += float(np.sum(start.weights**2 * seen.squared_torques()))
+        errors += [float(np.sum(start.weights**2 * unseen.squared_residuals(beta))) for beta in (plain, robust)]
+        torques += float(np.sum(start.weights**2 * unseen.squared_residuals(np.zeros(base.size))))
     relative = 100.0 * np.sqrt(errors / max(torques, np.finfo(float).tiny))
     return {"wls": float(relative[0]), "huber": float(relative[1])}
 
@@ -126,19 +126,22 @@ class _Spread:
         """Reweight in so many rounds; give the estimate that changed least, and by how many white deviations."""
         best = (beta, np.inf)
         for _ in range(rounds):
-            better = ordinary_least_squares(self._reweighted(beta))
-            deviations = np.where(np.isfinite(better.standard_deviations), better.standard_deviations, np.inf)
-            change = float(np.max(np.abs(better.beta - beta) / np.maximum(deviations, np.finfo(float).tiny)))
+            better, deviations = self._reweighted(beta).estimate()
+            change = float(np.max(np.abs(better - beta) / np.maximum(deviations, np.finfo(float).tiny)))
             if change < best[1]:
-                best = (better.beta, change)
-            beta = better.beta
+                best = (better, change)
+            beta = better
             if change < SETTLED:
                 break
         return best
 
-    def information(self) -> Information:
+    def moments(self) -> Moments:
         """The rows, each once."""
-        return self._of([triangle(table) for table in self.tables])
+        return self._of([table.T @ table for table in self.tables])
+
+    def squared_residuals(self, beta: Array) -> Array:
+        """Per joint, the sum of squared residuals, shape (joints,)."""
+        return np.array([float(one @ one) for one in self.residuals(beta)])
 
     def only(self, part: int) -> _Spread:
         """One third of the rows."""
@@ -161,14 +164,17 @@ class _Spread:
         """Robust standard deviation of each joint's residuals [N m or N], shape (joints,)."""
         return np.array([max(_CONSISTENT * float(np.median(np.abs(one))), 1e-9) for one in self.residuals(beta)])
 
-    def _reweighted(self, beta: Array) -> Information:
+    def _reweighted(self, beta: Array) -> Moments:
         # The rows as often as their residuals allow.
-        pairs = zip(self.tables, self.residuals(beta), self.scales(beta), strict=True)
-        return self._of([triangle(table * _weights(residual, scale)[:, None]) for table, residual, scale in pairs])
+        products = []
+        for table, residual, scale in zip(self.tables, self.residuals(beta), self.scales(beta), strict=True):
+            rows = table * _weights(residual, scale)[:, None]
+            products.append(rows.T @ rows)
+        return self._of(products)
 
-    def _of(self, factors: Sequence[Array]) -> Information:
+    def _of(self, products: Sequence[Array]) -> Moments:
         rows = np.array([len(table) for table in self.tables], dtype=np.int64)
-        return Information(self.supports, tuple(factors), rows, self.base)
+        return Moments(self.supports, tuple(products), rows, self.base)
 
     def _with(self, tables: Sequence[Array]) -> _Spread:
         return _Spread(self.supports, self.base, tuple(tables))

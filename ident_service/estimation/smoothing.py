@@ -152,7 +152,7 @@ class _Smoother:
             presliding = 0.0
         self._presliding = np.broadcast_to(np.asarray(presliding, dtype=float), (recording.joints,))
         self._direction = np.zeros((0, recording.joints))
-        self._delay = 0.0 if options.delay == "estimate" else float(options.delay)
+        self._delay = 0.0 if isinstance(options.delay, str) else float(options.delay)
         slowest = 2.0 * np.pi * self._cutoff * np.sin(np.pi / (2 * smoothing.order))
         memory = _DECAY / slowest
         if smoothing.method == "savitzky_golay":

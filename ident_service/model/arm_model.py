@@ -97,9 +97,12 @@ def control_model(model: ArmModel) -> ArmModel:
     at_joints = np.array([0.0 if joint is None else joint.drive_inertia or 0.0 for joint in joints])
     if model.prior is None or not len(columns) or not at_joints.any():
         return model
-    from scipy.optimize import nnls  # most arms are only looked at, and need no solver
+    stated = at_joints
+    felt = (model.chain.coupling**2).T
+    if not np.array_equal(felt, np.eye(len(felt))):
+        from scipy.optimize import nnls  # loads for 0.1 s, and few arms have coupled drives
 
-    stated, _ = nnls((model.chain.coupling**2).T, at_joints)
+        stated, _ = nnls(felt, at_joints)
     prior = model.prior.copy()
     prior[columns] = np.maximum(prior[columns], stated)
     prior.setflags(write=False)

@@ -31,6 +31,8 @@ TERM_SYMBOLS: dict[JointTerm, str] = {
     "viscous_asymmetry": "fa",
 }
 _TERM_ORDER: tuple[JointTerm, ...] = tuple(TERM_SYMBOLS)
+# [rad/s or m/s] At any speed that is ever recorded nothing is left of Stribeck friction with this velocity.
+NO_STRIBECK = 1e-6
 _REVOLUTE_UNITS = {
     "Ia": "kg m^2",
     "fv": "N m s/rad",

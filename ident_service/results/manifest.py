@@ -82,19 +82,6 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def remove_stale(folder: Path, earlier: Mapping[str, str]) -> None:
-    """Remove files of an earlier result that the one in a folder now does not have.
-
-    Args:
-        folder: with a manifest; files that no manifest names stay, as do those that were changed since.
-        earlier: name to SHA-256 in the manifest that stood there before.
-    """
-    for name in earlier.keys() - named_files(folder).keys():
-        path = folder / name
-        if path.is_file() and not path.is_symlink() and file_sha256(path) == earlier[name]:
-            path.unlink()
-
-
 def write_manifest(folder: Path) -> None:
     """Name and SHA-256 of every file in the folder, for verification on another machine."""
     manifest = {

@@ -29,6 +29,7 @@ from ident_service.model.expressions import parse_expression
 from ident_service.model.notation import NOTATIONS, Notation, regrouped, translate
 from ident_service.results.files import write_atomically
 from ident_service.results.information_document import information_document
+from ident_service.results.link_values import implausible_links
 from ident_service.results.rows_and_filter import how_fitted
 from ident_service.results.schemas import require_schema
 from ident_service.results.strict_json import strict_json
@@ -163,6 +164,7 @@ def parameters_document(estimate: Estimate, described: ArmConfig | None = None) 
             "units": list(model.layout.units),
             "values": estimate.delta.tolist(),
             **({} if estimate.nearest_to is None else {"nearest_to": estimate.nearest_to}),
+            **({"implausible": strange} if (strange := list(implausible_links(estimate))) else {}),
         }
     apart = estimate.noise_deviations
     held = estimate.constrained_intervals

@@ -10,7 +10,9 @@ import numpy as np
 from ident_service.estimation.doubt import IDENTIFIED_BELOW, NEGLIGIBLE_TORQUE, WEAK_BELOW
 from ident_service.estimation.identify import Candidate, Estimate
 from ident_service.estimation.least_squares import TorqueError
+from ident_service.model.layout import NO_STRIBECK
 from ident_service.model.likely_bodies import IN_WORDS
+from ident_service.results.link_values import WHAT_THEN, implausible_links
 from ident_service.results.rows_and_filter import how_fitted, wrapped
 
 
@@ -91,7 +93,9 @@ def _found_before(estimate: Estimate) -> list[str]:
     if presliding.any():
         lines.append("pre-sliding way [rad or m]: " + " ".join(f"{value:.2g}" for value in presliding))
     if model.layout.stribeck_velocity:
-        velocities = " ".join(f"{value:.2g}" for value in model.layout.stribeck_velocity)
+        velocities = " ".join(
+            f"{value:.2g}" if value > NO_STRIBECK else "none" for value in model.layout.stribeck_velocity
+        )
         lines.append(f"Stribeck velocity [rad/s or m/s]: {velocities}")
     if (prepared.torque_scales != 1.0).any():
         lines.append("measured torques multiplied by: " + " ".join(f"{value:.4g}" for value in prepared.torque_scales))
@@ -121,6 +125,8 @@ def _feasibility(estimate: Estimate) -> str:
         text = f"feasible ({kind}): margin {estimate.margin:.3g}, a real body could have these parameters\n"
         of_many = "" if estimate.nearest_to is None else f", the nearest to {IN_WORDS[estimate.nearest_to]}"
         text += f"(motion shows base parameters only; the link values behind them are one body of many{of_many})"
+        if strange := implausible_links(estimate):
+            text += "\n" + "\n".join(wrapped([f"implausible, {line}" for line in strange] + [WHAT_THEN]))
         if estimate.tight:
             text += "\nthe data pull against:\n" + "\n".join(f"  {name}" for name in estimate.tight)
         return text

@@ -19,14 +19,19 @@ from ident_service.estimation.feasible.convex import convex_least_squares
 from ident_service.estimation.feasible.feasible_set import SetName
 from ident_service.estimation.identify import Estimate, identify
 from ident_service.estimation.least_squares import LeastSquares
-from ident_service.estimation.plausibility import reasons_against, reasons_in_recording, remarks_on_limits
+from ident_service.estimation.plausibility import (
+    reasons_against,
+    reasons_in_length,
+    reasons_in_recording,
+    remarks_on_limits,
+)
 from ident_service.estimation.proof.sdpa import bpfc_sdpa, bpft_sdpa, fbpe_sdpa
 from ident_service.model.arm_model import arm_model
 from ident_service.model.chain import Array
 from ident_service.record.quality import Quality
 from ident_service.record.recording import Recording
-from ident_service.results.files import appearing_folder, write_atomically
-from ident_service.results.manifest import named_files, remove_stale
+from ident_service.results.files import write_atomically
+from ident_service.results.replacing import replacing_folder, require_replaceable
 from ident_service.results.report_files import write_report
 from ident_service.results.run_folder import MANIFEST, write_manifest, write_results
 from ident_service.service.recordings import (
@@ -103,16 +108,16 @@ def identify_files(request: Request, folder: Path, tell: Callable[[str], None] =
 
     Args:
         request: what is asked for.
-        folder: where results go; existing files of other names stay.
+        folder: where results go; an earlier result there is replaced as a whole.
         tell: called with a line at each step that takes longer.
 
     Raises:
-        UsageError, ConfigError: the request or the arm's description cannot be meant.
+        UsageError, ConfigError: the request or the arm's description cannot be meant, or the folder holds anything
+            else.
         RecordingError: a recording cannot be used.
         SolverError: a solver stopped without an optimum.
     """
-    if folder.exists() and not folder.is_dir():
-        raise UsageError(f"{folder}: is a file, not a folder")
+    require_replaceable(folder)
     described = load_arm(request.arm)
     model = arm_model(_config(described, request))
     custom = custom_of(request.arm, described)
@@ -157,14 +162,12 @@ def identify_files(request: Request, folder: Path, tell: Callable[[str], None] =
     if request.essential:
         tell("essential parameters")
         more["essential"] = _essential(estimate)
-    earlier = named_files(folder) if (folder / MANIFEST).is_file() else {}
-    with appearing_folder(folder) as staging:
+    with replacing_folder(folder) as staging:
         files = write_results(staging, estimate, more, unusable, described, opened.torque)
         if request.sdpa:
             files += _write_sdpa(staging, estimate)
         files += write_report(staging, estimate, recordings, validation, warnings)
         write_manifest(staging)
-    remove_stale(folder, earlier)
     return Identified(estimate, (*files, MANIFEST), warnings, unusable, opened.torque)
 
 
@@ -194,7 +197,13 @@ def unusable_because(estimate: Estimate, found: Sequence[tuple[Recording, Qualit
     """Say why an estimate must not be used, from the recordings that it knows and from its errors."""
     model = estimate.model
     seen = (reasons_in_recording(recording.path.name, one.joints, model) for recording, one in found)
-    return (*(reason for reasons in seen for reason in reasons), *reasons_against(estimate))
+    fitted = set(estimate.recordings)
+    seconds = sum(one.duration_s for recording, one in found if (recording.path.name, recording.sha256) in fitted)
+    return (
+        *(reason for reasons in seen for reason in reasons),
+        *reasons_against(estimate),
+        *reasons_in_length(estimate, seconds),
+    )
 
 
 def _config(config: ArmConfig, request: Request) -> ArmConfig:

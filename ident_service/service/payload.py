@@ -18,7 +18,7 @@ from ident_service.record.recording import Recording
 from ident_service.results.comparison.comparison import Comparison, compare
 from ident_service.results.comparison.sides import Side, read_side
 from ident_service.results.export.urdf_file import write_urdf
-from ident_service.results.files import appearing_folder, require_place, write_atomically
+from ident_service.results.files import require_place, write_atomically
 from ident_service.results.parameter_file import read_parameters, write_parameters
 from ident_service.results.payload_document import (
     loaded_config,
@@ -27,6 +27,7 @@ from ident_service.results.payload_document import (
     payload_text,
     write_payload,
 )
+from ident_service.results.replacing import replacing_folder, require_replaceable
 from ident_service.results.run_folder import ARM, MANIFEST, PARAMETERS, URDF, VERIFIER, write_manifest, write_verifier
 from ident_service.service.comparison import write_comparison_files
 from ident_service.service.recordings import open_together, require_no_fault
@@ -61,7 +62,7 @@ def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_off
     Args:
         run: folder of results of the arm.
         recordings: with the load; a path may end in `@START:END`, the seconds to read.
-        out: where results go; existing files of other names stay.
+        out: where results go; an earlier result there is replaced as a whole.
         refit_offsets: whether torque offsets may differ from those of the arm.
 
     Raises:
@@ -74,6 +75,7 @@ def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_off
         raise UsageError(f"{run}: not a folder; give the folder of results of the arm without the load")
     if out.exists() and out.samefile(run):
         raise UsageError(f"{out}: would replace the arm's own parameters; give another folder")
+    require_replaceable(out)
     side = read_side(run)
     arm = known_arm(side)
     known = side.content.get("torque")  # the difference of two torques is the load's only where both are of one kind
@@ -89,7 +91,7 @@ def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_off
     sources = [{"name": one.path.name, "sha256": one.sha256} for one in opened]
     document = payload_document(payload, arm, side.sha256, sources)
     text, comparison = payload_text(payload, arm), None
-    with appearing_folder(out) as staging:
+    with replacing_folder(out) as staging:
         write_payload(staging / DOCUMENT, document)
         write_atomically(staging / TEXT, text)
         names = [DOCUMENT, TEXT]

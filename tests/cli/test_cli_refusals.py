@@ -239,18 +239,22 @@ def test_an_existing_run_folder_is_not_touched_by_simulate(place: Path, quick: C
     assert (folder / "mine").read_text() == "keep"
 
 
-def test_identify_adds_to_an_existing_folder(place: Path, quick: Commissioned, ident: Ident) -> None:
+def test_identify_replaces_an_earlier_result_and_nothing_else(place: Path, quick: Commissioned, ident: Ident) -> None:
     folder = place / "out"
     folder.mkdir()
-    (folder / "mine").write_text("keep")
-    (folder / "report.txt").write_text("old")
+    (folder / "report.txt").write_text("by a person")
     words = identify(place, quick, quick.folder / "identification.mcap")
+    refused = ident(*words)
+    assert refused.code == 2
+    assert "holds what is not of an earlier result: report.txt; give a folder that does not exist" in refused.err
+    assert left_over(place) == ["out", "out/report.txt"]
+    (folder / "report.txt").unlink()
+    assert ident(*words, "--sdpa").code == 0
+    assert len(list(folder.glob("*.dat-s"))) == 3
     assert ident(*words).code == 0
-    names = ["arm.json", "evidence.json", "identified.urdf", "manifest.json", "mine", "parameters.json"]
+    names = ["arm.json", "evidence.json", "identified.urdf", "manifest.json", "parameters.json"]
     names += ["report.html", "report.txt", "verify.py"]
     assert left_over(place) == ["out", *(f"out/{name}" for name in names)]
-    assert (folder / "mine").read_text() == "keep"
-    assert (folder / "report.txt").read_text() != "old"
     # An unusable recording does not touch what is there.
     (place / "bad.csv").write_text("hello\n")
     before = {path.name: path.read_bytes() for path in folder.iterdir()}

@@ -20,7 +20,7 @@ WRONG = [
     (("identify", "a.mcap"), "the following arguments are required: --arm"),
     (("identify", "a.mcap", "--arm", "x", "--bootstrap", "1"), "a number of replicates is 0, or 2 and more"),
     (("identify", "a.mcap", "--arm", "x", "--prior-weight", "inf"), "a weight is a number, 0 or more"),
-    (("identify", "a.mcap", "--arm", "x", "--delay", "nan"), "a number of seconds below 1, or 'estimate'"),
+    (("identify", "a.mcap", "--arm", "x", "--delay", "nan"), "a number of seconds below 1, 'estimate' or 'choose'"),
     (("correct", "ä\u2028.json"), "the following arguments are required: --out"),
     (("config",), "the following arguments are required: VERB"),
     (("config", "mend", "a.yaml"), "argument VERB: invalid choice: 'mend'"),

@@ -191,7 +191,7 @@ def test_knowledge_about_base_parameters_and_every_replicate(setting: Setting, t
     drawn = json.loads((tmp_path / "out" / "parameters.json").read_text())["bootstrap"]["standard_deviations"]
     assert drawn[-3] < 1e-6 < drawn[-2]
     without = identify_files(
-        Request(arm=str(tmp_path / "arm.yaml"), recordings=(setting.path,), set_name="none"), tmp_path
+        Request(arm=str(tmp_path / "arm.yaml"), recordings=(setting.path,), set_name="none"), tmp_path / "without"
     )
     assert without.estimate.custom is None
     np.testing.assert_array_equal(without.estimate.beta, without.estimate.fit.beta)

@@ -13,18 +13,21 @@ from helpers.random_arms import model_around, random_delta
 
 from ident_service.config.schema import FrictionShape, Reversal
 from ident_service.errors import RecordingError
+from ident_service.estimation.choices import clearly_chosen
 from ident_service.estimation.delay import Delay, estimate_delay, with_delay
 from ident_service.estimation.direction import direction
 from ident_service.estimation.equations import equations
-from ident_service.estimation.friction_fit import at_the_edge, fit_friction, with_friction
+from ident_service.estimation.feasible.feasible_set import feasible_set
+from ident_service.estimation.friction_fit import at_the_edge, fit_friction, friction_trials, with_friction
 from ident_service.estimation.identify import identify
 from ident_service.estimation.least_squares import torque_error, weighted_least_squares
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters, base_parameters
-from ident_service.model.layout import Layout
+from ident_service.model.layout import NO_STRIBECK, Layout
 from ident_service.model.regressor import joint_regressor
 
 RATE = 250.0
+SMOOTH = plain_smoothing(cutoff=12.0, filter_torque=True)
 
 
 @cache
@@ -124,6 +127,46 @@ def test_a_delay_beyond_reason_is_refused() -> None:
         estimate_delay([late(0.35)], model, base)
 
 
+@pytest.mark.parametrize(("seconds", "taken"), [(0.0, False), (0.003, True), (0.006, True), (-0.01, True)])
+def test_a_delay_is_chosen_where_there_is_one(seconds: float, taken: bool) -> None:
+    model, _, _ = two_links()
+    estimate = identify(with_options(model, plain_options(smoothing=SMOOTH, delay="choose")), [late(seconds)])
+    (choice,) = estimate.choices
+    found = estimate.model.config.identification.delay
+    assert choice.option == "delay"
+    assert (choice.value != "0 ms") is taken
+    assert found == pytest.approx(seconds, abs=0.5e-3)
+    errors = list(choice.held_out.values())
+    assert (errors[1] < 0.9 * errors[0]) is taken
+
+
+def test_a_delay_of_one_third_is_not_taken() -> None:
+    """A part of a recording that a delay explains is no delay of the arm."""
+    model, _, _ = two_links()
+    there, here = late(0.008), late(0.0)
+    third = np.arange(len(here.torque)) < len(here.torque) // 3
+    mixed = replace(here, torque=np.where(third[:, None], there.torque, here.torque))
+    estimate = identify(with_options(model, plain_options(smoothing=SMOOTH, delay="choose")), [mixed])
+    assert estimate.choices[0].value == "0 ms"
+    assert estimate.model.config.identification.delay == 0.0
+
+
+@pytest.mark.parametrize(
+    ("errors", "value"),
+    [
+        ([2.0, 2.1, 1.9], "other"),
+        ([2.0, 2.1, 3.1], "usual"),  # not every third
+        ([2.99, 2.99, 2.98], "usual"),  # less than a hundredth
+        ([1.0, 2.9, 2.9], "usual"),  # mostly one third
+        ([np.inf, np.inf, np.inf], "usual"),
+    ],
+)
+def test_what_is_not_clearly_better_is_not_taken(errors: list[float], value: str) -> None:
+    choice = clearly_chosen("delay", {"usual": np.full(3, 3.0), "other": np.array(errors)})
+    assert choice.value == value
+    assert clearly_chosen("delay", {"usual": np.full(3, np.inf), "other": np.array(errors)}).value == "usual"
+
+
 # Friction.
 
 TERMS = ("drive_inertia", "viscous", "coulomb", "offset", "stribeck")
@@ -135,7 +178,9 @@ NOISE = 0.05
 def rubbing(shape: FrictionShape, terms: tuple[str, ...] = TERMS) -> tuple[ArmModel, BaseParameters, np.ndarray]:
     """An arm whose friction is known, and what is to be fitted of it."""
     plain = model_around(serial_chain(21, 2))
-    layout = Layout(plain.chain.revolute, terms, tuple(STRIBECK) if "stribeck" in terms else ())  # type: ignore[arg-type]
+    velocities = STRIBECK if isinstance(shape.stribeck_velocity, str) else shape.stribeck_velocity
+    velocities = tuple(np.broadcast_to(velocities, 2).tolist()) if "stribeck" in terms else ()
+    layout = Layout(plain.chain.revolute, terms, velocities)  # type: ignore[arg-type]
     options = plain_options(
         smoothing=plain_smoothing(cutoff=20.0), reversal=Reversal(speed=0.0, window=0.0), friction=shape
     )
@@ -163,11 +208,15 @@ def rubbed(model: ArmModel, delta: np.ndarray, presliding: np.ndarray, seconds: 
     )
 
 
+def fitted_friction(recordings: list[SampledRecording], model: ArmModel, base: BaseParameters) -> ArmModel:
+    return fit_friction(friction_trials(recordings, model, base), model, base)[0]
+
+
 @pytest.mark.slow
 def test_presliding_and_stribeck_velocity_are_found() -> None:
     model, base, delta = rubbing(FIT)
     recording = rubbed(model, delta, PRESLIDING)
-    fitted = fit_friction([recording], model, base)
+    fitted = fitted_friction([recording], model, base)
     shape = fitted.config.identification.friction
     assert isinstance(shape.presliding, tuple)
     for found, true in ((np.array(shape.presliding), PRESLIDING), (np.array(shape.stribeck_velocity), STRIBECK)):
@@ -183,11 +232,40 @@ def test_presliding_and_stribeck_velocity_are_found() -> None:
     assert np.all(worse > 1.2 * left(fitted))
 
 
+def test_friction_that_is_not_there_is_left_out_and_said() -> None:
+    bare, _, delta = rubbing(plain_friction(presliding=0.0), TERMS[:4])
+    recording = rubbed(bare, delta, np.zeros(2))
+    left_out = rubbing(plain_friction(presliding=0.0, stribeck_velocity=NO_STRIBECK))[0]
+    without, with_none = identify(bare, [recording]), identify(left_out, [recording])
+    assert sum(name.startswith("fs") for name in with_none.base.expressions) == 2
+    for number, name in enumerate(with_none.base.expressions):
+        if name.startswith("fs"):
+            assert with_none.beta[number] == 0.0
+            assert np.isinf(with_none.standard_deviations[number])
+        else:
+            same = without.base.expressions.index(name)
+            assert with_none.beta[number] == pytest.approx(without.beta[same], rel=1e-4, abs=1e-6)
+    assert at_the_edge(with_none.model.config.identification.friction, ("a", "b"), ("coulomb", "stribeck")) == ()
+
+
+@pytest.mark.slow
+def test_pre_sliding_and_stribeck_friction_that_are_there_are_kept() -> None:
+    model, base, delta = rubbing(FIT)
+    conditions = feasible_set("pseudo_inertia", base.names, model.config)
+    trials = friction_trials([rubbed(model, delta, PRESLIDING)], model, base)
+    _, choices = fit_friction(trials, model, base, conditions)
+    assert [(one.option, one.value) for one in choices] == [
+        ("friction.presliding", "fit"),
+        ("friction.stribeck_velocity", "fit"),
+    ]
+    assert all(one.held_out["none"] > 1.1 * one.held_out["fit"] for one in choices)
+
+
 @pytest.mark.slow
 def test_a_given_number_is_kept() -> None:
     given = plain_friction(presliding="fit", stribeck_velocity=tuple(STRIBECK))
     model, base, delta = rubbing(given)
-    fitted = fit_friction([rubbed(model, delta, PRESLIDING)], model, base)
+    fitted = fitted_friction([rubbed(model, delta, PRESLIDING)], model, base)
     shape = fitted.config.identification.friction
     assert shape.stribeck_velocity == tuple(STRIBECK)
     np.testing.assert_allclose(np.log(np.array(shape.presliding) / PRESLIDING), 0.0, atol=np.log(1.3))
@@ -196,7 +274,7 @@ def test_a_given_number_is_kept() -> None:
 @pytest.mark.slow
 def test_a_drive_without_presliding_is_given_little_or_none() -> None:
     model, base, delta = rubbing(plain_friction(presliding="fit"), TERMS[:4])
-    fitted = fit_friction([rubbed(model, delta, np.array([0.0, 0.03]))], model, base)
+    fitted = fitted_friction([rubbed(model, delta, np.array([0.0, 0.03]))], model, base)
     first, second = fitted.config.identification.friction.presliding  # type: ignore[misc]
     assert first < 1e-3
     assert second == pytest.approx(0.03, rel=0.3)
@@ -207,7 +285,7 @@ def test_nothing_to_fit_leaves_the_numbers(terms: tuple[str, ...]) -> None:
     shape = plain_friction(presliding=0.01, stribeck_velocity=tuple(STRIBECK))
     model, base, delta = rubbing(shape, terms)
     recording = rubbed(model, delta, PRESLIDING)
-    fitted = fit_friction([recording], model, base)
+    fitted = fitted_friction([recording], model, base)
     one, other = (equations(recording, arm, base).total for arm in (model, fitted))
     for a, b in zip(one.factors, other.factors, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -218,7 +296,7 @@ def test_nothing_to_fit_leaves_the_numbers(terms: tuple[str, ...]) -> None:
 def test_the_rate_and_other_options_come_back_untouched() -> None:
     model, base, delta = rubbing(plain_friction(presliding="fit"), TERMS[:4])
     before = model.config.identification
-    after = fit_friction([rubbed(model, delta, PRESLIDING)], model, base).config.identification
+    after = fitted_friction([rubbed(model, delta, PRESLIDING)], model, base).config.identification
     assert after.model_copy(update={"friction": before.friction}) == before
     assert model.config.identification is before
 

@@ -38,7 +38,7 @@ def both(model: ArmModel, recordings: list[SampledRecording], x0: np.ndarray, v_
     shape = plain_friction(presliding=tuple(x0.tolist()), stribeck_velocity=tuple(v_s.tolist()))
     again = equations(recordings, with_friction(model, shape), base)
     trials = FrictionTrials(recordings, model, base).equations(x0, v_s)
-    np.testing.assert_array_equal(trials.total.rows, again.everything.rows)
+    np.testing.assert_array_equal(trials.everything.rows, again.everything.rows)
     assert len(trials.blocks) == 3
     return [
         np.concatenate([(factor.T @ factor).ravel() for factor in found.everything.factors])
@@ -91,9 +91,9 @@ def test_long_recordings_are_thinned_and_say_the_same(monkeypatch: pytest.Monkey
     model, _, delta = rubbing(FIT)
     base = base_parameters(model.chain, model.layout)
     recording = rubbed(model, delta, X0)
-    whole = FrictionTrials([recording], model, base).equations(X0, V_S).total
+    whole = FrictionTrials([recording], model, base).equations(X0, V_S).everything
     monkeypatch.setattr(friction_trials, "_MOST_ROWS", 1500)
-    few = FrictionTrials([recording], model, base).equations(X0, V_S).total
+    few = FrictionTrials([recording], model, base).equations(X0, V_S).everything
     assert few.rows.max() <= 3000
     for all_rows, some in zip(whole.factors, few.factors, strict=True):
         share = few.rows[0] / whole.rows[0]

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from estimation.synthetic import SampledRecording, recorded, serial_chain, waves, with_options
-from helpers.plain import plain_options, plain_smoothing
+from helpers.plain import plain_friction, plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_delta
 
 from ident_service.config.schema import Identification
@@ -50,7 +50,14 @@ def off(estimate: Estimate, delta: np.ndarray) -> float:
 
 def identified(velocity: str, recording: SampledRecording, **more: object) -> Estimate:
     model, _ = arm()
-    options = Identification.model_validate({"method": "wls", "smoothing": {"velocity": velocity, **more}})
+    options = Identification.model_validate(
+        {
+            "method": "wls",
+            "delay": 0.0,
+            "friction": plain_friction(),
+            "smoothing": {"velocity": velocity, **more},
+        }
+    )
     return identify(with_options(model, options), [recording])
 
 
@@ -82,7 +89,7 @@ def test_velocities_of_our_own_loop_are_not_asked() -> None:
 
 def test_a_validation_without_velocities_is_judged_all_the_same() -> None:
     model, delta = arm()
-    options = Identification.model_validate({"method": "wls"})
+    options = Identification.model_validate({"method": "wls", "delay": 0.0, "friction": plain_friction()})
     other = replace(recorded(model, delta, waves(6, 2), rate=RATE, seconds=30.0), sha256="1" * 64)
     estimate = identify(with_options(model, options), [noisy(model, delta)], [other])
     assert estimate.choices == ()

@@ -18,7 +18,8 @@ def plain_friction(**given: Any) -> FrictionShape:
 
 
 def plain_options(**given: Any) -> Identification:
-    """Estimate by ordinary least squares, leaving out half a second at both ends."""
+    """Estimate by ordinary least squares without a delay, leaving out half a second at both ends."""
     return Identification.model_validate(
-        {"method": "ols", "smoothing": plain_smoothing(), "friction": plain_friction(), "edge": 0.5} | given
+        {"method": "ols", "smoothing": plain_smoothing(), "friction": plain_friction(), "edge": 0.5, "delay": 0.0}
+        | given
     )

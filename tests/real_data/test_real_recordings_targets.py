@@ -13,6 +13,7 @@ from ident_service.config.load import load_arm
 from ident_service.estimation.feasible.feasibility import constrained_least_squares
 from ident_service.estimation.identify import Estimate
 from ident_service.model.arm_model import arm_model
+from ident_service.results.link_values import implausible_links
 
 pytestmark = pytest.mark.slow
 
@@ -49,6 +50,13 @@ def test_link_values_are_those_of_an_arm(shared: Path) -> None:
     assert masses[1] == masses.max()
     assert 10.0 < masses[1] < 16.0
     assert all(np.linalg.norm(body[6:9]) / body[-1] < 0.4 for body in bodies)
+
+
+def test_a_wrist_of_fifty_grams_beside_the_arm_is_said_to_be_implausible(identified: Identified) -> None:
+    lines = {line.split(":")[0]: line for line in implausible_links(identified("kuka_lwr4"))}
+    assert "kg, where 0.16 to 16 kg are likely" in lines["lwr_5_joint"]
+    assert "m from a likely place, where 0.36 m would be much" in lines["lwr_5_joint"]
+    assert not {"lwr_1_joint", "lwr_2_joint", "lwr_3_joint"} & set(lines)
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.arm)

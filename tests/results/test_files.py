@@ -9,7 +9,6 @@ import pytest
 
 from ident_service.errors import UsageError
 from ident_service.results.files import appearing_folder, write_atomically
-from ident_service.results.manifest import named_files, remove_stale, write_manifest
 
 
 def everything_in(folder: Path) -> list[str]:
@@ -129,18 +128,3 @@ def test_a_file_in_the_folder_s_place_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="cannot be written"), appearing_folder(tmp_path / "deep" / "run"):
         pytest.fail("the block was entered")
     assert everything_in(tmp_path) == ["deep", "run"]
-
-
-def test_an_earlier_result_leaves_nothing_stale_in_its_folder(tmp_path: Path) -> None:
-    for name in ("parameters.json", "identified.urdf", "edited.txt"):
-        (tmp_path / name).write_text("old")
-    write_manifest(tmp_path)
-    earlier = named_files(tmp_path)
-    (tmp_path / "edited.txt").write_text("by a person")
-    (tmp_path / "notes.txt").write_text("by a person")
-    with appearing_folder(tmp_path) as staging:  # another result, which no body has, and so without a URDF
-        (staging / "parameters.json").write_text("new")
-        write_manifest(staging)
-    remove_stale(tmp_path, earlier)
-    assert everything_in(tmp_path) == ["edited.txt", "manifest.json", "notes.txt", "parameters.json"]
-    assert (tmp_path / "edited.txt").read_text() == "by a person"

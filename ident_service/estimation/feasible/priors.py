@@ -229,7 +229,7 @@ def roomier(
 def _within(prior: Prior, base: BaseParameters, conditions: FeasibleSet, near: Near, inside: Array) -> Array:
     """Link parameters of the least divergence from the prior whose base parameters are near others."""
     n, links = len(prior.names), prior.whitened
-    problem = ConicProblem(n + 14 * len(links))
+    problem = ConicProblem(n + 14 * len(links), rough=True)  # where Newton's method begins
     to_delta = np.zeros((n, n + 14 * len(links)))
     to_delta[:, :n] = np.diag(prior.scales)
     hold(problem, conditions, to_delta, inside)

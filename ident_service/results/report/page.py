@@ -24,6 +24,7 @@ from ident_service.results.evidence.evidence import Evidence, Traced
 from ident_service.results.evidence.file import runs_of
 from ident_service.results.evidence.making import CAD
 from ident_service.results.evidence.packing import packed, packed_mask
+from ident_service.results.link_values import WHAT_THEN
 from ident_service.results.parameter_file import ParameterFile
 from ident_service.results.report.figure import Figure, Zoom
 from ident_service.results.report.figures import Figures, figures
@@ -128,7 +129,7 @@ def _sections(
             _grid(drawn.friction, "The arm's model has no friction, so there is no curve to compare with."),
         ],
         "doubt": [_grid(drawn.doubt, "The parameter file has no standard deviations.")],
-        "bodies": _bodies(evidence, drawn),
+        "bodies": _bodies(evidence, parameters, drawn),
         "timing": [_arrival(config), _grid(drawn.timing, ""), axis_table(evidence)],
         "files": [*_run(parameters), file_table(evidence, parameters, sha256)],
     }
@@ -167,7 +168,7 @@ def _torque(evidence: Evidence, parameters: ParameterFile, drawn: Figures) -> It
         yield paragraph("There is no recording that the fit has not seen. Give one with --validate.")
 
 
-def _bodies(evidence: Evidence, drawn: Figures) -> Iterable[str]:
+def _bodies(evidence: Evidence, parameters: ParameterFile, drawn: Figures) -> Iterable[str]:
     if not evidence.conditions:
         yield paragraph("No body has these parameters, so there are no link parameters, no margins, no ellipsoids.")
         return
@@ -175,6 +176,9 @@ def _bodies(evidence: Evidence, drawn: Figures) -> Iterable[str]:
         "Motion shows base parameters only: the bodies are one choice of many that move alike. Good: much room. "
         "Bad: almost none: data and condition pull against each other."
     )
+    if strange := parameters.content.get("link_parameters", {}).get("implausible"):
+        yield items([f"Implausible, {line}." for line in strange])
+        yield paragraph(WHAT_THEN)
     yield margin_table(evidence)
     yield _grid(drawn.bodies, "")
 
