@@ -355,8 +355,7 @@ class CanopenArm(Arm):
         valid, age = self._all_fresh
         if not buses.complete:
             ages = [max(drives[k].age for k in needed) for needed in self._drives_of]
-            age = np.array(ages, dtype=np.int64)
-            valid = age == 0
+            valid = (age := np.array(ages, dtype=np.int64)) == 0
         return Sample(
             self._cycle,
             stamp_ns,
