@@ -95,7 +95,7 @@ def measure(path: Path, tries: int, state: Path) -> list[Row]:
         if (run / "ended.json").is_file():
             ended = json.loads((run / "ended.json").read_text(encoding="utf-8"))
         faults = fault_file(state, config.name)
-        ends.update([str(ended.get("state"))] if ended.get("state") == "done" else faults.latched())
+        ends.update(["done"] if ended.get("state") == "done" else [f"{k}: {v}" for k, v in faults.latched().items()])
         for code in list(faults.latched()):
             _ident("ack", path, code, "--state", state)
         if ended.get("state") == "done":
@@ -103,7 +103,8 @@ def measure(path: Path, tries: int, state: Path) -> list[Row]:
             done += 1
             worst_ms.append(lateness["worst_us"] * 1e-3)
             lost, cycles = lost + lateness["late_or_lost"], cycles + lateness["count"]
-    print(f"{name}: {', '.join(f'{end} {count} times' for end, count in ends.items())}")
+    for end, count in ends.items():
+        print(f"{name}: {count} times {end}")
     rows = [Row(f"{name}: share of {tries} tries that reached the end", done / tries, "", f">= {TARGET}")]
     if worst_ms:
         rows += [
@@ -136,7 +137,7 @@ def _ident(*words: object) -> subprocess.CompletedProcess[str]:
 
 def _written(folder: Path, tree: dict[str, Any]) -> Path:
     path = folder / f"{tree['name']}.yaml"
-    path.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    path.write_text(json.dumps(tree), encoding="utf-8")  # YAML without anchors
     return path
 
 

@@ -132,8 +132,9 @@ class Deadlines:
         came_ns = woken_ns if self._scheduled else stamp_ns
         off = 0 if self._expected_ns is None else came_ns - self._expected_ns
         self.lateness_ns = lateness = max(0, off)
-        # After a whole period's lateness the schedule begins anew: nobody catches up with bursts.
-        self._expected_ns = came_ns - off + round(FOLLOWS * off) + period if lateness < period else None
+        # Slots that were left out are not caught up with: the schedule goes on from the nearest one.
+        beside = off - round(lateness / period) * period
+        self._expected_ns = came_ns - beside + round(FOLLOWS * beside) + period
         doubted_ns, self._doubt_ns = self._doubt_ns, doubt_ns
         before, self._stamp_ns = self._stamp_ns, stamp_ns
         woken_before, self._woken_ns = self._woken_ns, woken_ns

@@ -100,6 +100,14 @@ def test_a_stall_of_ten_milliseconds_is_survived_and_a_longer_one_is_named() -> 
         assert fault.message.startswith("this computer stalled for 10 ms, 10 ms are survived")
 
 
+@pytest.mark.parametrize("skipped", [0.9, 1.0, 1.1, 2.95])
+def test_a_slot_that_is_left_out_makes_no_cycle_after_it_late(skipped: float) -> None:
+    times, step = Times(scheduled=False), round((1.0 + skipped) * MS)
+    assert code(times.cycle(step)) == "late_cycle"
+    assert {code(times.cycle()) for _ in range(100)} == {None}
+    assert times.deadlines.lost == round(skipped)
+
+
 def test_stalls_of_a_second_are_added_up_and_forgotten_after_it() -> None:
     times = Times(scheduled=False)
     for _ in range(5):
