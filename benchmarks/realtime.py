@@ -43,7 +43,7 @@ def planar(folder: Path) -> Path:
     shipped = shipped_arms()["planar2"]
     truth = yaml.safe_load(Path(shipped).read_text(encoding="utf-8"))["driver"]["truth"]
     motion = {"kind": "seeded", "seed": 1, "base_frequency": 0.2, "harmonics": 5, "periods": 2}
-    drive = {"counts": 65536, "rated_torque": 0.1, "max_torque": 20.0, "max_speed": 6000.0}
+    drive = {"counts": 65536, "rated_torque": 0.1, "max_torque": 3.0, "max_speed": 6000.0}
     driver = {
         "kind": "canopen",
         "eds": str(Path(shipped).with_name("puck.eds")),
