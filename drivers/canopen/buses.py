@@ -34,7 +34,7 @@ AWAKE = 2.0  # s within which every drive must answer
 LEAST = 0.5  # of a period, from SYNC on, that positions are waited for in any case
 SETTLED = 5  # cycles in a row with everybody's position before an arm counts as open
 _MISSED = 0.25  # of a period late, and the slot is left to the next
-_DOUBT = 0.1  # of a period: sending a SYNC takes less, unless this computer stalls
+_DOUBT = 0.25  # of a period: sending a SYNC takes less, unless this computer stalls
 _ASK = bytes([0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0])  # SDO upload of the device type, which every node has
 
 
@@ -225,8 +225,8 @@ class Buses:
         """
         begin_ns = self.clock.now_ns() if self._next_ns is None else self._next_ns
         self.clock.sleep_until_ns(begin_ns)
-        late_ns = self.clock.now_ns() - begin_ns
-        if late_ns > _MISSED * self._period_ns:  # drives go on with the torque that they have
+        while (late_ns := self.clock.now_ns() - begin_ns) > _MISSED * self._period_ns:
+            # Drives go on with the torque that they have.
             begin_ns += -(-late_ns // self._period_ns) * self._period_ns
             self.clock.sleep_until_ns(begin_ns)
         self._next_ns = begin_ns + self._period_ns

@@ -23,7 +23,8 @@ class Control(GrownSection):
     be overcompensated, and push the arm ahead of its reference at every reversal.
 
     A stall of this computer of up to `longest_stall` [s] ends no motion, 10 ms or one period by default: the drives go
-    on with the last torque meanwhile. It is at most half of the time after which they would stop by themselves.
+    on with the last torque meanwhile. It is at most half of the time after which they would stop by themselves, and 19
+    periods.
 
     `after_stop` says what follows a stop: `brake` for drives with brakes, and for arms that gravity does not move,
     which need not say it; `hold`: held under control until a person confirms that the arm is supported or home;

@@ -21,6 +21,7 @@ from ident_service.motion.faults import Fault, Findings
 LONGEST_STALL, SUCCESS = 0.010, 0.95  # s, or one period where that is longer
 LATE = 0.25  # periods late that a cycle may be (FIELDBUS.md: OWD counts periods above 1.25 times the nominal one)
 FOLLOWS = 1.0 / 32.0  # of the difference from the schedule that the schedule takes over, each cycle
+_MOST_UNKNOWN = 3  # cycles in a row without a velocity: two stalls, one after the other
 LONGEST_GAP = 20  # periods without a cycle, through which nobody guarded the arm (libfranka's lost packets)
 
 
@@ -31,9 +32,11 @@ def longest_stall(described: float | None, period: float, watchdogs: Iterable[Wa
         described: `control.longest_stall` of the arm's description [s].
         period: of the loop [s].
         watchdogs: of the drives. Half of the shortest time is the most: what comes late must not come too late.
+            Nor is it more than nearly the gap that is called silence.
     """
     times = [one.seconds for one in watchdogs if one.seconds is not None]
-    return min([max(LONGEST_STALL, period) if described is None else described, *(0.5 * time for time in times)])
+    asked = max(LONGEST_STALL, period) if described is None else described
+    return min([asked, (LONGEST_GAP - 1) * period, *(0.5 * time for time in times)])
 
 
 class Elapsed:
@@ -43,14 +46,15 @@ class Elapsed:
     sense are the guard's matter; nobody shall divide by them.
 
     Attributes:
-        known: whether both samples were taken when their stamps say, so that a velocity can be told from them.
+        known: whether both samples were taken when their stamps say, so that a velocity can be told from them. Where
+            that is not so again and again, stamps are believed all the same: a loop without a velocity has no damping.
     """
 
     def __init__(self, period: float) -> None:
         """`period` [s] of the loop."""
         self._period, self._period_ns = period, round(period * 1e9)
         self._before_ns: int | None = None
-        self._doubt_ns = 0
+        self._doubt_ns = self._unknown = 0
         self.known = True
 
     def __call__(self, stamp_ns: int, doubt_ns: int = 0) -> float:
@@ -60,8 +64,10 @@ class Elapsed:
             stamp_ns: of a sample [ns].
             doubt_ns: how much earlier it may have been taken [ns]; the time from one that was is the longest possible.
         """
-        gap_ns = self._period_ns if self._before_ns is None else stamp_ns - self._before_ns + self._doubt_ns
-        self.known = doubt_ns == self._doubt_ns == 0
+        gap_ns = self._period_ns if self._before_ns is None else stamp_ns - self._before_ns
+        self._unknown = 0 if doubt_ns == self._doubt_ns == 0 else self._unknown + 1
+        self.known = self._unknown == 0 or self._unknown > _MOST_UNKNOWN
+        gap_ns += 0 if self.known else self._doubt_ns
         self._before_ns, self._doubt_ns = stamp_ns, doubt_ns
         return (
             self._period
@@ -141,7 +147,8 @@ class Deadlines:
         if before is None:
             return None
         gap, slept = stamp_ns - before, woken_ns - woken_before
-        if gap + doubted_ns > 0 and gap <= period + self._late_ns and lateness <= self._late_ns:
+        in_time = gap <= period + self._late_ns and lateness <= self._late_ns and not doubt_ns
+        if in_time and gap + doubted_ns > 0:
             return None
         if gap + doubted_ns <= 0:
             return self._findings.found("clock_jump", f"consecutive stamps are {gap * 1e-6:g} ms apart")
@@ -149,7 +156,7 @@ class Deadlines:
             return self._findings.found("bus_silent", f"for {slept * 1e-6:g} ms there was no cycle")
         if gap > LONGEST_GAP * period:
             return self._findings.found("clock_jump", f"consecutive stamps are {gap * 1e-6:g} ms apart")
-        return self._late(stamp_ns, max(gap - period, lateness))
+        return self._late(stamp_ns, max(gap - period, lateness, doubt_ns))
 
     def _late(self, stamp_ns: int, late_ns: int) -> Fault:
         """Count a late cycle, and what was lost before it: too long a stall, or too many, are a fault."""

@@ -129,6 +129,8 @@ def test_stalls_of_a_second_are_added_up_and_forgotten_after_it() -> None:
         (None, 0.02, (), 0.02),
         (0.004, 0.002, (None, 0.1), 0.004),
         (0.02, 0.002, (0.1, 0.03), 0.015),
+        (0.02, 0.001, (), 0.019),
+        (None, 0.0004, (), 0.0076),
     ],
 )
 def test_the_longest_stall_is_described_and_never_more_than_half_of_what_drives_wait(
@@ -147,6 +149,16 @@ def test_a_stamp_that_may_be_too_late_tells_no_velocity() -> None:
     assert elapsed(17 * MS) == pytest.approx(15e-3)
     assert not elapsed.known
     assert (elapsed(19 * MS), elapsed.known) == (2e-3, True)
+
+
+def test_a_computer_that_is_always_in_doubt_is_too_late_and_its_stamps_are_believed_at_last() -> None:
+    deadlines, known, codes = Deadlines(Findings(), 1e-3), [], []
+    for cycle in range(100):
+        codes.append(code(deadlines.cycle(cycle * MS, cycle * MS + MS // 2, 300_000 if cycle else 0)))
+        known.append(deadlines.known)
+    assert codes.index("late_cycles") == 51
+    assert known == [True] + 3 * [False] + 96 * [True]
+    assert deadlines.elapsed == 1e-3
 
 
 @pytest.mark.parametrize(("gap", "told"), [(0, "0 ms"), (-MS, "-1 ms"), (LONGEST_GAP * MS + 1, "20 ms")])
