@@ -34,6 +34,7 @@ STALLS = (
     "repeated_warnings",
     "lease_lost",
     "8250h",
+    "not every axis answers",  # before anything moves
 )
 
 
