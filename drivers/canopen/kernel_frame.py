@@ -1,4 +1,4 @@
-"""A frame as the kernel's CAN sockets carry it (linux/can.h), to and from `Frame`.
+"""Convert frames to bytes: those of the kernel's CAN sockets (linux/can.h), and packets between our processes.
 
 `struct can_frame` has 16 bytes: identifier and flags (32 bit, native order), length, 3 bytes of padding, 8 of data.
 `struct canfd_frame` has 72: the same with a byte of flags after the length and 64 of data.
@@ -9,9 +9,11 @@ Boundary: bytes in, values out; no socket.
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterable
 from typing import Final
 
 from drivers.canopen.frame import Frame
+from drivers.canopen.sendable import FD_LENGTHS
 from ident_service.errors import DriverError
 
 CLASSIC_BYTES: Final = 16
@@ -20,6 +22,11 @@ EXTENDED, REMOTE, ERROR = 0x8000_0000, 0x4000_0000, 0x2000_0000
 RATE_SWITCH: Final = 0x01  # CANFD_BRS: the data phase at the data bit rate
 _CLASSIC: Final = struct.Struct("=IB3x8s")
 _FD: Final = struct.Struct("=IBB2x64s")
+MAX_PACKET_BYTES: Final = 8192
+MAX_PACKET_FRAMES: Final = 64  # fits with 64 bytes each
+_PACKED: Final = struct.Struct("<qIBB2x")
+_OWN_FLAG: Final = 1  # it is an echo, or was sent rather than heard
+_FD_FLAG: Final = 2
 
 
 def to_kernel(frame: Frame, *, fd: bool = False) -> bytes:
@@ -55,3 +62,53 @@ def from_kernel(data: bytes, stamp_ns: int = 0) -> Frame:
     identifier = word & (0x1FFF_FFFF if extended or error else 0x7FF)
     fd = len(data) == FD_BYTES
     return Frame(identifier, b"" if remote else payload[:length], remote, error, extended, stamp_ns, fd)
+
+
+def pack_frames(frames: Iterable[tuple[Frame, bool]]) -> bytes:
+    """Pack frames into one packet for another process, little-endian.
+
+    A frame is a header of 16 bytes (stamp [ns], the kernel's identifier word, length, flags) and its data.
+
+    Args:
+        frames: at most `MAX_PACKET_FRAMES` that exist on a bus, and whether each was sent by whom the packet is for.
+    """
+    parts = []
+    for (identifier, data, remote, error, extended, stamp_ns, fd), own in frames:
+        word = identifier | (EXTENDED if extended else 0) | (REMOTE if remote else 0) | (ERROR if error else 0)
+        parts.append(_PACKED.pack(stamp_ns, word, len(data), own | fd << 1))
+        parts.append(data)
+    return b"".join(parts)
+
+
+def unpack_frames(data: bytes) -> list[tuple[Frame, bool]]:
+    """Unpack the frames of one packet, and whether each was sent by whom the packet is for.
+
+    Raises:
+        DriverError: a packet that is empty, too long, torn, or has a frame that cannot exist.
+    """
+    if not 0 < len(data) <= MAX_PACKET_BYTES:
+        raise DriverError(f"a packet of {len(data)} bytes")
+    frames, at, end = [], 0, len(data)
+    while at < end:
+        if end - at < _PACKED.size:
+            raise DriverError(f"a torn packet: {end - at} bytes left")
+        stamp_ns, word, length, flags = _PACKED.unpack_from(data, at)
+        at += _PACKED.size
+        payload = data[at : at + length]
+        at += length
+        remote, error, extended = bool(word & REMOTE), bool(word & ERROR), bool(word & EXTENDED)
+        identifier = word & 0x1FFF_FFFF
+        fd = bool(flags & _FD_FLAG)
+        if (
+            len(payload) != length
+            or length not in FD_LENGTHS
+            or (length > 8 and not fd)
+            or (remote and length)
+            or (fd and (remote or error))
+            or flags & ~(_OWN_FLAG | _FD_FLAG)
+        ):
+            raise DriverError(f"a malformed frame: {length=}, {flags=}")
+        if identifier > 0x7FF and not (extended or error):
+            raise DriverError(f"identifier {identifier:X}h does not fit 11 bits")
+        frames.append((Frame(identifier, payload, remote, error, extended, stamp_ns, fd), bool(flags & _OWN_FLAG)))
+    return frames

@@ -22,8 +22,8 @@ from types import TracebackType
 from typing import Final, Self
 
 from drivers.canopen.frame import Frame
+from drivers.canopen.kernel_frame import pack_frames
 from drivers.canopen.link import Link
-from drivers.canopen.wire.packets import pack_frames
 from drivers.clock import Clock
 from ident_service.errors import DriverError
 

@@ -20,8 +20,7 @@ import can
 from can.io.canutils import CanutilsLogWriter
 
 from drivers.canopen.frame import Frame
-from drivers.canopen.kernel_frame import ERROR
-from drivers.canopen.wire.packets import MAX_BYTES, unpack_frames
+from drivers.canopen.kernel_frame import ERROR, MAX_PACKET_BYTES, unpack_frames
 from ident_service.errors import DriverError
 
 _WINDOW_NS: Final = 500_000_000
@@ -130,7 +129,7 @@ def _serve(source: socket.socket) -> int:
         request = json.loads(source.recv(65536))
         log = OrderedLog(Path(request["path"]), request["utc_offset_ns"])
         _say(source, {"error": ""})
-        while packet := source.recv(MAX_BYTES + 1):
+        while packet := source.recv(MAX_PACKET_BYTES + 1):
             frames = unpack_frames(packet[1:])
             taken += len(frames)
             log.add(packet[0], frames)
@@ -141,7 +140,7 @@ def _serve(source: socket.socket) -> int:
     if log is not None:
         if error:  # what is left unread when the socket closes would hide the answer
             with suppress(OSError, DriverError):
-                while packet := source.recv(MAX_BYTES + 1):
+                while packet := source.recv(MAX_PACKET_BYTES + 1):
                     taken += len(unpack_frames(packet[1:]))
         try:
             log.close()

@@ -18,14 +18,13 @@ from typing import Final, Literal
 from ident_service.errors import Dependent, DriverError, InUse, UnknownId, UsageError
 from ident_service.motion.control_file import ControlFile
 from ident_service.service.arm_state import arm_folder, control_path, fault_file
-from ident_service.service.jobs.commands import REPORTS
 from ident_service.service.maintenance.schedules import remove_schedule
 from ident_service.service.registry.arms import DESCRIPTIONS, know_shipped
 from ident_service.service.registry.audit import note
 from ident_service.service.registry.database import Database, Row
 from ident_service.service.registry.jobs import LIVE
 from ident_service.service.registry.motions import MOTIONS, known_motion
-from ident_service.service.registry.runs import RUNS, known_run
+from ident_service.service.registry.runs import REPORTS, RUNS, known_run
 
 _GONE: Final = ".deleted"
 _PLACES: Final = (RUNS, MOTIONS, DESCRIPTIONS, "arms")

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from link_bench import frames
 
 from drivers.canopen.frame import Frame
-from drivers.canopen.kernel_frame import from_kernel, to_kernel
+from drivers.canopen.kernel_frame import MAX_PACKET_BYTES, from_kernel, pack_frames, to_kernel, unpack_frames
 from drivers.canopen.sendable import check_sendable
 from drivers.canopen.wire import packets
 from ident_service.errors import DriverError
@@ -75,17 +75,17 @@ def test_every_frame_that_exists_may_be_sent(frame: Frame) -> None:
 @given(st.lists(st.tuples(frames(fd=True, errors=True), st.booleans()), min_size=1, max_size=64), st.integers(0, 2**62))
 def test_frames_survive_a_packet(drawn: list[tuple[Frame, bool]], stamp: int) -> None:
     stamped = [(frame._replace(stamp_ns=stamp + k), own) for k, (frame, own) in enumerate(drawn)]
-    data = packets.pack_frames(stamped)
-    assert len(data) <= packets.MAX_BYTES
-    assert packets.unpack_frames(data) == stamped
+    data = pack_frames(stamped)
+    assert len(data) <= MAX_PACKET_BYTES
+    assert unpack_frames(data) == stamped
 
 
 @given(st.lists(frames(fd=True), min_size=1, max_size=5), st.data())
 def test_a_torn_packet_is_one_error_or_the_frames_before_the_tear(drawn: list[Frame], choice: st.DataObject) -> None:
-    data = packets.pack_frames([(frame, False) for frame in drawn])
+    data = pack_frames([(frame, False) for frame in drawn])
     cut = choice.draw(st.integers(0, len(data) - 1))
     try:
-        found = [frame for frame, _ in packets.unpack_frames(data[:cut])]
+        found = [frame for frame, _ in unpack_frames(data[:cut])]
     except DriverError:
         return
     assert found == drawn[: len(found)]
@@ -95,7 +95,7 @@ def test_a_torn_packet_is_one_error_or_the_frames_before_the_tear(drawn: list[Fr
 @given(st.binary(max_size=300))
 def test_noise_is_frames_that_exist_or_one_error(data: bytes) -> None:
     try:
-        found = packets.unpack_frames(data)
+        found = unpack_frames(data)
     except DriverError:
         return
     for frame, _ in found:

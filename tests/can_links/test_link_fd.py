@@ -14,12 +14,12 @@ from link_bench import PATIENCE, arm_on_bus, content, end_of, frames, soon, wait
 from drivers.canopen.bits import exact
 from drivers.canopen.bus_errors import BUS_OFF, BusError
 from drivers.canopen.frame import Frame
+from drivers.canopen.kernel_frame import pack_frames, unpack_frames
 from drivers.canopen.link import open_links
 from drivers.canopen.sendable import FD_LENGTHS
 from drivers.canopen.wire.host import WireThread
 from drivers.canopen.wire.hub import ERROR_BITS, Wire
 from drivers.canopen.wire.medium import Medium, Port
-from drivers.canopen.wire.packets import pack_frames, unpack_frames
 from ident_service.errors import DriverError
 
 SLOW, FAST = 500_000, 2_000_000

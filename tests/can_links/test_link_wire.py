@@ -20,6 +20,7 @@ from link_bench import PATIENCE, arm_on_bus, content, end_of, frames, greeted, p
 
 from drivers.canopen.bus_errors import BUS_OFF, CONTROLLER, RESTARTED, RX_OVERFLOW, BusError
 from drivers.canopen.frame import Frame
+from drivers.canopen.kernel_frame import MAX_PACKET_BYTES, pack_frames
 from drivers.canopen.link import open_links
 from drivers.canopen.wire import address, packets
 from drivers.canopen.wire.host import LocalPort, WireThread
@@ -59,7 +60,7 @@ def test_frames_that_wait_together_are_ordered_by_arbitration(name: str) -> None
             wire.poll(soon())
         listener = LocalPort(wire, "listener")
         for identifier, sock in zip((0x183, 0x181, 0x182), connections, strict=True):
-            sock.send(packets.pack_frames([(Frame(identifier), False), (Frame(identifier - 0x100), False)]))
+            sock.send(pack_frames([(Frame(identifier), False), (Frame(identifier - 0x100), False)]))
         wire.poll(soon())
         assert [frame.identifier for frame in listener.drain()] == [0x181, 0x081, 0x182, 0x082, 0x183, 0x083]
         for sock in connections:
@@ -207,7 +208,7 @@ def test_noise_on_the_socket_never_stops_the_wire(wire: Wire, noise: list[bytes]
         sock.settimeout(PATIENCE)
         if greets:
             sock.send(packets.pack_hello(Hello("noise")))
-            sock.recv(packets.MAX_BYTES)
+            sock.recv(MAX_PACKET_BYTES)
         try:
             for data in noise:
                 sock.send(data)
@@ -232,9 +233,9 @@ def test_an_end_that_sends_what_no_controller_sends_is_thrown_out(wire: Wire, fr
     with address.connect(wire.name) as sock:
         sock.settimeout(PATIENCE)
         sock.send(packets.pack_hello(Hello("liar")))
-        sock.recv(packets.MAX_BYTES)
-        sock.send(packets.pack_frames([(frame, False)]))
-        assert sock.recv(packets.MAX_BYTES) == b""
+        sock.recv(MAX_PACKET_BYTES)
+        sock.send(pack_frames([(frame, False)]))
+        assert sock.recv(MAX_PACKET_BYTES) == b""
     assert wire.expelled == 1
 
 
@@ -252,7 +253,7 @@ def test_an_end_of_another_version_is_told_so(wire: Wire) -> None:
     with address.connect(wire.name) as sock:
         sock.settimeout(PATIENCE)
         sock.send(packets.pack_hello(Hello("old"))[:4] + b"\0" + bytes(40))
-        assert packets.unpack_welcome(sock.recv(packets.MAX_BYTES)).answer == packets.OTHER_VERSION
+        assert packets.unpack_welcome(sock.recv(MAX_PACKET_BYTES)).answer == packets.OTHER_VERSION
 
 
 def test_something_else_at_the_address_is_told_from_a_wire(name: str) -> None:
@@ -264,7 +265,7 @@ def test_something_else_at_the_address_is_told_from_a_wire(name: str) -> None:
             with ThreadPoolExecutor() as pool:
                 end = pool.submit(end_of, name)
                 with listener.accept()[0] as sock:
-                    sock.recv(packets.MAX_BYTES)
+                    sock.recv(MAX_PACKET_BYTES)
                     sock.send(answer)
                     with pytest.raises(DriverError, match=complaint):
                         end.result(PATIENCE)

@@ -22,6 +22,7 @@ from typing import Final, Self
 from drivers.canopen.bits import exact
 from drivers.canopen.bus_errors import BusError
 from drivers.canopen.frame import Frame
+from drivers.canopen.kernel_frame import MAX_PACKET_BYTES, MAX_PACKET_FRAMES, pack_frames, unpack_frames
 from drivers.canopen.wire import address, packets
 from drivers.canopen.wire.medium import Medium, Port, overflow
 from ident_service.errors import DriverError
@@ -154,7 +155,7 @@ class Wire:
             ends = [
                 number
                 for number, end in self._ends.items()
-                if end.port is None or self.medium.room(end.port) >= packets.MAX_FRAMES
+                if end.port is None or self.medium.room(end.port) >= MAX_PACKET_FRAMES
             ]
             return [self._listener.fileno(), self._wake, *ends], self.medium.end_ns
 
@@ -181,7 +182,7 @@ class Wire:
 
     def _read(self, end: _End, now: int) -> None:
         try:
-            data = end.socket.recv(packets.MAX_BYTES + 1)
+            data = end.socket.recv(MAX_PACKET_BYTES + 1)
         except BlockingIOError:
             return
         except OSError:
@@ -193,7 +194,7 @@ class Wire:
             if end.port is None:
                 self._greet(end, packets.unpack_hello(data))
                 return
-            for frame, _ in packets.unpack_frames(data):
+            for frame, _ in unpack_frames(data):
                 if frame.error:
                     raise DriverError("a frame that no controller sends")
                 # The queue had room for a whole packet.
@@ -226,8 +227,8 @@ class Wire:
         if end.dropped:
             frames.insert(0, (overflow(now), False))
         try:
-            for first in range(0, len(frames), packets.MAX_FRAMES):
-                end.socket.send(packets.pack_frames(frames[first : first + packets.MAX_FRAMES]))
+            for first in range(0, len(frames), MAX_PACKET_FRAMES):
+                end.socket.send(pack_frames(frames[first : first + MAX_PACKET_FRAMES]))
                 end.dropped = False
         except BlockingIOError:
             port.lost += len(frames) - first

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from drivers.canopen.bus_errors import BusError, BusOffWatch, kind_of
 from drivers.canopen.frame import Frame
 from drivers.canopen.heard import HEARD, MOST_AT_ONCE
+from drivers.canopen.kernel_frame import MAX_PACKET_BYTES, MAX_PACKET_FRAMES, pack_frames, unpack_frames
 from drivers.canopen.sendable import check_sendable
 from drivers.canopen.wire import address, packets
 from drivers.clock import RealClock
@@ -67,7 +68,7 @@ class Connection:
         self._socket.settimeout(_WELCOME_S)
         try:
             self._socket.send(packets.pack_hello(hello))
-            self.welcome = packets.unpack_welcome(self._socket.recv(packets.MAX_BYTES))
+            self.welcome = packets.unpack_welcome(self._socket.recv(MAX_PACKET_BYTES))
         except (OSError, DriverError) as error:
             self._socket.close()
             raise BusError("refused", self.name, remedy=f"does not answer as a wire does: {error}") from None
@@ -87,10 +88,8 @@ class Connection:
             BusError: the wire is gone, or takes no more.
         """
         try:
-            for first in range(0, len(frames), packets.MAX_FRAMES):
-                self._socket.send(
-                    packets.pack_frames([(frame, False) for frame in frames[first : first + packets.MAX_FRAMES]])
-                )
+            for first in range(0, len(frames), MAX_PACKET_FRAMES):
+                self._socket.send(pack_frames([(frame, False) for frame in frames[first : first + MAX_PACKET_FRAMES]]))
         except OSError as error:
             raise self._failure(error) from None
 
@@ -102,7 +101,7 @@ class Connection:
         """
         while True:
             try:
-                data = self._socket.recv(packets.MAX_BYTES)
+                data = self._socket.recv(MAX_PACKET_BYTES)
             except BlockingIOError:
                 remaining = until_ns - time.monotonic_ns()
                 if remaining <= 0:
@@ -113,7 +112,7 @@ class Connection:
                 raise self._failure(error) from None
             if not data:
                 raise BusError("gone", self.name, remedy="the process that runs this wire has ended; start it again")
-            return packets.unpack_frames(data)
+            return unpack_frames(data)
 
     def close(self) -> None:
         """Leave the wire."""

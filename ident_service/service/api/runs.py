@@ -13,8 +13,8 @@ from ident_service.service.api.asking import Serving, Viewer
 from ident_service.service.api.mistakes import failures, failures_of_files
 from ident_service.service.api.paging import PAGES, BeforeId, Most, Page
 from ident_service.service.jobs.asked import ArmName, FileName, Id
-from ident_service.service.jobs.commands import REPORTS
 from ident_service.service.registry import runs
+from ident_service.service.registry.runs import REPORTS
 
 router = APIRouter(prefix="/api/v1", tags=["runs"], responses=failures(404))
 _REPORT = "report.html"

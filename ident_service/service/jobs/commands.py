@@ -45,9 +45,19 @@ from ident_service.service.jobs.asked import (
 from ident_service.service.registry.arms import KnownArm, known_arm, resources
 from ident_service.service.registry.database import Database
 from ident_service.service.registry.motions import MOTIONS, motion_path, new_id
-from ident_service.service.registry.runs import COLUMNS, RUNS, known_run, recording_name, run_file, run_folder
+from ident_service.service.registry.runs import (
+    COLUMNS,
+    EXPORTS,
+    REPORTS,
+    RUNS,
+    TAKEN_AWAY,
+    known_run,
+    recording_name,
+    run_file,
+    run_folder,
+)
 
-JOBS, REPORTS, EXPORTS = "jobs", "reports", "exports"
+JOBS = "jobs"
 _LOOKS = (Check, Watch, Recover, Base, Preview, Zero, BusLoad, BusScan, BusProbe, ConfigCheck)  # that make no folder
 _OF_A_RUN = (Report, Export, Verify, Compare, Feasible, Correct, Figures, Payload)
 _VERBS: Final = {
@@ -58,8 +68,6 @@ _VERBS: Final = {
     "bus_probe": ("bus", "probe"),
     "config_check": ("config", "check"),
 }
-TAKEN_AWAY: Final = frozenset({"export", "figures", "payload", "correct"})
-"""Kinds whose files are made for somebody to fetch: a folder of its own below `EXPORTS`."""
 FOLDERS: Final = {"design": MOTIONS, **dict.fromkeys(TAKEN_AWAY, EXPORTS)}
 
 

@@ -6,10 +6,10 @@ from contextlib import suppress
 from pathlib import Path
 
 from ident_service.results.manifest import MANIFEST, write_manifest
-from ident_service.service.jobs.commands import EXPORTS, FOLDERS
+from ident_service.service.jobs.commands import FOLDERS
 from ident_service.service.registry.database import Database, Row
 from ident_service.service.registry.motions import MOTION_FILE, MOTIONS, index_motion
-from ident_service.service.registry.runs import RUNS, index_run
+from ident_service.service.registry.runs import EXPORTS, RUNS, index_run
 
 _MAKES_A_RUN = frozenset({"run", "rehearse", "home", "leave_limit", "identify", "simulate", "judge"})
 

@@ -13,11 +13,11 @@ from ident_service.service.api import jobs
 from ident_service.service.api.asking import Operator, Service, Serving, Viewer
 from ident_service.service.api.live_stream import RECORDED, log_of
 from ident_service.service.jobs.asked import FileName, Id
-from ident_service.service.jobs.commands import EXPORTS
 from ident_service.service.pages.asking import Form, PageRoute, seen
 from ident_service.service.pages.render import page
 from ident_service.service.registry import jobs as rows
 from ident_service.service.registry.database import Row
+from ident_service.service.registry.runs import EXPORTS
 
 router = APIRouter(include_in_schema=False, route_class=PageRoute)
 

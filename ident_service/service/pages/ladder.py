@@ -19,13 +19,13 @@ from ident_service.motion.preflight.check import Verdict
 from ident_service.motion.preflight.ticket import read_ticket
 from ident_service.service.acceptance import Acceptance, acceptances
 from ident_service.service.arm_state import ticket_path
-from ident_service.service.jobs.commands import EXPORTS, REPORTS
 from ident_service.service.maintenance.alarms import alarms
 from ident_service.service.maintenance.reidentification import reidentifications, require_comparable
 from ident_service.service.maintenance.schedules import dues
 from ident_service.service.registry import jobs as rows
 from ident_service.service.registry.database import Database, Row
 from ident_service.service.registry.motions import motions
+from ident_service.service.registry.runs import EXPORTS, REPORTS
 
 StepState = Literal["done", "skipped", "next", "open", "busy"]
 TITLES: Final = {

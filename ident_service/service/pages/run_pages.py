@@ -13,11 +13,11 @@ from ident_service.service.api.about import AUDIT_SECONDS
 from ident_service.service.api.asking import Serving, Viewer
 from ident_service.service.api.paging import BeforeId
 from ident_service.service.jobs.asked import ArmName, Id
-from ident_service.service.jobs.commands import REPORTS
 from ident_service.service.pages.asking import PageRoute
 from ident_service.service.pages.render import page
 from ident_service.service.registry import runs as known
 from ident_service.service.registry.audit import trail
+from ident_service.service.registry.runs import REPORTS
 
 router = APIRouter(include_in_schema=False, route_class=PageRoute)
 # Of a page whose own style stands in it, and that needs nothing else.

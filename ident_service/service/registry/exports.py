@@ -9,8 +9,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from ident_service.errors import UnknownId
-from ident_service.service.jobs.commands import EXPORTS, TAKEN_AWAY
 from ident_service.service.registry.database import Database, Row
+from ident_service.service.registry.runs import EXPORTS, TAKEN_AWAY
 
 _ENDED = ("done", "refused")  # a payload that is nothing has files, too
 

@@ -15,7 +15,9 @@ from ident_service.motion.ending import ENDED
 from ident_service.results.manifest import MANIFEST, file_sha256, named_files, verified_files
 from ident_service.service.registry.database import Database, Row
 
-RUNS: Final = "runs"
+RUNS, REPORTS, EXPORTS = "runs", "reports", "exports"
+TAKEN_AWAY: Final = frozenset({"export", "figures", "payload", "correct"})
+"""Kinds of jobs whose files are made for somebody to fetch: a folder of its own below `EXPORTS`."""
 UPLOAD, COLUMNS = "upload.json", "columns.yaml"
 """Files of a run that is an uploaded recording: what was announced, and how its columns are laid out."""
 KILLED: Final = "killed"
