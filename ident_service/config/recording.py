@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import (
     Field,
     SerializerFunctionWrapHandler,
@@ -22,7 +23,7 @@ from pydantic import (
     model_validator,
 )
 
-from ident_service.config.quantities import Angle, NonNegative, Number, Positive, Section
+from ident_service.config.quantities import Angle, GrownSection, NonNegative, Number, Positive, Section
 
 # Beyond, rounding would eat half of the digits on the way from motor to joint.
 _WORST_CONDITION = 1e8
@@ -125,17 +126,20 @@ class Column(Section):
         return self.factor * size
 
 
-class Transmission(Section):
+class Transmission(GrownSection):
     """Gear ratios per joint (motor over joint, the sign tells the sense), coupling of joints, offsets of zero.
 
     `drive_terms` says whose drive inertia and friction are: those of the motors, which a coupling spreads over joints,
-    or those of the joints as if there were no coupling, as in the paper's model of the WAM.
+    or those of the joints as if there were no coupling, as in the paper's model of the WAM. `motor_torque` [N m] is the
+    most that each motor gives, where motors share joints and the driver's section does not say it.
     """
 
     ratios: Annotated[tuple[Number, ...], Field(min_length=1)]
     coupling: tuple[tuple[Number, ...], ...] | None = None
     offsets: tuple[Angle, ...] | None = None
     drive_terms: Literal["motors", "joints"] = "motors"
+    motor_torque: tuple[Positive, ...] | None = None
+    later = frozenset({"motor_torque"})
 
     @field_validator("ratios")
     @classmethod
@@ -158,12 +162,23 @@ class Transmission(Section):
             raise ValueError("the matrix has no inverse, so that no joint position follows from the motors'")
         return coupling
 
-    @field_validator("offsets")
+    @field_validator("offsets", "motor_torque")
     @classmethod
-    def _one_each(cls, offsets: tuple[float, ...] | None, info: ValidationInfo) -> tuple[float, ...] | None:
-        if offsets is not None and "ratios" in info.data and len(offsets) != len(info.data["ratios"]):
-            raise ValueError(f"{len(offsets)} offsets for {len(info.data['ratios'])} ratios")
-        return offsets
+    def _one_each(cls, values: tuple[float, ...] | None, info: ValidationInfo) -> tuple[float, ...] | None:
+        if values is not None and "ratios" in info.data and len(values) != len(info.data["ratios"]):
+            what = "offsets" if info.field_name == "offsets" else "torques"
+            raise ValueError(f"{len(values)} {what} for {len(info.data['ratios'])} ratios")
+        return values
+
+
+def motor_groups(transmission: Transmission) -> NDArray[np.bool_]:
+    """Tell which motors move each joint, directly or through other joints, shape (joints, motors)."""
+    size = len(transmission.ratios)
+    moves = np.eye(size, dtype=bool) if transmission.coupling is None else np.array(transmission.coupling) != 0.0
+    found = moves.T
+    for _ in range(size):
+        found = found @ moves @ moves.T
+    return np.asarray(found)
 
 
 class RecordingFormat(Section):

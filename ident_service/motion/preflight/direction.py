@@ -24,7 +24,7 @@ from ident_service.model.zero_phase import local_polynomial
 from ident_service.motion.preflight.check import Check, Measure, Verdict, failed, judged, measures
 from ident_service.motion.preflight.delay import FREQUENCY, Delay, delay_measures, dither
 from ident_service.motion.preflight.session import BAND, Rows, Session, Trace
-from ident_service.motion.preflight.stability import INERTIA, known_drives
+from ident_service.motion.preflight.stability import INERTIA, drive_matrix, known_drives
 from ident_service.motion.reference import Reference, Setpoint, rest
 from ident_service.motion.surroundings import way_clearance
 from ident_service.motion.way import RuckigReference, way
@@ -259,7 +259,7 @@ def direction_check(
     follows = np.array([one.follows for one in answers])
     # What the drives are known to have does not get lighter with the links: doubled torque shows the sooner.
     most = np.minimum(MOST_ANSWER, MORE_TORQUE * np.diag(session.inertia) / session.lightest)
-    known = nothing if model.prior is None else model.layout.term_values("drive_inertia", model.prior)
+    known = nothing if model.prior is None else np.diag(drive_matrix(model, model.prior))
     said = known_drives(model)
     least = np.where(known > 0.0, LEAST_ANSWER, np.where(said > 0.0, LEAST_DESCRIBED, 0.0))
     response = np.array([one.answers for one in answers])
