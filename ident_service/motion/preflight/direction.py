@@ -158,7 +158,8 @@ def _answer_to_torque(trace: Trace, joint: int, session: Session) -> tuple[float
     measured = local_polynomial(trace.position[:, joint], window, 2, 2, trace.period)
     speed = local_polynomial(trace.position[:, joint], window, 2, 1, trace.period)
     # The same filter on the way that the model expects, so that what it distorts it distorts on both sides.
-    expected = local_polynomial(expected_way(trace, session)[:, joint], window, 2, 2, trace.period)
+    way_expected = _own_way(trace, session, joint) if session.shares_drives else expected_way(trace, session)[:, joint]
+    expected = local_polynomial(way_expected, window, 2, 2, trace.period)
     sliding = (np.minimum(np.abs(rate), np.abs(speed)) > _MOVING * largest) & (np.sign(speed) == np.sign(rate))
     if int(sliding.sum()) < 2 * window:
         return nothing
@@ -315,10 +316,25 @@ def _free_stroke(
 
 def expected_way(trace: Trace, session: Session, sign: Vector | float = 1.0) -> Vector:
     """How far the model expects the torque that acted, times `sign`, to have moved the arm, shape (cycles, joints)."""
-    acceleration = np.linalg.solve(session.inertia, (sign * (trace.torque - session.gravity)).T).T
+    acceleration: Vector = np.linalg.solve(session.inertia, (sign * (trace.torque - session.gravity)).T).T
+    return _integrated_twice(acceleration, trace.period)
+
+
+def _own_way(trace: Trace, session: Session, joint: int) -> Vector:
+    """Return how far the model expects a joint's own torque to have moved it while the others stand, shape (cycles,).
+
+    Where drives are shared, moving one joint takes the friction away that others stand by, and the torques by which
+    they are held then move nothing, against other friction.
+    """
+    push = (trace.torque[:, [joint]] - session.gravity[joint]) / session.inertia[joint, joint]
+    return _integrated_twice(push, trace.period)[:, 0]
+
+
+def _integrated_twice(acceleration: Vector, period: float) -> Vector:
+    """Return the way [rad or m] of accelerations held for a period each, both of shape (cycles, joints)."""
     start = np.zeros((1, acceleration.shape[1]))
-    speed = np.vstack([start, np.cumsum(acceleration, axis=0)[:-1]]) * trace.period
-    steps = trace.period * (speed + 0.5 * trace.period * acceleration)
+    speed = np.vstack([start, np.cumsum(acceleration, axis=0)[:-1]]) * period
+    steps = period * (speed + 0.5 * period * acceleration)
     return np.vstack([start, np.cumsum(steps, axis=0)[:-1]])
 
 

@@ -95,6 +95,7 @@ class Session:
         lightest: the least inertia that each joint may have [kg m^2 or kg], shape (joints,): links lighter than
             modelled, and all of the described drive inertia.
         period: [s].
+        shares_drives: whether drives move several joints.
         torque_limit: of the description [N m or N], shape (joints,).
     """
 
@@ -150,6 +151,7 @@ class Session:
         to_drives = np.linalg.inv(self._coupling).T
         self._stiffness = to_drives**2 @ (limits.kp * np.diag(self.mass))
         self._most = (np.abs(to_drives) * self._band).max(axis=1)
+        self.shares_drives = not np.array_equal(self._coupling, np.diag(np.diag(self._coupling)))
 
     def energise(self) -> None:
         """Enable; the first cycle of `follow` sends the torque that holds the arm.
@@ -181,6 +183,7 @@ class Session:
             DriverError: the arm does not answer.
         """
         self._rows = []
+        learned: list[Vector] = []
         begin_ns: int | None = None
         while True:
             sample = self._arm.exchange(self._torque)
@@ -196,7 +199,13 @@ class Session:
                 moving = np.clip(np.abs(setpoint.velocity) / (2.0 * _CREEP), 0.0, 1.0)
                 wanted = wanted + moving * shaking[0] * np.sin(2.0 * np.pi * shaking[1] * elapsed)
             self._torque = self._limited(wanted + self._against_friction(setpoint, learning))
+            if learning and self.shares_drives and setpoint.velocity.any():
+                learned.append(self._friction)
             if elapsed >= seconds:
+                if learned:
+                    # Where no other joint's friction holds it, what the model lacks of gravity is taken for friction on
+                    # one way and against it on the other.
+                    self._friction = np.mean(learned, axis=0)
                 return self._rows
 
     @property
