@@ -23,7 +23,8 @@ class ArmModel:
         config: what it was made from.
         chain: the mechanism.
         layout: names and order of delta.
-        prior: CAD parameters [SI], shape (layout.size,), or None where nothing is known.
+        prior: CAD parameters, the description's payload included [SI], shape (layout.size,), or None where nothing is
+            known.
     """
 
     config: ArmConfig
@@ -37,7 +38,8 @@ def arm_model(config: ArmConfig) -> ArmModel:
 
     Raises:
         ModelError: a mechanism that is not a tree of one-degree-of-freedom joints, or joints of the configuration
-            that the mechanism does not have, or recorded columns in units of other joints.
+            that the mechanism does not have, or recorded columns in units of other joints, or a payload on a link that
+            the arm does not have.
         ParameterError: prior parameters that the arm does not have.
     """
     kinematics = config.kinematics
@@ -81,8 +83,33 @@ def arm_model(config: ArmConfig) -> ArmModel:
         for link in range(layout.joints):
             prior[layout.inertial(link)] = inertias[link]
     if prior is not None:
+        prior = with_payload(config, chain.names, layout, prior)
         prior.setflags(write=False)
+    elif config.payload is not None:
+        with_payload(config, chain.names, layout, np.zeros(layout.size))
     return ArmModel(config, chain, layout, prior)
+
+
+def with_payload(config: ArmConfig, names: tuple[str, ...], layout: Layout, delta: Array) -> Array:
+    """Return parameters of an arm with what its description's payload adds to them.
+
+    Args:
+        config: the description.
+        names: of the joints.
+        layout: of `delta`.
+        delta: parameters of the arm alone [SI], shape (layout.size,).
+
+    Raises:
+        ModelError: the payload is on a link that the arm does not have.
+    """
+    payload = config.payload
+    if payload is None:
+        return delta
+    if payload.link is not None and payload.link not in names:
+        raise ModelError(f"{config.name}: payload.link: {payload.link!r} is none of {', '.join(names)}")
+    loaded = delta.copy()
+    loaded[layout.inertial(len(names) - 1 if payload.link is None else names.index(payload.link))] += payload.parameters
+    return loaded
 
 
 def control_model(model: ArmModel) -> ArmModel:

@@ -316,8 +316,8 @@ def _free_stroke(
 
 def expected_way(trace: Trace, session: Session, sign: Vector | float = 1.0) -> Vector:
     """How far the model expects the torque that acted, times `sign`, to have moved the arm, shape (cycles, joints)."""
-    acceleration: Vector = np.linalg.solve(session.inertia, (sign * (trace.torque - session.gravity)).T).T
-    return _integrated_twice(acceleration, trace.period)
+    acceleration = np.linalg.solve(session.inertia, (sign * (trace.torque - session.gravity)).T).T
+    return _integrated_twice(np.asarray(acceleration, dtype=np.float64), trace.period)
 
 
 def _own_way(trace: Trace, session: Session, joint: int) -> Vector:

@@ -199,7 +199,7 @@ class Session:
                 moving = np.clip(np.abs(setpoint.velocity) / (2.0 * _CREEP), 0.0, 1.0)
                 wanted = wanted + moving * shaking[0] * np.sin(2.0 * np.pi * shaking[1] * elapsed)
             self._torque = self._limited(wanted + self._against_friction(setpoint, learning))
-            if learning and self.shares_drives and setpoint.velocity.any():
+            if learning and setpoint.velocity.any():
                 learned.append(self._friction)
             if elapsed >= seconds:
                 if learned:
