@@ -27,6 +27,7 @@ from ident_service.config.quantities import Angle, GrownSection, NonNegative, Nu
 
 # Beyond, rounding would eat half of the digits on the way from motor to joint.
 _WORST_CONDITION = 1e8
+_FASTEST = 100_000.0  # Hz, of recordings; beyond, samples would fill any memory
 _NUMBERED = re.compile(r"(q|dq|tau)(\d+)")
 _SAME = 0.01  # a factor this near to a unit's own conversion is that conversion a second time
 
@@ -110,7 +111,7 @@ class Column(Section):
             return self.factor
         if self.unit in bare:
             size, per = bare[self.unit]
-            if self.factor == 1.0:
+            if "factor" not in self.model_fields_set:
                 raise ValueError(f"unit {self.unit!r} needs a factor in {_SI[quantity]} per {per}")
             return self.factor * size
         if self.unit not in own:
@@ -201,7 +202,7 @@ class RecordingFormat(Section):
     stamps: Literal["sampled", "arrival"] = "sampled"
     trim: tuple[NonNegative, NonNegative] = (0.0, 0.0)
     gap: Annotated[float, Field(gt=1, strict=True)] = 3.0
-    rate: Positive | None = None
+    rate: Annotated[Positive, Field(le=_FASTEST)] | None = None
     missing: Literal["refuse", "skip"] = "refuse"
     standstill: Literal["keep", "cut"] = "keep"
 

@@ -83,7 +83,12 @@ def _place(message: str) -> tuple[str, ...]:
     """The keys that a model's complaint is about."""
     if named := _NAMED.search(message):
         return ("kinematics", named.group(1))
-    about = {"payload.link": "payload", "joints are configured as": "joints", "columns": "recording", "parameters this arm does not have": "prior"}
+    about = {
+        "payload.link": "payload",
+        "joints are configured as": "joints",
+        "columns": "recording",
+        "parameters this arm does not have": "prior",
+    }
     return (next((key for words, key in about.items() if words in message), "kinematics"),)
 
 

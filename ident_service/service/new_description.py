@@ -105,7 +105,7 @@ def new_description(
 
         def loaded() -> ArmModel:
             trial.write_text(in_yaml(draft), encoding="utf-8")
-            return arm_model(load_arm(trial))
+            return arm_model(load_arm(trial), bodies=False)  # what is none is guessed
 
         draft.remarks += _which(loaded(), draft)
         tell("joints and bodies")

@@ -61,7 +61,8 @@ def test_it_is_held_moved_and_identified_with_its_payload_and_results_say_so(
     assert main(["verify", str(out / "parameters.json"), "--arm", str(arm)]) == 0
     assert main(["export", str(out), "--format", "urdf", "--out", str(tmp_path / "urdf")]) == 0
     texts = [path.read_text() for path in (tmp_path / "urdf").rglob("*.urdf")]
-    assert texts and all("include the payload of the description: 1.2 kg" in text for text in texts)
+    assert texts
+    assert all("include the payload of the description: 1.2 kg" in text for text in texts)
 
 
 @pytest.mark.slow
@@ -74,7 +75,8 @@ def test_a_payload_that_is_not_on_is_told_before_anything_moves(
     config = load_arm(arm)
     model = arm_model(config)
     truth = true_parameters(config, model)
-    assert truth is not None and config.payload is not None
+    assert truth is not None
+    assert config.payload is not None
     truth[model.layout.inertial(1)] -= 2.0 * np.array(config.payload.parameters)
     table = {name: float(value) for name, value in zip(model.layout.names, truth, strict=True)}
     off.write_text(f"extends: bare.yaml\nname: off\ndriver: {{truth: {json.dumps(table)}}}\n")

@@ -158,8 +158,7 @@ def _answer_to_torque(trace: Trace, joint: int, session: Session) -> tuple[float
     measured = local_polynomial(trace.position[:, joint], window, 2, 2, trace.period)
     speed = local_polynomial(trace.position[:, joint], window, 2, 1, trace.period)
     # The same filter on the way that the model expects, so that what it distorts it distorts on both sides.
-    way_expected = _own_way(trace, session, joint) if session.shares_drives else expected_way(trace, session)[:, joint]
-    expected = local_polynomial(way_expected, window, 2, 2, trace.period)
+    expected = local_polynomial(_own_way(trace, session, joint), window, 2, 2, trace.period)
     sliding = (np.minimum(np.abs(rate), np.abs(speed)) > _MOVING * largest) & (np.sign(speed) == np.sign(rate))
     if int(sliding.sum()) < 2 * window:
         return nothing
@@ -323,8 +322,7 @@ def expected_way(trace: Trace, session: Session, sign: Vector | float = 1.0) -> 
 def _own_way(trace: Trace, session: Session, joint: int) -> Vector:
     """Return how far the model expects a joint's own torque to have moved it while the others stand, shape (cycles,).
 
-    Where drives are shared, moving one joint takes the friction away that others stand by, and the torques by which
-    they are held then move nothing, against other friction.
+    Others are held by friction and by torques that move nothing.
     """
     push = (trace.torque[:, [joint]] - session.gravity[joint]) / session.inertia[joint, joint]
     return _integrated_twice(push, trace.period)[:, 0]

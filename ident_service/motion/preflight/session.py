@@ -95,7 +95,6 @@ class Session:
         lightest: the least inertia that each joint may have [kg m^2 or kg], shape (joints,): links lighter than
             modelled, and all of the described drive inertia.
         period: [s].
-        shares_drives: whether drives move several joints.
         torque_limit: of the description [N m or N], shape (joints,).
     """
 
@@ -151,7 +150,6 @@ class Session:
         to_drives = np.linalg.inv(self._coupling).T
         self._stiffness = to_drives**2 @ (limits.kp * np.diag(self.mass))
         self._most = (np.abs(to_drives) * self._band).max(axis=1)
-        self.shares_drives = not np.array_equal(self._coupling, np.diag(np.diag(self._coupling)))
 
     def energise(self) -> None:
         """Enable; the first cycle of `follow` sends the torque that holds the arm.
@@ -203,8 +201,7 @@ class Session:
                 learned.append(self._friction)
             if elapsed >= seconds:
                 if learned:
-                    # Where no other joint's friction holds it, what the model lacks of gravity is taken for friction on
-                    # one way and against it on the other.
+                    # What the model lacks of gravity is taken for friction on one way, and against it on the other.
                     self._friction = np.mean(learned, axis=0)
                 return self._rows
 
