@@ -27,7 +27,6 @@ from ident_service.motion.control import ComputedTorque
 from ident_service.motion.reference import rest
 from ident_service.service.urdf_says import arm_part
 
-
 CONFIGS = Path(__file__).parents[2] / "configs"
 
 
@@ -122,13 +121,13 @@ def test_one_count_of_the_encoder_is_no_jump_of_the_torque(tmp_path: Path) -> No
     assert isinstance(config.driver, SimulatedDriver)
     dynamics = InverseDynamics(model.chain, model.layout, model.prior)
     count = np.broadcast_to(np.asarray(config.driver.encoder_resolution), (6,))
-    for joint in range(6):
+    for k in range(6):
         control = ComputedTorque(dynamics, limits, period, config.control.velocity_cutoff, limits.home)
-        step = np.where(np.arange(6) == joint, count, 0.0)
+        step = np.where(np.arange(6) == k, count, 0.0)
         every = np.ones(6, dtype=bool)
         before = control.torque(limits.home, every, rest(limits.home))
         after = control.torque(limits.home + step, every, rest(limits.home))
-        assert np.abs(after - before)[joint] < 0.5 * min(1000.0, 100.0 * limits.torque[joint]) * period
+        assert np.abs(after - before)[k] < 0.5 * min(1000.0, 100.0 * limits.torque[k]) * period
 
 
 @pytest.mark.slow

@@ -40,7 +40,7 @@ def test_it_is_held_moved_and_identified_with_its_payload_and_results_say_so(
     assert main(["identify", str(run / "run.mcap"), "--arm", str(arm), "--out", str(out), "--state", str(state)]) == 0
     said = capsys.readouterr().out
     assert "payload, by the description: 1.2 kg at (0.03, -0.02, 0) m of the last link" in said
-    assert "with its payload of 1.2 kg" in (out / "report.html").read_text()
+    assert "with its payload of 1.2\xa0kg" in (out / "report.html").read_text()
     content = json.loads((out / "parameters.json").read_text())
     assert content["arm"]["payload"] == {
         "mass": 1.2,
