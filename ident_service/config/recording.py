@@ -171,6 +171,18 @@ class Transmission(GrownSection):
             raise ValueError(f"{len(values)} {what} for {len(info.data['ratios'])} ratios")
         return values
 
+    @field_validator("motor_torque")
+    @classmethod
+    def _shared(cls, torque: tuple[float, ...] | None, info: ValidationInfo) -> tuple[float, ...] | None:
+        coupling = info.data.get("coupling")
+        if torque is not None and "ratios" in info.data and "coupling" in info.data:
+            shared = coupling is not None and any(
+                value for row, values in enumerate(coupling) for column, value in enumerate(values) if row != column
+            )
+            if not shared:
+                raise ValueError("is for motors that share joints (coupling); else give joints.NAME.torque alone")
+        return torque
+
 
 def motor_groups(transmission: Transmission) -> NDArray[np.bool_]:
     """Tell which motors move each joint, directly or through other joints, shape (joints, motors)."""

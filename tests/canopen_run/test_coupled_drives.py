@@ -13,7 +13,7 @@ from canopen_run_bench import canopen, checked, described, simulated, truth, wri
 from ident_service.cli import main
 from ident_service.config.limits import motion_limits
 from ident_service.config.load import load_arm
-from ident_service.config.schema import ArmConfig
+from ident_service.errors import ConfigError
 from ident_service.excitation.demands import demands
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import ArmModel, arm_model
@@ -93,5 +93,10 @@ def test_drives_limits_are_the_motors(tmp_path: Path) -> None:
 
 
 def test_joints_with_a_motor_each_have_no_other_limits(tmp_path: Path) -> None:
-    alone: ArmConfig = load_arm(simulated_arm(tmp_path, coupling=[[1.0, 0.0], [0.0, 2.0]], motor_torque=[1.0, 1.0]))
+    alone = load_arm(simulated_arm(tmp_path, "alone", coupling=[[1.0, 0.0], [0.0, 2.0]]))
     assert motion_limits(alone).motors is None
+    path = simulated_arm(tmp_path, "told", coupling=[[1.0, 0.0], [0.0, 2.0]], motor_torque=[1.0, 1.0])
+    with pytest.raises(ConfigError, match=r"transmission\.motor_torque: is for motors that share joints"):
+        load_arm(path)
+    with pytest.raises(ConfigError, match=r"transmission\.motor_torque: 1 torques for 2 ratios"):
+        load_arm(simulated_arm(tmp_path, "few", motor_torque=[1.0]))
