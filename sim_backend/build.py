@@ -15,7 +15,7 @@ from ident_service.config.quantities import PerJoint
 from ident_service.config.schema import ArmConfig
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.errors import DriverError
-from ident_service.model.arm_model import arm_model
+from ident_service.model.arm_model import arm_model, with_payload
 from sim_backend.faults import Fault, configured_faults
 from sim_backend.imperfections import Imperfections
 from sim_backend.machine import Machine
@@ -44,7 +44,9 @@ def build_machine(config: ArmConfig, faults: Sequence[Fault] = ()) -> Machine:
     if not isinstance(driver, SimulatedDriver):
         raise DriverError(f"{config.name}: the driver is not a simulated one")
     model = arm_model(config)
-    truth = model.prior if driver.truth is None else model.layout.vector(driver.truth)
+    truth = model.prior
+    if driver.truth is not None:
+        truth = with_payload(config, model.chain.names, model.layout, model.layout.vector(driver.truth))
     if truth is None:
         raise DriverError(f"{config.name}: a simulated arm needs driver.truth, or a prior to take for the truth")
     joints = [config.joints.get(name) for name in model.chain.names]

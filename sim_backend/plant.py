@@ -9,6 +9,9 @@ direction, and unconditionally sticking where one comes to rest::
     (M(q_m) + h/2 fv) (v+ - v)/h = tau - c(q_m, v_m) - g(q_m) - fo - fv v - lambda,  lambda_i in fc_i Sgn(v+_i)
     q+ = q + h/2 (v + v+)
 
+Drives that move several joints, `w = C v`, have their friction in their own coordinates, so that it is drives that
+stick: `C^T (fo + fv w + lambda)` with `lambda_i` in `fc_i Sgn(w+_i)`, solved for `w+` with `C^-T M C^-1`.
+
 Idle drives brake like more of `fv`, or, where a gear couples joints, like a symmetric damping matrix. A load is a point
 mass that moves with the last link, on which it appears without an impact.
 
@@ -16,6 +19,8 @@ Boundary: the only file of this room that knows pinocchio; no clock, no encoder,
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -27,6 +32,8 @@ from ident_service.model.rigid_body import InverseDynamics, pinocchio_model
 from sim_backend.friction import stick_slip_velocity
 
 Load = tuple[float, tuple[float, float, float]]
+
+_ROUNDING = 1e-12  # of the largest number in an inverse
 
 
 class Plant:
@@ -53,7 +60,13 @@ class Plant:
         self._half = 0.5 * period
         self._viscous = layout.term_values("viscous", delta)
         self._coulomb = layout.term_values("coulomb", delta)
-        self._offset = layout.term_values("offset", delta)
+        coupling = chain.coupling
+        self._offset = coupling.T @ layout.term_values("offset", delta)
+        self._inverse_coupling: Array | None = None
+        if not np.array_equal(coupling, np.eye(chain.joints)):
+            inverse = np.linalg.inv(coupling)
+            # Rounding would let a drive that sticks creep with one that it has nothing to do with.
+            self._inverse_coupling = np.where(np.abs(inverse) > _ROUNDING * np.abs(inverse).max(), inverse, 0.0)
         if (self._viscous < 0.0).any() or (self._coulomb < 0.0).any():
             raise ModelError("negative friction would drive the arm; fv and fc must not be negative")
         self._braking = np.zeros(chain.joints)
@@ -61,7 +74,7 @@ class Plant:
         self._build(self._delta)
         # What a velocity times its old sign must exceed for a joint to go on sliding; frictionless joints always do.
         self._keeps_on = np.where(self._coulomb > 0.0, 0.0, -np.inf)
-        self._set(np.array(position, dtype=float), np.zeros(chain.joints), np.zeros(chain.joints))
+        self.place(position)
         if not np.linalg.eigvalsh(self._inverse.mass_matrix(self._position)).min() > 0.0:
             raise ModelError("the mass matrix is not positive definite: no real body has these parameters")
 
@@ -82,13 +95,18 @@ class Plant:
 
     @property
     def velocity(self) -> Array:
-        """[rad/s or m/s], shape (joints,), read-only; exactly 0 where a joint sticks."""
+        """[rad/s or m/s], shape (joints,), read-only; exactly 0 where a joint sticks with all drives that move it."""
         return self._velocity
 
     @property
     def acceleration(self) -> Array:
         """Mean over the last step [rad/s^2 or m/s^2], shape (joints,), read-only."""
         return self._acceleration
+
+    @property
+    def drive_velocity(self) -> Array:
+        """Of the drives, `C dq` [rad/s or m/s], shape (joints,), read-only; exactly 0 where a drive sticks."""
+        return self._rate
 
     @property
     def inertia(self) -> Array:
@@ -117,7 +135,7 @@ class Plant:
             position: [rad or m], shape (joints,).
         """
         still = np.zeros(self._chain.joints)
-        self._set(np.array(position, dtype=float), still, still)
+        self._set(np.array(position, dtype=float), still, still, still)
 
     def load(self, loads: tuple[Load, ...]) -> None:
         """Attach point masses to the last link, in place of those attached before.
@@ -157,59 +175,77 @@ class Plant:
         # A joint at rest is predicted to stay there: its last mean acceleration is the impact that stopped it.
         v_m = v + self._half * (self._acceleration * np.abs(sign))
         smooth = torque - self._offset - self._damping * v
-        if self._coupled is None:
+        if self._coupled is not None:
+            smooth = smooth - self._coupled @ v
+        if self._matrix is None and self._inverse_coupling is None:
             a = pin.aba(self._model, self._data, q_m, v_m, smooth - self._coulomb * sign)
             v_next = v + h * a
+            rate = v_next
             if not (v_next * sign > self._keeps_on).all():
-                v_next = self._stick_or_slip(q_m, v_m, smooth)
+                v_next, rate = self._stick_or_slip(q_m, v_m, smooth)
         else:
-            v_next = self._stick_or_slip(q_m, v_m, smooth - self._coupled @ v)
-        self._set(self._position + self._half * (v + v_next), v_next, (v_next - v) / h)
+            v_next, rate = self._stick_or_slip(q_m, v_m, smooth)
+        self._set(self._position + self._half * (v + v_next), v_next, (v_next - v) / h, rate)
 
     def inverse_dynamics(self, position: Array, velocity: Array, acceleration: Array) -> Array:
         """The torque the true parameters ask for at one state, free of noise: the truth to score against.
 
         Args:
             position: [rad or m], shape (joints,).
-            velocity: [rad/s or m/s], shape (joints,); its sign is dry friction's, which counts as 0 at rest.
+            velocity: [rad/s or m/s], shape (joints,); its sign, or that of the drives' velocity, is dry friction's,
+                which counts as 0 at rest.
             acceleration: [rad/s^2 or m/s^2], shape (joints,).
 
         Returns:
             [N m or N], shape (joints,).
         """
-        friction = self._viscous * velocity + self._coulomb * np.sign(velocity) + self._offset
+        rate = self._chain.coupling @ velocity
+        friction = self._chain.coupling.T @ (self._viscous * rate + self._coulomb * np.sign(rate)) + self._offset
         return np.asarray(self._inverse.torque(position, velocity, acceleration) + friction)
 
     def _build(self, delta: Array) -> None:
-        self._inverse = InverseDynamics(self._chain, self._layout, delta)
-        self._model = pinocchio_model(self._chain, self._layout, delta)
+        chain, layout = self._chain, self._layout
+        self._inverse = InverseDynamics(chain, layout, delta)
+        coupling, drives = chain.coupling, layout.term_values("drive_inertia", delta)
+        links = np.array(delta, dtype=float)
+        links[layout.term_columns("drive_inertia")] = 0.0
+        self._model = pinocchio_model(replace(chain, coupling=np.eye(chain.joints)), layout, links)
         self._data = self._model.createData()
-        self._armature = np.array(self._model.armature)
+        self._drive_matrix = coupling.T @ (drives[:, None] * coupling)
         self._damp()
 
     def _damp(self) -> None:
         # Implicit viscous friction acts like more drive inertia, so that it costs nothing to solve for.
-        braking: Array = self._braking
-        self._coupled: Array | None = None
-        if braking.ndim == 2:
-            # What couples joints does not: it is solved for as dry friction is.
-            rest = braking - np.diag(np.diag(braking))
-            self._coupled, braking = (rest if rest.any() else None), np.diagonal(braking)
-        self._damping = self._viscous + braking
-        self._model.armature = self._armature + self._half * self._damping
+        coupling = self._chain.coupling
+        whole = coupling.T @ (self._viscous[:, None] * coupling)
+        whole = whole + (self._braking if self._braking.ndim == 2 else np.diag(self._braking))
+        self._damping = np.diag(whole).copy()
+        # Between joints it does not, nor does drive inertia: pinocchio has an armature per joint only.
+        damping = whole - np.diag(self._damping)
+        inertia = self._drive_matrix - np.diag(np.diag(self._drive_matrix))
+        self._coupled: Array | None = damping if damping.any() else None
+        self._matrix: Array | None = inertia + self._half * damping if damping.any() or inertia.any() else None
+        self._model.armature = np.diag(self._drive_matrix) + self._half * self._damping
 
-    def _stick_or_slip(self, q_m: Array, v_m: Array, smooth: Array) -> Array:
+    def _stick_or_slip(self, q_m: Array, v_m: Array, smooth: Array) -> tuple[Array, Array]:
+        """Return the velocities of joints and drives at the end of the step."""
         A = np.array(pin.crba(self._model, self._data, q_m))
-        if self._coupled is not None:
-            A += self._half * self._coupled
+        if self._matrix is not None:
+            A += self._matrix
         rest = pin.nonLinearEffects(self._model, self._data, q_m, v_m)
         b = A @ self._velocity + self._stepped * (smooth - rest)
         if not np.isfinite(b).all():
             raise DriverError("the simulated arm ran away: its state is no longer finite")
-        return stick_slip_velocity(A, b, self._stepped * self._coulomb, self._velocity)
+        bound = self._stepped * self._coulomb
+        inverse = self._inverse_coupling
+        if inverse is None:
+            v = stick_slip_velocity(A, b, bound, self._velocity)
+            return v, v
+        rate = stick_slip_velocity(inverse.T @ A @ inverse, inverse.T @ b, bound, self._rate)
+        return np.asarray(inverse @ rate), rate
 
-    def _set(self, position: Array, velocity: Array, acceleration: Array) -> None:
+    def _set(self, position: Array, velocity: Array, acceleration: Array, rate: Array) -> None:
         # Replaced, never written into, so that whoever holds an old state keeps it.
-        for array in (position, velocity, acceleration):
+        for array in (position, velocity, acceleration, rate):
             array.setflags(write=False)
-        self._position, self._velocity, self._acceleration = position, velocity, acceleration
+        self._position, self._velocity, self._acceleration, self._rate = position, velocity, acceleration, rate

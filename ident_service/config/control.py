@@ -12,6 +12,8 @@ from pydantic import Field
 
 from ident_service.config.quantities import GrownSection, Number, Positive
 
+_FASTEST = 10_000.0  # Hz; no torque loop over a fieldbus is faster
+
 
 class Control(GrownSection):
     """The computed-torque loop (eq. 76): rate [Hz] and cut-off of the velocity low-pass [Hz].
@@ -31,7 +33,7 @@ class Control(GrownSection):
     `lower`: lowered under damped control until it rests, or its lowest point is at `floor` [m above the base's origin].
     """
 
-    rate: Positive = 1000.0
+    rate: Annotated[Positive, Field(le=_FASTEST)] = 1000.0
     velocity_cutoff: Positive | tuple[Positive, ...] = 30.0
     after_stop: Literal["brake", "hold", "lower"] | None = None
     floor: Number | None = None

@@ -217,6 +217,8 @@ def _disagreements(config: ArmConfig) -> Iterator[tuple[KeyPath, str]]:
         yield from canopen_checks.disagreements(
             config.driver, config.transmission, names, config.control.rate, homeless, velocities
         )
+    if config.payload is not None and config.payload.link is not None and names and config.payload.link not in names:
+        yield ("payload", "link"), f"payload.link: {config.payload.link!r} is none of {', '.join(names)}"
     yield from recording.disagreements(config.recording, config.transmission, names)
     yield from workspace.disagreements(config.geometry, config.workspace, config.supply, names)
     yield from design.disagreements(config.design, names)

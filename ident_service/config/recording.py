@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import (
     Field,
     SerializerFunctionWrapHandler,
@@ -22,10 +23,11 @@ from pydantic import (
     model_validator,
 )
 
-from ident_service.config.quantities import Angle, NonNegative, Number, Positive, Section
+from ident_service.config.quantities import Angle, GrownSection, NonNegative, Number, Positive, Section
 
 # Beyond, rounding would eat half of the digits on the way from motor to joint.
 _WORST_CONDITION = 1e8
+_FASTEST = 100_000.0  # Hz, of recordings; beyond, samples would fill any memory
 _NUMBERED = re.compile(r"(q|dq|tau)(\d+)")
 _SAME = 0.01  # a factor this near to a unit's own conversion is that conversion a second time
 
@@ -109,7 +111,7 @@ class Column(Section):
             return self.factor
         if self.unit in bare:
             size, per = bare[self.unit]
-            if self.factor == 1.0:
+            if "factor" not in self.model_fields_set:
                 raise ValueError(f"unit {self.unit!r} needs a factor in {_SI[quantity]} per {per}")
             return self.factor * size
         if self.unit not in own:
@@ -125,17 +127,20 @@ class Column(Section):
         return self.factor * size
 
 
-class Transmission(Section):
+class Transmission(GrownSection):
     """Gear ratios per joint (motor over joint, the sign tells the sense), coupling of joints, offsets of zero.
 
     `drive_terms` says whose drive inertia and friction are: those of the motors, which a coupling spreads over joints,
-    or those of the joints as if there were no coupling, as in the paper's model of the WAM.
+    or those of the joints as if there were no coupling, as in the paper's model of the WAM. `motor_torque` [N m] is the
+    most that each motor gives, where motors share joints and the driver's section does not say it.
     """
 
     ratios: Annotated[tuple[Number, ...], Field(min_length=1)]
     coupling: tuple[tuple[Number, ...], ...] | None = None
     offsets: tuple[Angle, ...] | None = None
     drive_terms: Literal["motors", "joints"] = "motors"
+    motor_torque: tuple[Positive, ...] | None = None
+    later = frozenset({"motor_torque"})
 
     @field_validator("ratios")
     @classmethod
@@ -158,12 +163,35 @@ class Transmission(Section):
             raise ValueError("the matrix has no inverse, so that no joint position follows from the motors'")
         return coupling
 
-    @field_validator("offsets")
+    @field_validator("offsets", "motor_torque")
     @classmethod
-    def _one_each(cls, offsets: tuple[float, ...] | None, info: ValidationInfo) -> tuple[float, ...] | None:
-        if offsets is not None and "ratios" in info.data and len(offsets) != len(info.data["ratios"]):
-            raise ValueError(f"{len(offsets)} offsets for {len(info.data['ratios'])} ratios")
-        return offsets
+    def _one_each(cls, values: tuple[float, ...] | None, info: ValidationInfo) -> tuple[float, ...] | None:
+        if values is not None and "ratios" in info.data and len(values) != len(info.data["ratios"]):
+            what = "offsets" if info.field_name == "offsets" else "torques"
+            raise ValueError(f"{len(values)} {what} for {len(info.data['ratios'])} ratios")
+        return values
+
+    @field_validator("motor_torque")
+    @classmethod
+    def _shared(cls, torque: tuple[float, ...] | None, info: ValidationInfo) -> tuple[float, ...] | None:
+        coupling = info.data.get("coupling")
+        if torque is not None and "ratios" in info.data and "coupling" in info.data:
+            shared = coupling is not None and any(
+                value for row, values in enumerate(coupling) for column, value in enumerate(values) if row != column
+            )
+            if not shared:
+                raise ValueError("is for motors that share joints (coupling); else give joints.NAME.torque alone")
+        return torque
+
+
+def motor_groups(transmission: Transmission) -> NDArray[np.bool_]:
+    """Tell which motors move each joint, directly or through other joints, shape (joints, motors)."""
+    size = len(transmission.ratios)
+    moves = np.eye(size, dtype=bool) if transmission.coupling is None else np.array(transmission.coupling) != 0.0
+    found = moves.T
+    for _ in range(size):
+        found = found @ moves @ moves.T
+    return np.asarray(found)
 
 
 class RecordingFormat(Section):
@@ -186,7 +214,7 @@ class RecordingFormat(Section):
     stamps: Literal["sampled", "arrival"] = "sampled"
     trim: tuple[NonNegative, NonNegative] = (0.0, 0.0)
     gap: Annotated[float, Field(gt=1, strict=True)] = 3.0
-    rate: Positive | None = None
+    rate: Annotated[Positive, Field(le=_FASTEST)] | None = None
     missing: Literal["refuse", "skip"] = "refuse"
     standstill: Literal["keep", "cut"] = "keep"
 

@@ -20,6 +20,7 @@ from ident_service.config.control import Control
 from ident_service.config.design import Design
 from ident_service.config.drivers import Driver
 from ident_service.config.kinematics import Kinematics
+from ident_service.config.payload import Payload
 from ident_service.config.quantities import (
     UPLOAD,
     Angle,
@@ -323,6 +324,7 @@ _MOTION_DEPENDS_ON = (
     "terms",
     "joints",
     "prior",
+    "payload",
     "control",
     "transmission",
     "geometry",
@@ -331,14 +333,19 @@ _MOTION_DEPENDS_ON = (
 )
 
 
-class ArmConfig(Section):
+class ArmConfig(GrownSection):
     """A whole arm as its YAML file describes it; the first thing that passes every door.
 
     WARNING: with `unattended_motion: allowed` a scheduled re-identification, or one after maintenance, moves the arm
     with nobody there, at any hour and without any further word; preflight's question whether the arm is supported and
     nobody is within its reach is answered by this key alone. It is for the simulator, and for a cell whose fence and
     interlock take the drives' power away as soon as a person can reach in; software does not see people.
+
+    `prior`, `driver.truth` and the bounds of `joints.*.body` and `constraints.total_mass` are of the arm alone;
+    `payload` comes on top of them for as long as it is mounted.
     """
+
+    later = frozenset({"payload"})
 
     format: Literal["ident-arm"]
     version: Literal[1]
@@ -350,6 +357,7 @@ class ArmConfig(Section):
     joints: dict[str, Joint] = Field(default_factory=dict)
     constraints: Constraints = Constraints()
     prior: ParameterTable | None = None
+    payload: Payload | None = None
     feasible_set: FeasibleSetName = "pseudo_inertia"
     control: Control = Control()
     identification: Identification = Identification()

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ident_service.config.limits import MotionLimits
+from ident_service.config.limits import MotionLimits, motor_limits
 from ident_service.config.workspace import Supply
 from ident_service.errors import MotionRefused
 from ident_service.excitation.enclosure import Stretches, stretches
@@ -38,6 +38,7 @@ class Demands:
         jerk: largest size.
         torque: largest size, or None where no model is known.
         power: the most that the supply gives [W], or None where nothing is known of it.
+        motors: torque of motors that share joints, largest size [N m], None where there are none or no model is known.
         when: by name of the above, the times [s] near which the bounds are reached; one number for power.
         slack: by name, the most by which a bound exceeds the largest sample; one number for power.
     """
@@ -51,6 +52,7 @@ class Demands:
     power: float | None
     when: dict[str, Array]
     slack: dict[str, Array]
+    motors: Array | None = None
 
     def violations(self, names: tuple[str, ...], limits: MotionLimits, supply: Supply | None = None) -> list[str]:
         """What is asked beyond the limits, in words; empty when the arm may move so."""
@@ -74,6 +76,9 @@ class Demands:
         if self.torque is not None:
             rows = zip(names, self.torque, limits.torque, strict=True)
             found += [f"{name}: torque {peak:.3f} exceeds {limit:g}" for name, peak, limit in rows if not peak <= limit]
+        if self.motors is not None and limits.motors is not None:
+            rows = zip(limits.motors.names, self.motors, limits.motors.torque, strict=True)
+            found += [f"{name}: torque {peak:.3f} exceeds {most:g}" for name, peak, most in rows if not peak <= most]
         if self.power is not None and supply is not None and not self.power <= supply.budget:
             found.append(f"supply: {self.power:.1f} W exceeds {supply.budget:g} W")
         return found
@@ -109,6 +114,10 @@ def demands(path: Path, model: ArmModel) -> Demands:
         bounds[kind] = sizes.max(axis=1)
         when[kind] = cells.time[sizes.argmax(axis=1)]
         slack[kind] = bounds[kind] - np.abs([value.c for value in values]).max(axis=1)
+    shared = motor_limits(model.config)
+    motors: Array | None = None
+    if shared is not None and "torque" in enclosed:
+        motors = np.array([effort.size.max() for effort in _drive_rates(enclosed["torque"], shared.to_motors)])
     power: float | None = None
     if model.config.supply is not None and "torque" in enclosed:
         drawn = power_bounds(enclosed["torque"], enclosed["velocity"], model.config.supply, model.chain.coupling)
@@ -124,6 +133,7 @@ def demands(path: Path, model: ArmModel) -> Demands:
         power=power,
         when=when,
         slack=slack,
+        motors=motors,
     )
 
 

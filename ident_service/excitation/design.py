@@ -119,12 +119,20 @@ def _require_torque(model: ArmModel, limits: MotionLimits) -> None:
         raise MotionRefused(
             f"{model.config.name}: torque cannot be predicted without prior (CAD) parameters; give them under prior"
         )
-    _, needed = dry_friction(model, model.prior)
-    if weak := [
+    drives, needed = dry_friction(model, model.prior)
+    weak = [
         f"{name}: friction {f:g} against {limit:g}"
         for name, f, limit in zip(model.chain.names, needed, limits.torque, strict=True)
         if f >= limit
-    ]:
+    ]
+    if limits.motors is not None:
+        taken = np.abs(limits.motors.to_motors @ model.chain.coupling.T) @ drives
+        weak += [
+            f"{name}: friction {f:g} against {limit:g}"
+            for name, f, limit in zip(limits.motors.names, taken, limits.motors.torque, strict=True)
+            if f >= limit
+        ]
+    if weak:
         raise MotionRefused("dry friction alone takes all the torque that the margin leaves: " + "; ".join(weak))
     supply = model.config.supply
     if supply is not None and supply.standby >= supply.budget:

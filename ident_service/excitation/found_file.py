@@ -28,7 +28,8 @@ def fingerprint(task: Task, seed: int) -> str:
     )
     for part in parts:
         digest.update(part.encode() + b"\0")
-    limits = (task.limits.lower, task.limits.upper, task.limits.torque)
+    limits = [task.limits.lower, task.limits.upper, task.limits.torque]
+    limits += [] if task.limits.motors is None else [task.limits.motors.torque]
     for array in (task.model.prior, task.scale, task.noise, task.added, *limits):
         digest.update(b"none" if array is None else np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()

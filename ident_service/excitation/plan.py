@@ -66,8 +66,11 @@ def _seeded(motion: SeededMotion, model: ArmModel, limits: MotionLimits) -> Four
     series = FourierSeries(motion.base_frequency, series.a * factor, series.b * factor, middle)
     most = motion.use if motion.about == "middle" else max(motion.use, _HELD)
     for _ in range(20):
-        torque = demands(FourierPath(series, 1, motion.ramp), model).torque
-        if torque is None or bool(np.all(torque <= most * limits.torque)):
+        asked = demands(FourierPath(series, 1, motion.ramp), model)
+        torque, motors = asked.torque, asked.motors
+        if (torque is None or bool(np.all(torque <= most * limits.torque))) and (
+            motors is None or limits.motors is None or bool(np.all(motors <= most * limits.motors.torque))
+        ):
             return series
         series = series.scaled(0.8)
     raise MotionRefused(

@@ -63,8 +63,9 @@ def _torque_used(model: ArmModel, limits: MotionLimits, postures: Array) -> Arra
     still = np.zeros_like(postures)
     rows = joint_regressor(model.chain, model.layout, postures, still, still)
     _, dry = dry_friction(model, model.prior)
-    torque = np.abs(np.einsum("jps,p->sj", rows, model.prior)) + dry
-    return np.asarray(torque / limits.torque)
+    gravity = np.einsum("jps,p->sj", rows, model.prior)
+    used = (np.abs(gravity) + dry) / limits.torque
+    return np.asarray(used if limits.motors is None else np.maximum(used, limits.motors.used_of_joints(gravity)))
 
 
 def _reason(

@@ -117,7 +117,8 @@ class Problem:
         self._line = np.linspace(0.0, 1.0, _LINE)[:, None]
         self._begin = maps(task.basis, np.zeros(1))[0]
         self.names = list(LINEAR)
-        self.names += ["torque"] * (model.prior is not None) + ["power"] * (self._supply is not None)
+        self.names += ["torque"] * (model.prior is not None) + ["motor torque"] * (self._motors is not None)
+        self.names += ["power"] * (self._supply is not None)
         self.names += ["following error", "forecast speed"] * (self._following is not None)
         self.names += ["clearance"] * bool(self._capsules.pairs)
 
@@ -127,6 +128,7 @@ class Problem:
         self._beta = np.zeros(len(self.task.columns))
         self._torque_limit = self.task.limits.torque.copy()
         self._supply = model.config.supply if model.prior is not None else None
+        self._motors = self.task.limits.motors if model.prior is not None else None
         self._torque_regressor = self._regressor
         if model.prior is None:
             return
@@ -134,6 +136,9 @@ class Problem:
         delta = model.prior.copy()
         self._dry, at_joints = dry_friction(model, delta)
         self._torque_limit = self._torque_limit - at_joints
+        if self._motors is not None:
+            friction = np.abs(self._motors.to_motors @ model.chain.coupling.T) @ self._dry
+            self._motor_limit = self._motors.torque - friction
         delta[model.layout.term_columns("coulomb")] = 0.0
         delta[model.layout.term_columns("stribeck")] = 0.0
         self._beta = base.K @ delta
@@ -232,6 +237,8 @@ class Problem:
         }
         if torque is not None:
             signed["torque"] = torque / self._torque_limit
+            if self._motors is not None:
+                signed["motor torque"] = torque @ self._motors.to_motors.T / self._motor_limit
         if self._following is not None:
             behind = self._following.run(q, dq)
             signed["following error"] = behind / self._allowed
@@ -274,6 +281,8 @@ class Problem:
             seeds[k, felt] = (2.0 / noise**2 * value.gradient[np.ix_(felt, felt)]) @ rows[felt] * self._weights
         if torque is not None:
             on_torque = pushes["torque"] / self._torque_limit
+            if self._motors is not None:
+                on_torque = on_torque + (pushes["motor torque"] / self._motor_limit) @ self._motors.to_motors
             if self._supply is not None:
                 on_torque = on_torque + forces["power"] * power_slopes[0]
                 on_dq = on_dq + forces["power"] * power_slopes[1]

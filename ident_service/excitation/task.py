@@ -62,4 +62,6 @@ def usable_limits(names: tuple[str, ...], limits: MotionLimits, design: Design) 
         if left <= 0.0
     ]:
         raise MotionRefused("the position margin leaves nothing of the range of " + "; ".join(gone))
-    return replace(limits, lower=lower, upper=upper, torque=limits.torque * (1.0 - design.torque_margin))
+    left = 1.0 - design.torque_margin
+    motors = None if limits.motors is None else replace(limits.motors, torque=left * limits.motors.torque)
+    return replace(limits, lower=lower, upper=upper, torque=limits.torque * left, motors=motors)

@@ -189,7 +189,8 @@ def way_width(path: Path, model: ArmModel, margin: float) -> Callable[[Array, Ar
     if used.prior is None:
         raise ModelError(f"{model.config.name}: without prior parameters no arm can be simulated")
     law = InverseDynamics(model.chain, model.layout, used.prior)
-    dry = DOUBT[1] * expected_friction(model, limits, model.config.design.friction_guess).coulomb
+    expected = expected_friction(model, limits, model.config.design.friction_guess).at_joints(model.chain)
+    dry = DOUBT[1] * expected.coulomb
     error, stuck = np.zeros(path.joints), np.zeros(path.joints)
     for begin in np.linspace(0.0, path.duration - part, _PARTS):
         reference = path.at(np.minimum(begin + times, path.duration))[:3]
@@ -238,7 +239,8 @@ def _followed(
             break
         torque = law.torque(q, rate, push[k] + kd * (pace[k] - rate) + kp * away) + feedforward[k]
         np.maximum(fastest, np.abs(rate), out=fastest)
-        queue.append(np.minimum(np.maximum(torque, -limit), limit))
+        torque = np.minimum(np.maximum(torque, -limit), limit)
+        queue.append(torque if limits.motors is None else limits.motors.limited(torque))
         after = plant.next_velocity(q, v, queue.popleft(), period)
         q, v = q + 0.5 * period * (v + after), after
     return positions, fastest

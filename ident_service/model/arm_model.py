@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ident_service.config.quantities import TextFile
 from ident_service.config.recording import units_of_other_joints
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import ModelError
-from ident_service.model.chain import Array, Chain, chain_from_dh
+from ident_service.model.chain import WORLD, Array, Chain, chain_from_dh
 from ident_service.model.layout import Layout
 
 _LONGEST_LINK = 20.0  # m, as in DH tables
@@ -23,7 +24,8 @@ class ArmModel:
         config: what it was made from.
         chain: the mechanism.
         layout: names and order of delta.
-        prior: CAD parameters [SI], shape (layout.size,), or None where nothing is known.
+        prior: CAD parameters, the description's payload included [SI], shape (layout.size,), or None where nothing is
+            known.
     """
 
     config: ArmConfig
@@ -32,12 +34,17 @@ class ArmModel:
     prior: Array | None
 
 
-def arm_model(config: ArmConfig) -> ArmModel:
+def arm_model(config: ArmConfig, *, bodies: bool = True) -> ArmModel:
     """Build the model of an arm.
+
+    Args:
+        config: the description.
+        bodies: whether masses that no link has are refused in a URDF whose bodies are the prior.
 
     Raises:
         ModelError: a mechanism that is not a tree of one-degree-of-freedom joints, or joints of the configuration
-            that the mechanism does not have, or recorded columns in units of other joints.
+            that the mechanism does not have, masses that no link has, recorded columns in units of other joints, or a
+            payload on a link that the arm does not have.
         ParameterError: prior parameters that the arm does not have.
     """
     kinematics = config.kinematics
@@ -50,6 +57,8 @@ def arm_model(config: ArmConfig) -> ArmModel:
 
         if kinematics.urdf is not None:
             chain, inertias = read_urdf(kinematics.urdf, config.gravity, kinematics)
+            if bodies and config.prior is None:
+                _require_bodies(config, kinematics.urdf, inertias)
         elif kinematics.mjcf is not None:
             chain, inertias = read_mjcf(kinematics.mjcf, config.gravity, kinematics)
         else:
@@ -76,13 +85,58 @@ def arm_model(config: ArmConfig) -> ArmModel:
     prior: Array | None = None
     if config.prior is not None:
         prior = layout.vector(config.prior)
-    elif inertias is not None and bool(np.all(inertias[:, 9] > 0.0)):
+    elif inertias is not None and bool(np.all(inertias[:, 9] > 0.0)) and bool(np.isfinite(inertias).all()):
         prior = np.zeros(layout.size)
         for link in range(layout.joints):
             prior[layout.inertial(link)] = inertias[link]
     if prior is not None:
+        prior = with_payload(config, chain.names, layout, prior)
         prior.setflags(write=False)
+    elif config.payload is not None:
+        with_payload(config, chain.names, layout, np.zeros(layout.size))
     return ArmModel(config, chain, layout, prior)
+
+
+def _require_bodies(config: ArmConfig, urdf: TextFile, inertias: Array) -> None:
+    """Refuse masses that are no number, negative or, where a joint then moves nothing, zero.
+
+    Raises:
+        ModelError: with the line in the URDF; a URDF that says nothing of masses is none of this arm's bodies.
+    """
+    from ident_service.model.mechanism import bad_inertias, read_mechanism
+
+    weightless = {k for k, mass in enumerate(inertias[:, 9]) if not mass > 0.0}
+    frames = read_mechanism(urdf, "urdf", config.kinematics).frames
+    for bad in bad_inertias(urdf):
+        moved_by = frames[bad.link][0] if bad.link in frames else WORLD
+        if bad.zero and moved_by not in weightless:
+            continue  # a frame without a body of its own
+        raise ModelError(
+            f"kinematics.urdf: {urdf.name}:{bad.line}: link {bad.link!r} has {bad.what}; give what it has, in kg and"
+            " kg m^2, or prior parameters in the description"
+        )
+
+
+def with_payload(config: ArmConfig, names: tuple[str, ...], layout: Layout, delta: Array) -> Array:
+    """Return parameters of an arm with what its description's payload adds to them.
+
+    Args:
+        config: the description.
+        names: of the joints.
+        layout: of `delta`.
+        delta: parameters of the arm alone [SI], shape (layout.size,).
+
+    Raises:
+        ModelError: the payload is on a link that the arm does not have.
+    """
+    payload = config.payload
+    if payload is None:
+        return delta
+    if payload.link is not None and payload.link not in names:
+        raise ModelError(f"{config.name}: payload.link: {payload.link!r} is none of {', '.join(names)}")
+    loaded = delta.copy()
+    loaded[layout.inertial(len(names) - 1 if payload.link is None else names.index(payload.link))] += payload.parameters
+    return loaded
 
 
 def control_model(model: ArmModel) -> ArmModel:

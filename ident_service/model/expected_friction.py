@@ -24,7 +24,7 @@ _TURNING = 500.0  # N m/s or N/s
 
 @dataclass(frozen=True)
 class ExpectedFriction:
-    """Friction of the drives.
+    """Friction of the drives, in their own coordinates; of joints with a drive each, the joints'.
 
     Attributes:
         coulomb: [N m or N], shape (joints,).
@@ -36,6 +36,11 @@ class ExpectedFriction:
     viscous: Array
     offset: Array
 
+    def at_joints(self, chain: Chain) -> ExpectedFriction:
+        """Return the most of it that each joint feels, of whichever drives move it."""
+        moves = np.abs(chain.coupling)
+        return ExpectedFriction(self.coulomb @ moves, np.diag((moves.T * self.viscous) @ moves), self.offset @ moves)
+
 
 def expected_friction(model: ArmModel, limits: MotionLimits, guess: tuple[float, float]) -> ExpectedFriction:
     """The prior's friction, or, of drives of which it has none, the guess.
@@ -43,9 +48,12 @@ def expected_friction(model: ArmModel, limits: MotionLimits, guess: tuple[float,
     Args:
         model: of the arm.
         limits: its full limits.
-        guess: Coulomb friction, and viscous friction at the velocity limit, in shares of the torque limit.
+        guess: Coulomb friction, and viscous friction at the velocity limit, in shares of the torque limit: the joint's,
+            or, of drives that move several joints, the most that a joint's limit alone asks of the drive.
     """
-    coulomb, viscous = guess[0] * limits.torque, guess[1] * limits.torque / limits.velocity
+    coupling = model.chain.coupling
+    torque = (np.abs(np.linalg.inv(coupling).T) * limits.torque).max(axis=1)
+    coulomb, viscous = guess[0] * torque, guess[1] * torque / (np.abs(coupling) @ limits.velocity)
     if model.prior is None:
         return ExpectedFriction(coulomb, viscous, np.zeros_like(coulomb))
     known = [model.layout.term_values(term, model.prior) for term in ("coulomb", "viscous", "offset")]

@@ -13,8 +13,9 @@ from typing import Literal
 
 import numpy as np
 
+from ident_service.config.payload import knowledge_with_payload
 from ident_service.config.workspace import Capsule
-from ident_service.model.arm_model import ArmModel, control_model
+from ident_service.model.arm_model import ArmModel, control_model, with_payload
 from ident_service.model.chain import Array
 from ident_service.model.layout import INERTIAL
 from ident_service.model.mechanism import read_mechanism
@@ -53,20 +54,22 @@ def likely_bodies(model: ArmModel) -> LikelyBodies:
     else along the lines from its joint to the next ones, with the bounds of its mass and of the arm's kept.
     """
     chain, layout = model.chain, model.layout
+    # A prior has the payload already; guesses are of the arm alone, and it comes on top of them.
+    config = model.config if model.prior is None else knowledge_with_payload(model.config)
     delta, guessed = np.zeros(layout.size), []
     for link, name in enumerate(chain.names):
         place = layout.inertial(link)
         if model.prior is not None and _is_body(model.prior[place]):
             delta[place] = model.prior[place]
             continue
-        rods = model.config.geometry.get(name) or lines_of(model, link)
+        rods = config.geometry.get(name) or lines_of(model, link)
         parameters = sum((_rod(rod) for rod in rods), np.zeros(len(INERTIAL)))
-        joint = model.config.joints.get(name)
+        joint = config.joints.get(name)
         if joint is not None and joint.body.mass is not None:
             parameters = parameters * (np.clip(parameters[-1], *joint.body.mass) / parameters[-1])
         delta[place] = parameters
         guessed.append(place)
-    total = model.config.constraints.total_mass
+    total = config.constraints.total_mass
     masses = sum(float(delta[place][-1]) for place in guessed)
     known = sum(float(delta[layout.inertial(link)][-1]) for link in range(chain.joints)) - masses
     if guessed:
@@ -76,6 +79,8 @@ def likely_bodies(model: ArmModel) -> LikelyBodies:
         for place in guessed:
             delta[place] *= wanted / masses
     names = tuple(chain.names[k] for k in range(chain.joints) if layout.inertial(k) in guessed)
+    if model.prior is None:
+        delta = with_payload(config, chain.names, layout, delta)
     return LikelyBodies(delta, _drives(model, delta), "geometry" if guessed else "prior", names)
 
 

@@ -9,6 +9,7 @@ another. An MJCF is read in a process of its own, with limits of memory and time
 from __future__ import annotations
 
 import json
+import math
 import re
 import tempfile
 from collections.abc import Mapping
@@ -124,6 +125,61 @@ def count_mechanism(file: TextFile, kind: Kind) -> None:
     except expat.ExpatError as error:
         raise ModelError(f"{name}: not a {kind.upper()} that can be read: {error}") from None
     counter.finish()
+
+
+@dataclass(frozen=True)
+class BadInertia:
+    """What a URDF says of a link's mass or inertia, and no link has.
+
+    Attributes:
+        line: where.
+        link: whose.
+        what: it says.
+        zero: whether it is a mass of zero, which a frame without a body may have.
+    """
+
+    line: int
+    link: str
+    what: str
+    zero: bool = False
+
+
+def bad_inertias(file: TextFile) -> list[BadInertia]:
+    """Find links of a URDF, one that its parser accepts, with masses or inertias that no link has."""
+    found: list[BadInertia] = []
+    link, inside = "", False
+    parser = expat.ParserCreate("utf-8")
+
+    def begin(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal link, inside
+        if tag == "link":
+            link = attributes.get("name", "")
+        elif tag == "inertial":
+            inside = True
+        elif inside and tag in ("mass", "inertia", "origin"):
+            for key, text in attributes.items():
+                values = [_as_number(word) for word in text.split()]
+                line = parser.CurrentLineNumber
+                if not all(map(math.isfinite, values)):
+                    where = tag if tag == "mass" else f"{tag} ({key})"
+                    found.append(BadInertia(line, link, f"{where} of {text!r}"))
+                elif tag == "mass" and values and values[0] <= 0.0:
+                    found.append(BadInertia(line, link, f"mass of {text} kg", zero=values[0] == 0.0))
+
+    def end(tag: str) -> None:
+        nonlocal inside
+        inside = inside and tag != "inertial"
+
+    parser.StartElementHandler, parser.EndElementHandler = begin, end
+    parser.Parse(file.text.encode("utf-8", "surrogatepass"), True)
+    return found
+
+
+def _as_number(word: str) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        return math.nan
 
 
 class _Counter:

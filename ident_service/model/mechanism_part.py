@@ -2,8 +2,8 @@
 
 A joint that is held still is a fixed joint at its value, and its link's inertia merges into the link before it
 (pinocchio's `buildReducedModel`). Joints outside base and tip are held at zero, or at the limit nearest to zero, unless
-`lock` names a value; a joint that mimics one that is held still follows it. What moves with a joint of the arm but is
-not held cannot be represented, and is refused.
+`lock` names a value; a joint that mimics one that is held still follows it. What moves with a joint of the arm cannot
+be represented, and is refused; so is a lock of such a joint elsewhere than where the one that it mimics puts it.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def arm_part(
 
     Raises:
         ModelError: a link or joint that does not exist, a value outside a joint's limits, a tip that does not hang on
-            the base, or a joint that follows one of the arm.
+            the base, a joint that follows one of the arm, or locks that contradict each other.
     """
     inside = _between(model, part, file)
     held = {name: _checked(model, name, value, file) for name, value in part.lock.items()}
@@ -94,9 +94,12 @@ def arm_part(
             held[name] = follower.multiplier * held[follower.joint] + follower.offset
     for name, follower in waiting.items():
         raise ModelError(
-            f"{file}: joint {name!r} mimics {follower.joint!r}, which moves with the arm; lock it at a value, as"
-            f" kinematics.lock: {{{name}: 0}}, or name base and tip so that {follower.joint!r} is not between them"
+            f"{file}: joint {name!r} mimics {follower.joint!r}, which moves with the arm; lock {follower.joint!r} at a"
+            f" value, as kinematics.lock: {{{follower.joint}: 0}}, or name base and tip so that it is not between them"
         )
+    for name, follower in followers.items():
+        if name in part.lock and model.existJointName(name):
+            _require_agreement(name, follower, held, file)
     positions = pin.neutral(model)
     for name, value in held.items():
         joint = model.joints[model.getJointId(name)]
@@ -109,6 +112,26 @@ def arm_part(
     if part.base is not None:
         _rebase(model, part.base)
     return model, held
+
+
+def _require_agreement(name: str, follower: Mimic, held: Mapping[str, float], file: str) -> None:
+    """Refuse a lock of a joint that is elsewhere than the joint that it mimics puts it."""
+    leader, value = follower.joint, held[name]
+    scale, offset = follower.multiplier, follower.offset
+    there = f"; lock {leader!r} alone" + (
+        f", as kinematics.lock: {{{leader}: {(value - offset) / scale:g}}}" if scale else ""
+    )
+    if leader not in held:
+        raise ModelError(
+            f"{file}: kinematics.lock: {name!r} mimics {leader!r}, which is not locked and would move with it{there},"
+            f" or name base and tip so that {leader!r} is not between them"
+        )
+    puts = scale * held[leader] + offset
+    if abs(puts - value) > _OUTSIDE:
+        raise ModelError(
+            f"{file}: kinematics.lock: {name} at {value:g} contradicts {leader} at {held[leader]:g}, which puts it at"
+            f" {puts:g}{there}"
+        )
 
 
 def _between(model: pin.Model, part: Part, file: str) -> set[str]:

@@ -99,6 +99,8 @@ class Guard:
         self._jump = JUMP * limits.velocity * period
         self._push = FROZEN_EFFORT * limits.torque
         self._not_applied = NOT_APPLIED * limits.torque
+        together = np.eye(joints, dtype=bool) if limits.motors is None else limits.motors.together
+        self._joined = together @ together.T  # which joints share motors
         self._braking = 2.0 * ENVELOPE * limits.acceleration
         zero, slack = np.zeros(joints), (ENVELOPE_SLACK * limits.velocity) ** 2
         away = limits.following_error
@@ -172,9 +174,13 @@ class Guard:
         Returns:
             The torque that may leave: within limits, or zero when the fault takes torque away.
         """
-        limit, before = self._limits.torque, self._sent
+        limit, before, motors = self._limits.torque, self._sent, self._limits.motors
         size = np.abs(wanted)
-        if (size <= limit).all() and (before is None or (np.abs(wanted - before) <= self.rate).all()):
+        if (
+            (size <= limit).all()
+            and (motors is None or (motors.used(wanted) <= 1.0).all())
+            and (before is None or (np.abs(wanted - before) <= self.rate).all())
+        ):
             self._sent = wanted
             return wanted, None
         finite = np.isfinite(wanted)
@@ -190,14 +196,29 @@ class Guard:
         if over.any():
             what = "a torque of {} {f} was asked for, the limit is {}"
             fault = self._found(Check("torque_saturated", over, what, (wanted, limit)))
+        if motors is not None and (over := motors.used(leaves) > 1.0).any():
+            what = "a torque of {} N m was asked for, the limit is {}"
+            asked = leaves @ motors.to_motors.T
+            fault = self._found(Check("torque_saturated", over, what, (asked, motors.torque), motors.names))
+            leaves = motors.limited(leaves)
         if before is not None and (fast := np.abs(leaves - before) > self.rate).any():
             change = (leaves - before) / self._period
             what = "the torque was to change by {} {f}/s, {} allowed"
             found = self._found(Check("torque_rate", fast, what, (change, self.rate / self._period)))
-            leaves = np.clip(leaves, before - self.rate, before + self.rate)
+            leaves = self._slowed(before, leaves)
             fault = found if fault is None or found.reaction > fault.reaction else fault
         self._sent = leaves
         return leaves, fault
+
+    def _slowed(self, before: Vector, wanted: Vector) -> Vector:
+        """Return the torque on the way from the last one to the one wanted that the rate allows."""
+        if self._limits.motors is None:
+            return np.clip(wanted, before - self.rate, before + self.rate)
+        # Joints that share motors change by the same share: between two torques that their motors can give lies one
+        # that they can give, but not where each joint goes its own share of the way.
+        change = np.abs(wanted - before)
+        share = np.minimum(1.0, self.rate / np.maximum(change, self.rate))
+        return np.asarray(before + np.where(self._joined, share, 1.0).min(axis=1) * (wanted - before))
 
     def about(self, joint: int, what: str, velocity: float) -> str:
         """The beginning of a sentence about one joint; `{}` in it stands for its velocity [rad/s or m/s]."""

@@ -132,6 +132,6 @@ def owed_ways(
 ) -> Owed:
     """The observer of an arm: dry friction is the prior's, but never less than the configuration's guess."""
     guess = model.config.design.friction_guess
-    expected = expected_friction(model, limits, guess).coulomb
+    expected = expected_friction(model, limits, guess).at_joints(model.chain).coulomb
     least = None if model.prior is None else InverseDynamics(model.chain, model.layout, model.prior)
     return Owed(dynamics, limits, period, np.maximum(expected, guess[0] * limits.torque), resolution, least)

@@ -153,6 +153,7 @@ def parameters_document(estimate: Estimate, described: ArmConfig | None = None) 
             "name": model.config.name,
             "joints": list(model.chain.names),
             "sha256": model.config.sha256,
+            **({} if model.config.payload is None else {"payload": model.config.payload.model_dump(mode="json")}),
             **_changes(model.config, described),
         },
         "method": estimate.method,

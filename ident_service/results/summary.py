@@ -86,6 +86,8 @@ def _found_before(estimate: Estimate) -> list[str]:
     """What the recordings said before the parameters: delay, shape of the friction, torque constants, prior."""
     model, prepared = estimate.model, estimate.prepared
     lines = []
+    if (payload := model.config.payload) is not None:
+        lines.append(f"payload, by the description: {payload.words}; these are parameters of the arm with it")
     if prepared.delay is not None:
         seconds, deviation = 1e3 * prepared.delay.seconds, 1e3 * prepared.delay.deviation
         lines.append(f"torque is stamped {seconds:.3f} +- {deviation:.3f} ms later than the position")

@@ -83,7 +83,12 @@ def _place(message: str) -> tuple[str, ...]:
     """The keys that a model's complaint is about."""
     if named := _NAMED.search(message):
         return ("kinematics", named.group(1))
-    about = {"joints are configured as": "joints", "columns": "recording", "parameters this arm does not have": "prior"}
+    about = {
+        "payload.link": "payload",
+        "joints are configured as": "joints",
+        "columns": "recording",
+        "parameters this arm does not have": "prior",
+    }
     return (next((key for words, key in about.items() if words in message), "kinematics"),)
 
 
@@ -108,6 +113,7 @@ def description_document(checked: CheckedDescription) -> dict[str, Any]:
         "sha256": config.sha256,
         "problems": [],
         "warnings": list(checked.warnings),
+        "payload": None if config.payload is None else config.payload.model_dump(mode="json"),
         "stability": None if report is None or gains is None else asdict(report) | gains,
         "after_stop": checked.after_stop.value if isinstance(checked.after_stop, AfterStop) else None,
         "objection": checked.after_stop if isinstance(checked.after_stop, str) else None,
@@ -118,6 +124,9 @@ def description_text(arm: str, checked: CheckedDescription) -> str:
     """For a person; `arm` as they named it."""
     model = checked.model
     head = f"{arm}: {model.config.name}, {model.chain.joints} joints, {model.layout.size} parameters: good\n"
+    if (payload := model.config.payload) is not None:
+        unknown = "; no prior, so that no model has it" if model.prior is None else ""
+        head += f"payload: {payload.words}{unknown}\n"
     head += "".join(f"WARNING: {line}\n" for line in checked.warnings)
     head += "" if checked.budget is None else bus_lines(checked.budget)
     if checked.gains is None:

@@ -10,6 +10,8 @@ import yaml
 RATE = 500.0  # Hz, at which most arms' gains are stable and a simulation is quick
 CLEARANCE = 0.02  # m
 FRICTION_GUESS = 0.04  # of the torque limits, what the description expects
+ENCODER = 2e-5  # rad or m, of the simulated arm
+_SECONDS = 20.0  # of a motion
 LARGEST_USE = 0.6  # share of the limits of the first motion that is tried
 
 
@@ -27,6 +29,9 @@ class Draft:
         prior: names and values where the URDF's bodies are not those of real links; empty where they are.
         use: share of the limits that the motions take.
         seeds: of the two motions.
+        frequency: of the two motions [Hz].
+        cutoff: of the velocity's low-pass [Hz].
+        standstill: speed below which a joint counts as standing [rad/s or m/s]; 0 for what is usual.
         total_mass: largest of the arm [kg].
         truth: of the simulated arm.
         remarks: what was guessed, for people.
@@ -41,6 +46,9 @@ class Draft:
     prior: dict[str, float] = field(default_factory=dict)
     use: float = LARGEST_USE
     seeds: tuple[int, int] = (1, 2)
+    frequency: float = 0.1
+    cutoff: float = 30.0
+    standstill: float = 0.0
     total_mass: float = 0.0
     truth: dict[str, float] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
@@ -81,7 +89,8 @@ terms: [drive_inertia, viscous, coulomb, offset]
         )
     if draft.total_mass:
         parts.append(f"constraints: {{total_mass: {{upper: {draft.total_mass:g}}}}} # kg, twice what its links have\n")
-    parts.append(f"control: {{rate: {RATE:g}}} # Hz\n")
+    cutoff = "" if draft.cutoff == 30.0 else f", velocity_cutoff: {draft.cutoff:g}"
+    parts.append(f"control: {{rate: {RATE:g}{cutoff}}} # Hz\n")
     if draft.geometry:
         rows = "".join(f"  {_flow(name)}: {_flow(each)}\n" for name, each in draft.geometry.items())
         parts.append(f"geometry: # m, in the link frames; around the URDF's meshes\n{rows}")
@@ -96,13 +105,19 @@ terms: [drive_inertia, viscous, coulomb, offset]
     parts.append(
         f"design: {{friction_guess: [{FRICTION_GUESS:g}, {FRICTION_GUESS:g}]}} # shares of the torque limits\n"
     )
-    motion = {"kind": "seeded", "about": "home", "base_frequency": 0.1, "harmonics": 5, "periods": 2, "use": draft.use}
+    if draft.standstill:
+        parts.append(f"identification: {{reversal: {{speed: {draft.standstill:g}}}}} # rad/s or m/s\n")
+    periods = round(_SECONDS * draft.frequency)
+    motion = {
+        "kind": "seeded", "about": "home", "base_frequency": draft.frequency, "harmonics": 5, "periods": periods,
+        "use": draft.use,
+    }  # fmt: skip
     first, second = ({**motion, "seed": seed} for seed in draft.seeds)
     parts.append(f"motions:\n  identification: {_flow(first)}\n  validation: {_flow(second)}\n")
     torque = [keys["torque"] for keys in draft.joints.values()]
     noise, step = ([short(share * value, 2) for value in torque] for share in (2e-3, 2e-4))
     driver: dict[str, Any] = {
-        "kind": "simulated", "time": "virtual", "seed": 1, "truth": draft.truth, "encoder_resolution": 2e-5,
+        "kind": "simulated", "time": "virtual", "seed": 1, "truth": draft.truth, "encoder_resolution": ENCODER,
         "torque_resolution": step, "torque_noise": noise, "delay_cycles": 1,
     }  # fmt: skip
     rows = "".join(f"  {key}: {_flow(value)}\n" for key, value in driver.items() if value or key == "seed")

@@ -22,7 +22,7 @@ from ident_service.config.quantities import TextFile
 from ident_service.config.workspace import BASE
 from ident_service.errors import ModelError, MotionRefused, UsageError
 from ident_service.excitation.plan import excitation
-from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.model.arm_model import ArmModel, arm_model, control_model
 from ident_service.model.base import base_parameters, remarks_on_angles
 from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel, share_touching
@@ -35,7 +35,7 @@ from ident_service.motion.preflight.check import Verdict
 from ident_service.motion.preflight.plan import stability_check
 from ident_service.record.files import write_atomically
 from ident_service.service.commission import require_clear_from_home
-from ident_service.service.draft import CLEARANCE, LARGEST_USE, RATE, Draft, in_yaml, short
+from ident_service.service.draft import CLEARANCE, ENCODER, LARGEST_USE, RATE, Draft, in_yaml, short
 from ident_service.service.urdf_says import Said, arm_part, said_of
 
 _MOST_TURNS = 8.0 * np.pi  # rad, from which a range is degrees
@@ -50,8 +50,13 @@ _FRICTION = 0.03  # of the torque limit, Coulomb, and viscous at the velocity li
 _DRIVE = 0.02  # s in which a geared drive alone would reach its velocity limit with its torque limit
 _RATE_SHARE = 0.15  # of the torque rate that the guard lets through, that a motion's jerk may ask for
 _POSTURES, _SEED = 300, 20140101
+_COUNT_SHARE = 0.4  # of the torque rate that the guard lets through, that one count of the encoder may make
+_CUTOFFS = (30.0, 20.0, 15.0, 10.0)  # Hz, of the velocity's low-pass: slow where a count makes much torque
+_FREQUENCIES = (0.1, 0.2, 0.4)  # Hz, of the motions: faster where joints with little room would be too slow
+_MOVES = 0.3  # share of a motion in which a joint should be faster than what counts as standstill
 _USES = (LARGEST_USE, 0.4, 0.25, 0.15, 0.08)  # shares of the limits that motions are tried with
 _SEEDS = range(1, 9)
+_PACES = 2000  # samples of a motion in which speeds are counted
 _GLANCES, _GLANCE = 200, 1.3  # postures of a motion that are looked at first, and clearances they must have
 # Share of postures from which links that touch are no collision, by the joints between them: capsules of links around a
 # shoulder or a wrist reach into each other.
@@ -105,7 +110,7 @@ def new_description(
 
         def loaded() -> ArmModel:
             trial.write_text(in_yaml(draft), encoding="utf-8")
-            return arm_model(load_arm(trial))
+            return arm_model(load_arm(trial), bodies=False)  # what is none is guessed
 
         draft.remarks += _which(loaded(), draft)
         tell("joints and bodies")
@@ -248,14 +253,18 @@ def _bodies(draft: Draft, loaded: Callable[[], ArmModel], folder: Path) -> None:
 
 
 def _home(draft: Draft, loaded: Callable[[], ArmModel]) -> ArmModel:
-    """Choose where motions begin: zero, the middle, or what is most free of random postures; and keep it."""
+    """Choose where motions begin: zero, the middle, or what is most free of random postures; and keep it.
+
+    A joint that has no room about zero begins in its middle: motions are about home.
+    """
     model = loaded()
     limits = motion_limits(model.config)
     low, high = limits.lower, limits.upper
     margin = 0.15 * (high - low)
     middle = 0.5 * (low + high)
     drawn = np.random.default_rng(_SEED).uniform(low + margin, high - margin, size=(_POSTURES, len(low)))
-    postures = np.vstack([np.clip(0.0, low + margin, high - margin), middle, 0.5 * (drawn + middle), drawn])
+    zero = np.where((low + margin <= 0.0) & (high - margin >= 0.0), 0.0, middle)
+    postures = np.vstack([zero, middle, 0.5 * (drawn + middle), drawn])
     collision = CollisionModel(model)
     distances = collision.distances(postures)
     free = distances.min(axis=1) if distances.shape[1] else np.full(len(postures), np.inf)
@@ -298,17 +307,69 @@ def _drives(draft: Draft, model: ArmModel) -> None:
 
 
 def _gains(draft: Draft, loaded: Callable[[], ArmModel]) -> None:
+    """Choose the stiffest gains that are stable, and by which a count of the encoder makes no jump of the torque."""
+    model = loaded()
+    limits = motion_limits(model.config)
+    _, inertia = _worst(control_model(model), list(zip(limits.lower.tolist(), limits.upper.tolist(), strict=True)))
+    rate = np.minimum(TORQUE_RATE, TORQUE_RATE_SHARE * limits.torque)
+    quietest = np.inf
     for kp, kd in _GAINS:
         for joint in draft.joints.values():
             joint.update(kp=kp, kd=kd)
-        model = loaded()
-        if stability_check(model, motion_limits(model.config), None).verdict is Verdict.PASSED:
-            return
+        for cutoff in _CUTOFFS:
+            # Torque of one count, by K_p and by K_d through the low-pass, as a share of what a cycle may change.
+            passed = (1.0 - np.exp(-2.0 * np.pi * cutoff / RATE)) * RATE
+            share = float((inertia * (kp + kd * passed) * ENCODER * RATE / rate).max())
+            quietest = min(quietest, share)
+            if share > _COUNT_SHARE:
+                continue
+            draft.cutoff = cutoff
+            model = loaded()
+            if stability_check(model, motion_limits(model.config), None).verdict is Verdict.PASSED:
+                return
+    if quietest > _COUNT_SHARE:
+        draft.remarks.append(
+            f"gains: one count of the encoder changes a torque by {quietest:.0%} of what the guard lets through, even"
+            f" at kp {kp:g}; the simulated arm's encoder may have to be finer (driver.encoder_resolution)"
+        )
+        return
     draft.remarks.append(f"gains: not stable at {RATE:g} Hz even at kp {kp:g}; see `ident config check`")
 
 
 def _motions(draft: Draft, loaded: Callable[[], ArmModel]) -> None:
-    """Choose the largest motions about home that keep limits and clearance."""
+    """Choose the largest motions about home that keep limits and clearance, and in which every joint really moves."""
+    found: list[tuple[float, float, float, tuple[int, int]]] = []
+    for draft.frequency in _FREQUENCIES:
+        try:
+            _clear_motions(draft, loaded)
+        except MotionRefused:
+            if found:
+                break
+            raise
+        paces = _paces(loaded())
+        standstill = loaded().config.identification.reversal.speed
+        moves = float((paces > standstill).mean(axis=1).min())
+        found.append((moves, draft.frequency, draft.use, draft.seeds))
+        if moves >= _MOVES:
+            return
+    moves, draft.frequency, draft.use, draft.seeds = max(found)
+    # Half of the time each joint is faster than the median of its speeds.
+    draft.standstill = short(0.5 * float(np.median(_paces(loaded()), axis=1).min()), 2)
+    draft.remarks.append(
+        f"identification.reversal.speed: {draft.standstill:g} rad/s or m/s; a joint with little room is never fast"
+    )
+
+
+def _paces(model: ArmModel) -> Array:
+    """Return speeds of every joint in each of both motions, shape (2 joints, samples)."""
+    found = []
+    for which in ("identification", "validation"):
+        path = excitation(model, which, checked=False).path
+        found.append(np.abs(path.at(np.linspace(0.0, path.duration, _PACES))[1]).T)
+    return np.vstack(found)
+
+
+def _clear_motions(draft: Draft, loaded: Callable[[], ArmModel]) -> None:
     refused: MotionRefused | None = None
     collision = CollisionModel(loaded())
     for use in _USES:

@@ -25,6 +25,7 @@ def preview_text(seen: Preview) -> str:
     lines = [
         f"{seen.excitation.name} motion for {seen.model.config.name}: {path.duration:g} s ({kind})",
         f"way there {seen.approach[0]:.1f} s and back {seen.approach[1]:.1f} s, from and to home",
+        *([] if (load := seen.model.config.payload) is None else [f"payload: {load.words}"]),
         "",
         "peaks at every instant, not only at samples; in brackets the share of the limit",
         f"  {'joint':<{width}} {'position':>17} {'(range)':>8} {'velocity':>14} {'acceleration':>14} {'jerk':>14} "

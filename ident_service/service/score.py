@@ -12,7 +12,7 @@ from ident_service.config.simulation import SimulatedDriver
 from ident_service.estimation.equations import Equations
 from ident_service.estimation.identify import Estimate
 from ident_service.estimation.least_squares import torque_error
-from ident_service.model.arm_model import ArmModel
+from ident_service.model.arm_model import ArmModel, with_payload
 from ident_service.model.chain import Array
 from ident_service.model.regressor import joint_regressor
 from sim_backend.arm import Truth
@@ -45,7 +45,9 @@ def true_parameters(config: ArmConfig, model: ArmModel) -> Array | None:
     """Link parameters of the simulated plant, shape (layout.size,), or None where there is no such plant."""
     if not isinstance(config.driver, SimulatedDriver):
         return None
-    return model.prior if config.driver.truth is None else model.layout.vector(config.driver.truth)
+    if config.driver.truth is None:
+        return model.prior
+    return with_payload(config, model.chain.names, model.layout, model.layout.vector(config.driver.truth))
 
 
 def score(estimate: Estimate, truth: Array, plant_motion: Sequence[Truth], unseen: Equations) -> Score:

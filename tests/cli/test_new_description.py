@@ -13,15 +13,21 @@ from hypothesis import strategies as st
 from model.test_locked_joints import PANDA, joint, link
 
 from ident_service.cli import main
+from ident_service.config.limits import motion_limits
 from ident_service.config.load import load_arm
 from ident_service.config.schema import ArmConfig
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.errors import ModelError
-from ident_service.model.arm_model import arm_model
+from ident_service.excitation.plan import excitation
+from ident_service.model.arm_model import arm_model, control_model
 from ident_service.model.likely_bodies import drawn_about
 from ident_service.model.outline import capsule_around
-from ident_service.model.rigid_body import inertia_from_delta
+from ident_service.model.rigid_body import InverseDynamics, inertia_from_delta
+from ident_service.motion.control import ComputedTorque
+from ident_service.motion.reference import rest
 from ident_service.service.urdf_says import arm_part
+
+CONFIGS = Path(__file__).parents[2] / "configs"
 
 
 def box_stl(x: float, y: float, z: float) -> bytes:
@@ -79,6 +85,49 @@ def test_a_stock_urdf_simulates_without_an_edit(
     assert (shares > 0.8).all()
     assert (shares < 1.25).all()
     assert np.abs(shares - 1.0).max() > 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("arm", ["threelink", "ur10", "tx40", "kuka_lwr4"])
+def test_shipped_urdfs_simulate_without_an_edit(arm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A slide of 0.3 m that a slow motion leaves at a standstill, joints so heavy that an encoder's count is a jump."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["new", str(CONFIGS / f"{arm}.urdf"), "--out", "arm.yaml"]) == 0
+    assert main(["config", "check", "arm.yaml"]) == 0
+    assert main(["simulate", "arm.yaml", "--out", "run", "--state", "state"]) == 0
+    scored = json.loads((tmp_path / "run" / "score.json").read_text())
+    assert scored["noise_free_torque_error_percent"] < 1.0
+
+
+@pytest.mark.slow
+def test_motions_are_faster_where_a_joint_would_stand_still(tmp_path: Path) -> None:
+    assert main(["new", str(CONFIGS / "threelink.urdf"), "--out", str(tmp_path / "arm.yaml")]) == 0
+    config = load_arm(tmp_path / "arm.yaml")
+    model = arm_model(config)
+    for which in ("identification", "validation"):
+        path = excitation(model, which).path
+        pace = np.abs(path.at(np.linspace(0.0, path.duration, 2000))[1])
+        assert ((pace > config.identification.reversal.speed).mean(axis=0) >= 0.3).all()
+    assert config.joints["slide"].home == pytest.approx(0.15)  # its middle: zero is the end of its range
+
+
+@pytest.mark.slow
+def test_one_count_of_the_encoder_is_no_jump_of_the_torque(tmp_path: Path) -> None:
+    assert main(["new", str(CONFIGS / "ur10.urdf"), "--out", str(tmp_path / "arm.yaml")]) == 0
+    config = load_arm(tmp_path / "arm.yaml")
+    model, limits, period = control_model(arm_model(config)), motion_limits(config), 1.0 / config.control.rate
+    assert model.prior is not None
+    assert isinstance(config.driver, SimulatedDriver)
+    dynamics = InverseDynamics(model.chain, model.layout, model.prior)
+    count = np.broadcast_to(np.asarray(config.driver.encoder_resolution), (6,))
+    for k in range(6):
+        control = ComputedTorque(dynamics, limits, period, config.control.velocity_cutoff, limits.home)
+        step = np.where(np.arange(6) == k, count, 0.0)
+        every = np.ones(6, dtype=bool)
+        before = control.torque(limits.home, every, rest(limits.home))
+        after = control.torque(limits.home + step, every, rest(limits.home))
+        assert np.abs(after - before)[k] < 0.5 * min(1000.0, 100.0 * limits.torque[k]) * period
 
 
 @pytest.mark.slow

@@ -44,6 +44,8 @@ def read(folder: Path, text: str, layout: RecordingFormat) -> tuple[list[int], l
         ("dq1", {"unit": "deg / s", "factor": -1}, -math.pi / 180.0),
         ("tau1", {"unit": "mA", "factor": -11.2}, -0.0112),
         ("tau1", {"unit": "A", "factor": 11.2}, 11.2),
+        ("tau1", {"unit": "A", "factor": 1.0}, 1.0),
+        ("tau1", {"unit": "%", "factor": 1}, 0.01),
         ("tau1", {"unit": "%", "factor": 176}, 1.76),
         ("tau1", {"unit": "mN m", "factor": 100}, 0.1),
         ("tau1", {"unit": "N\u00b7m"}, 1.0),
@@ -141,3 +143,10 @@ def test_metres_of_a_joint_that_turns_are_refused() -> None:
         arm_model(config.model_copy(update={"recording": layout}))
     motors = layout.model_copy(update={"side": "motor"})
     assert np.all(arm_model(config.model_copy(update={"recording": motors})).chain.revolute)
+
+
+def test_a_factor_of_one_that_is_given_is_given_still_after_it_was_kept() -> None:
+    """A results folder keeps the description, and identifies from it again."""
+    column = Column(column="theirs", unit="A", factor=1.0)
+    again = Column.model_validate_json(column.model_dump_json())
+    assert again.scale("tau1") == 1.0

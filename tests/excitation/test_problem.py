@@ -11,11 +11,14 @@ from design_bench import FOURIER, POSTURES, quick, random_task, small
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from ident_service.config.design import Design
+from ident_service.config.limits import MotorLimits
 from ident_service.config.workspace import Workspace
 from ident_service.excitation.basis import Basis
 from ident_service.excitation.climb import keeps
 from ident_service.excitation.design import family, settled
 from ident_service.excitation.problem import Problem
+from ident_service.excitation.task import usable_limits
 from ident_service.model.base import static_base_parameters
 from ident_service.model.regressor import joint_regressor
 
@@ -57,6 +60,30 @@ def test_the_gradient_is_what_central_differences_say_with_all_limits_broken(
         assume(state.limits[name].max() > 0.0)
     slope, difference, size = slope_and_difference(problem, x, rng)
     assert slope == pytest.approx(difference, rel=1e-4, abs=1e-5 * size)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 4])
+def test_the_gradient_of_motors_that_share_joints(seed: int) -> None:
+    task, rng = random_task(seed, 3, "d_optimal", FOURIER), np.random.default_rng(seed)
+    to_motors = np.linalg.inv(np.eye(3) + 0.3 * rng.normal(size=(3, 3)))
+    motors = MotorLimits(to_motors, np.array([8.0, 9.0, np.inf]), np.ones((3, 3), dtype=bool))
+    problem = Problem(replace(task, limits=replace(task.limits, motors=motors)), 30)
+    x = rng.normal(size=problem.size)
+    state, without = problem.state(x, 4.0), Problem(task, 30).state(x, 4.0)
+    assert set(state.limits) == {*without.limits, "motor torque"}
+    assert state.limits["motor torque"].max() > 0.0
+    assert (state.limits["motor torque"][:, 2] < 0.0).all()  # of whose limit nothing is known
+    slope, difference, size = slope_and_difference(problem, x, rng)
+    assert slope == pytest.approx(difference, rel=1e-4, abs=1e-5 * size)
+
+
+def test_a_margin_of_torque_is_one_of_the_motors_too() -> None:
+    task = random_task(1, 3, "d_optimal", FOURIER)
+    motors = MotorLimits(np.eye(3), np.array([8.0, 9.0, 10.0]), np.ones((3, 3), dtype=bool))
+    design = Design(torque_margin=0.25, position_margin=0.0)
+    usable = usable_limits(("a", "b", "c"), replace(task.limits, motors=motors), design)
+    assert usable.motors is not None
+    np.testing.assert_allclose(usable.motors.torque, [6.0, 6.75, 7.5])
 
 
 @pytest.mark.parametrize("name", ALL_LIMITS)

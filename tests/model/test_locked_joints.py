@@ -182,7 +182,7 @@ def whole_torques(
         (PANDA, {"tip": "panda_hand"}, SEVEN),
         (PANDA, {"base": "panda_link0", "tip": "panda_link8"}, SEVEN),
         (PANDA, {"lock": {"panda_finger_joint1": 0.03}}, SEVEN),
-        (PANDA, {"lock": {"panda_finger_joint1": 0.03, "panda_finger_joint2": 0.01}}, SEVEN),
+        (PANDA, {"lock": {"panda_finger_joint1": 0.03, "panda_finger_joint2": 0.03}}, SEVEN),
         (PANDA, {"lock": {"panda_finger_joint1": 0.03, "panda_joint3": "40 deg"}}, (*SEVEN[:2], *SEVEN[3:])),
         (PANDA, {"base": "panda_link2", "tip": "panda_link6", "lock": {"panda_joint1": 1.0}}, SEVEN[2:6]),
         (TIAGO, {"tip": "arm_tool_link"}, ("torso_lift_joint", *THREE)),
@@ -225,7 +225,11 @@ def test_a_joint_outside_that_cannot_be_at_zero_is_at_its_nearest_limit() -> Non
 @pytest.mark.parametrize(
     ("text", "kinematics", "words"),
     [
-        (PANDA, {}, "joint 'panda_finger_joint2' mimics 'panda_finger_joint1', which moves with the arm; lock it"),
+        (
+            PANDA,
+            {},
+            "'panda_finger_joint2' mimics 'panda_finger_joint1', which moves with the arm; lock 'panda_finger_joint1'",
+        ),
         (PANDA, {"base": "panda_link8"}, "'panda_finger_joint2' mimics"),
         (PANDA, {"tip": "hand"}, "kinematics.tip: no link 'hand'; it has panda_link0"),
         (PANDA, {"base": "panda_joint1"}, "kinematics.base: no link 'panda_joint1'"),
@@ -247,15 +251,57 @@ def test_what_is_no_arm_is_refused(text: str, kinematics: dict[str, Any], words:
         arm(text, **kinematics)
 
 
-def test_a_follower_of_the_arm_is_refused_unless_locked_by_name() -> None:
+def test_a_follower_of_the_arm_is_refused_locked_or_not() -> None:
     parallel = TIAGO.replace(
         '<mimic joint="gripper_left_joint" multiplier="-1" offset="0.2"/>', '<mimic joint="arm_2_joint"/>'
     )
     with pytest.raises(ModelError, match="joint 'gripper_right_joint' mimics 'arm_2_joint', which moves with the arm"):
         arm(parallel, tip="arm_tool_link")
-    assert (
-        arm(parallel, base="torso_lift_link", tip="arm_3_link", lock={"gripper_right_joint": 0.0}).chain.names == THREE
-    )
+    with pytest.raises(
+        ModelError, match="'gripper_right_joint' mimics 'arm_2_joint', which is not locked and would move"
+    ):
+        arm(parallel, base="torso_lift_link", tip="arm_3_link", lock={"gripper_right_joint": 0.0})
+    assert "arm_2_joint" not in arm(parallel, tip="arm_tool_link", lock={"arm_2_joint": 0.1}).chain.names
+
+
+@pytest.mark.parametrize(
+    ("text", "kinematics", "words"),
+    [
+        # The leader alone would be a joint of the arm, and its follower stand still.
+        (
+            PANDA,
+            {"lock": {"panda_finger_joint2": 0.02}},
+            r"'panda_finger_joint2' mimics 'panda_finger_joint1', which is not locked.*{panda_finger_joint1: 0.02}",
+        ),
+        # The leader is held at zero, outside of base and tip.
+        (
+            PANDA,
+            {"lock": {"panda_finger_joint2": 0.02}, "tip": "panda_hand"},
+            "panda_finger_joint2 at 0.02 contradicts panda_finger_joint1 at 0, which puts it at 0",
+        ),
+        (
+            PANDA,
+            {"lock": {"panda_finger_joint1": 0.01, "panda_finger_joint2": 0.03}},
+            r"panda_finger_joint2 at 0.03 contradicts panda_finger_joint1 at 0.01, which puts it at 0.01",
+        ),
+        (
+            TIAGO,
+            {"tip": "arm_3_link", "lock": {"gripper_left_joint": 0.7, "gripper_right_joint": 0.5}},
+            r"gripper_right_joint at 0.5 contradicts gripper_left_joint at 0.7, which puts it at -0.5.*"
+            r"lock: {gripper_left_joint: -0.3}",
+        ),
+    ],
+)
+def test_locks_that_contradict_a_mimic_are_refused(text: str, kinematics: dict[str, Any], words: str) -> None:
+    with pytest.raises(ModelError, match=words):
+        arm(text, **kinematics)
+
+
+def test_locks_that_agree_with_a_mimic_are_taken() -> None:
+    file = TextFile(name="arm.urdf", text=TIAGO)
+    locks = {"gripper_left_joint": 0.7, "gripper_right_joint": -0.5}
+    held = read_mechanism(file, "urdf", Kinematics(urdf=file, tip="arm_3_link", lock=locks)).held
+    assert (held["gripper_left_joint"], held["gripper_right_joint"]) == (0.7, -0.5)
 
 
 def test_xml_that_only_pinocchio_accepts_is_told() -> None:

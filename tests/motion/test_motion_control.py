@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -10,8 +12,8 @@ from hypothesis import strategies as st
 from motion_bench import PRIOR, bench_config, bench_limits, bench_model
 
 from drivers.arm import StopKind
-from ident_service.model.arm_model import control_model
-from ident_service.model.expected_friction import ExpectedFriction, FrictionFeedforward
+from ident_service.model.arm_model import ArmModel, control_model
+from ident_service.model.expected_friction import ExpectedFriction, FrictionFeedforward, expected_friction
 from ident_service.model.rigid_body import InverseDynamics
 from ident_service.motion.control import ComputedTorque
 from ident_service.motion.guard import TORQUE_RATE
@@ -214,3 +216,57 @@ def test_stated_drive_inertia_is_in_the_computed_torque() -> None:
     np.testing.assert_allclose(more, (0.3 - np.array([0.02, 0.01])) * wanted, atol=1e-12)
     less = {name: joint.model_dump() | {"drive_inertia": 0.001} for name, joint in bench_config().joints.items()}
     np.testing.assert_array_equal(control_model(bench_model(joints=less)).prior, MODEL.prior)
+
+
+def coupled(**changes: Any) -> ArmModel:
+    """The bench's arm behind a differential whose drives have the inertia and the friction."""
+    gears = {"ratios": [20.0, -20.0], "coupling": COUPLING.tolist(), "drive_terms": "motors"}
+    return bench_model(transmission=gears, **changes)
+
+
+COUPLING = np.array([[1.0, -0.5], [1.0, 0.5]])
+
+
+@given(VECTORS, VECTORS)
+def test_drives_that_move_both_joints_add_their_inertia_to_both(q: Array, wanted: Array) -> None:
+    model = coupled()
+    assert model.prior is not None
+    both = InverseDynamics(model.chain, model.layout, model.prior)
+    assert MODEL.prior is not None
+    bare = MODEL.prior.copy()
+    bare[MODEL.layout.term_columns("drive_inertia")] = 0.0
+    links = InverseDynamics(MODEL.chain, MODEL.layout, bare)
+    drives = COUPLING.T @ np.diag([PRIOR["Ia1"], PRIOR["Ia2"]]) @ COUPLING
+    still = np.zeros(2)
+    np.testing.assert_allclose(
+        both.torque(q, still, wanted), links.torque(q, still, wanted) + drives @ wanted, atol=1e-9
+    )
+    np.testing.assert_allclose(both.mass_matrix(q), links.mass_matrix(q) + drives, atol=1e-12)
+
+
+@given(VECTORS)
+def test_friction_of_drives_that_move_both_joints_is_fed_forward_for_their_velocities(pace: Array) -> None:
+    expected = ExpectedFriction(np.array([0.5, 0.2]), np.array([0.3, 0.1]), np.array([0.05, -0.02]))
+    fed = FrictionFeedforward(expected, 0.8, coupled().chain, LIMITS)
+    rate = COUPLING @ pace
+    over = 0.02 * np.abs(COUPLING) @ LIMITS.velocity
+    felt = 0.8 * (np.array([0.5, 0.2]) * np.tanh(rate / over) + np.array([0.3, 0.1]) * rate) + np.array([0.05, -0.02])
+    np.testing.assert_allclose(fed.torque(pace), COUPLING.T @ felt, atol=1e-9)
+
+
+def test_what_holds_a_joint_is_the_friction_of_all_drives_that_move_it() -> None:
+    drives = ExpectedFriction(np.array([0.5, 0.2]), np.array([0.3, 0.1]), np.array([0.05, -0.02]))
+    joints = drives.at_joints(coupled().chain)
+    np.testing.assert_allclose(joints.coulomb, [0.7, 0.35])
+    np.testing.assert_allclose(joints.viscous, [0.4, 0.1])
+    own = drives.at_joints(MODEL.chain)
+    np.testing.assert_array_equal(own.coulomb, drives.coulomb)
+    np.testing.assert_array_equal(own.viscous, drives.viscous)
+
+
+def test_friction_is_guessed_of_a_drive_by_the_torque_that_joints_ask_of_it() -> None:
+    """By `t = C^-T tau` the shoulder's limit of 40 N m asks for (20, 20) N m, the elbow's of 15 for (-15, 15)."""
+    guessed = expected_friction(coupled(), LIMITS, (0.02, 0.05))
+    np.testing.assert_allclose(guessed.coulomb, [0.02 * 20.0, 0.02 * 20.0])
+    # At their limits both joints turn a drive by 2 + 3/2 rad/s.
+    np.testing.assert_allclose(guessed.viscous, [0.05 * 20.0 / 3.5] * 2)

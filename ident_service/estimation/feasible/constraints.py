@@ -15,6 +15,7 @@ from fractions import Fraction
 
 import numpy as np
 
+from ident_service.config.payload import knowledge_with_payload
 from ident_service.config.quantities import Vector3
 from ident_service.config.schema import ArmConfig, Body, Box, Ellipsoid, JointTerm
 from ident_service.errors import ParameterError
@@ -44,6 +45,7 @@ def configured(config: ArmConfig, links: Sequence[int], index: Index) -> list[Bl
     Raises:
         ParameterError: a hull whose points lie in one plane.
     """
+    config = knowledge_with_payload(config)
     blocks = _masses(config, links, index)
     for link, body in _bodies(config, links):
         if body.center_of_mass is not None:
@@ -58,7 +60,7 @@ def configured(config: ArmConfig, links: Sequence[int], index: Index) -> list[Bl
 def symmetries(config: ArmConfig, links: Sequence[int], index: Index) -> list[Block]:
     """The odd moments that symmetry planes make zero, one block per plane; none stands twice."""
     blocks = []
-    for link, body in _bodies(config, links):
+    for link, body in _bodies(knowledge_with_payload(config), links):
         gone: set[str] = set()
         for plane in dict.fromkeys(body.symmetry):
             names = [f"{symbol}{link}" for symbol in _ODD[plane] if symbol not in gone]

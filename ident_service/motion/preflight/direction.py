@@ -24,7 +24,7 @@ from ident_service.model.zero_phase import local_polynomial
 from ident_service.motion.preflight.check import Check, Measure, Verdict, failed, judged, measures
 from ident_service.motion.preflight.delay import FREQUENCY, Delay, delay_measures, dither
 from ident_service.motion.preflight.session import BAND, Rows, Session, Trace
-from ident_service.motion.preflight.stability import INERTIA, known_drives
+from ident_service.motion.preflight.stability import INERTIA, drive_matrix, known_drives
 from ident_service.motion.reference import Reference, Setpoint, rest
 from ident_service.motion.surroundings import way_clearance
 from ident_service.motion.way import RuckigReference, way
@@ -158,7 +158,7 @@ def _answer_to_torque(trace: Trace, joint: int, session: Session) -> tuple[float
     measured = local_polynomial(trace.position[:, joint], window, 2, 2, trace.period)
     speed = local_polynomial(trace.position[:, joint], window, 2, 1, trace.period)
     # The same filter on the way that the model expects, so that what it distorts it distorts on both sides.
-    expected = local_polynomial(expected_way(trace, session)[:, joint], window, 2, 2, trace.period)
+    expected = local_polynomial(_own_way(trace, session, joint), window, 2, 2, trace.period)
     sliding = (np.minimum(np.abs(rate), np.abs(speed)) > _MOVING * largest) & (np.sign(speed) == np.sign(rate))
     if int(sliding.sum()) < 2 * window:
         return nothing
@@ -259,7 +259,7 @@ def direction_check(
     follows = np.array([one.follows for one in answers])
     # What the drives are known to have does not get lighter with the links: doubled torque shows the sooner.
     most = np.minimum(MOST_ANSWER, MORE_TORQUE * np.diag(session.inertia) / session.lightest)
-    known = nothing if model.prior is None else model.layout.term_values("drive_inertia", model.prior)
+    known = nothing if model.prior is None else np.diag(drive_matrix(model, model.prior))
     said = known_drives(model)
     least = np.where(known > 0.0, LEAST_ANSWER, np.where(said > 0.0, LEAST_DESCRIBED, 0.0))
     response = np.array([one.answers for one in answers])
@@ -316,9 +316,23 @@ def _free_stroke(
 def expected_way(trace: Trace, session: Session, sign: Vector | float = 1.0) -> Vector:
     """How far the model expects the torque that acted, times `sign`, to have moved the arm, shape (cycles, joints)."""
     acceleration = np.linalg.solve(session.inertia, (sign * (trace.torque - session.gravity)).T).T
+    return _integrated_twice(np.asarray(acceleration, dtype=np.float64), trace.period)
+
+
+def _own_way(trace: Trace, session: Session, joint: int) -> Vector:
+    """Return how far the model expects a joint's own torque to have moved it while the others stand, shape (cycles,).
+
+    Others are held by friction and by torques that move nothing.
+    """
+    push = (trace.torque[:, [joint]] - session.gravity[joint]) / session.inertia[joint, joint]
+    return _integrated_twice(push, trace.period)[:, 0]
+
+
+def _integrated_twice(acceleration: Vector, period: float) -> Vector:
+    """Return the way [rad or m] of accelerations held for a period each, both of shape (cycles, joints)."""
     start = np.zeros((1, acceleration.shape[1]))
-    speed = np.vstack([start, np.cumsum(acceleration, axis=0)[:-1]]) * trace.period
-    steps = trace.period * (speed + 0.5 * trace.period * acceleration)
+    speed = np.vstack([start, np.cumsum(acceleration, axis=0)[:-1]]) * period
+    steps = period * (speed + 0.5 * period * acceleration)
     return np.vstack([start, np.cumsum(steps, axis=0)[:-1]])
 
 

@@ -113,6 +113,11 @@ def preflight(
     return new_ticket(subject, flight.all_checks(), clock.now_ns() + clock.utc_offset_ns, valid)
 
 
+def _felt_friction(model: ArmModel, limits: MotionLimits) -> ExpectedFriction:
+    """Return the friction that joints feel, of whichever drives move them."""
+    return expected_friction(model, limits, model.config.design.friction_guess).at_joints(model.chain)
+
+
 @dataclass(frozen=True)
 class _Gravity:
     torque: Vector
@@ -204,7 +209,7 @@ class _Preflight:
         home = again.samples[-1].position
         with attended(self.arm):
             limits = limits if self.excitation is not None else admitting(home, limits)
-            friction = expected_friction(self.model, limits, self.model.config.design.friction_guess)
+            friction = _felt_friction(self.model, limits)
             session = Session(self.arm, self.model, limits, self.described, home, friction)
             planned = self._planned(session)
         self._touched(session, planned, _Gravity(session.gravity, limits, friction), try_watchdog=agreed.given)
@@ -230,7 +235,7 @@ class _Preflight:
         elif self.checks["motion_fits"].verdict is Verdict.PASSED:
             self._passed(ways_check(self.model, limits, self.excitation, home), of_place=True)
         self._passed(rate_check(looked, self.arm.clock.lock_step))
-        friction = expected_friction(self.model, limits, self.model.config.design.friction_guess)
+        friction = _felt_friction(self.model, limits)
         session = Session(self.arm, self.model, limits, self.described, home, friction)
         self._passed(noise_check(looked, self.described, self.model, limits, session.mass))
         if any(c.verdict is Verdict.FAILED and c.code not in ABOUT_THE_MOTION for c in self.checks.values()):
@@ -301,7 +306,7 @@ class _Preflight:
                 self.arm.reset()  # the host's own silence was the fault
             with attended(self.arm):
                 limits = admitting(home, limits)
-                friction = expected_friction(self.model, limits, self.model.config.design.friction_guess)
+                friction = _felt_friction(self.model, limits)
                 session = Session(self.arm, self.model, limits, described, home, friction)
                 room = admitting(home, motion_limits(self.model.config), 0.0)
                 stroke = strokes(session, self.model, room, only=0)[0]

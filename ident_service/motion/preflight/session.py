@@ -146,7 +146,10 @@ class Session:
         self._rows: list[tuple[Sample, Setpoint]] = []
         self._words: tuple[int, ...] = ()
         self._friction = still
-        self._stiffness = limits.kp * np.diag(self.mass)
+        self._coupling = model.chain.coupling
+        to_drives = np.linalg.inv(self._coupling).T
+        self._stiffness = to_drives**2 @ (limits.kp * np.diag(self.mass))
+        self._most = (np.abs(to_drives) * self._band).max(axis=1)
 
     def energise(self) -> None:
         """Enable; the first cycle of `follow` sends the torque that holds the arm.
@@ -178,6 +181,7 @@ class Session:
             DriverError: the arm does not answer.
         """
         self._rows = []
+        learned: list[Vector] = []
         begin_ns: int | None = None
         while True:
             sample = self._arm.exchange(self._torque)
@@ -193,7 +197,12 @@ class Session:
                 moving = np.clip(np.abs(setpoint.velocity) / (2.0 * _CREEP), 0.0, 1.0)
                 wanted = wanted + moving * shaking[0] * np.sin(2.0 * np.pi * shaking[1] * elapsed)
             self._torque = self._limited(wanted + self._against_friction(setpoint, learning))
+            if learning and setpoint.velocity.any():
+                learned.append(self._friction)
             if elapsed >= seconds:
+                if learned:
+                    # What the model lacks of gravity is taken for friction on one way, and against it on the other.
+                    self._friction = np.mean(learned, axis=0)
                 return self._rows
 
     @property
@@ -259,12 +268,15 @@ class Session:
         return control.torque(sample.position, usable, setpoint, since if known else 0.0)
 
     def _against_friction(self, setpoint: Setpoint, learning: float) -> Vector:
-        """Torque that moving joints need besides the model's, learned from how they lag [N m or N], shape (joints,)."""
-        rate = setpoint.velocity
+        """Torque that moving joints need besides the model's, learned from how they lag [N m or N], shape (joints,).
+
+        Friction is the drives': one that moves several joints lags by what all of them do, and pushes all of them.
+        """
+        rate = self._coupling @ setpoint.velocity
         direction = np.where(np.abs(rate) > _CREEP, np.sign(rate), 0.0)
-        lag = (setpoint.position - self._control.position) * direction
-        self._friction = np.clip(self._friction + learning * self.period * self._stiffness * lag, 0.0, self._band)
-        return np.asarray(self._friction * np.clip(rate / _CREEP, -1.0, 1.0))
+        lag = self._coupling @ (setpoint.position - self._control.position) * direction
+        self._friction = np.clip(self._friction + learning * self.period * self._stiffness * lag, 0.0, self._most)
+        return np.asarray(self._coupling.T @ (self._friction * np.clip(rate / _CREEP, -1.0, 1.0)))
 
     def _limited(self, wanted: Vector, *, band: bool = True) -> Vector:
         if band:

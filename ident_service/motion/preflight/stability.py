@@ -265,11 +265,11 @@ def _lightest_and_unknown(model: ArmModel) -> tuple[Vector, Vector]:
     used = control_model(model).prior
     if used is None:
         return np.full(n, INERTIA[0]), np.full(n, UNKNOWN_DRIVE)
-    known = np.diag(_drive_matrix(model, used)) > 0.0
+    known = np.diag(drive_matrix(model, used)) > 0.0
     return np.where(known, INERTIA[0], 1.0), np.where(known, KNOWN_DRIVE, UNKNOWN_DRIVE)
 
 
-def _drive_matrix(model: ArmModel, delta: Vector) -> Vector:
+def drive_matrix(model: ArmModel, delta: Vector) -> Vector:
     """Return what drives add to the mass matrix, shape (joints, joints)."""
     coupling = model.chain.coupling
     return np.asarray(coupling.T @ (model.layout.term_values("drive_inertia", delta)[:, None] * coupling))
@@ -281,7 +281,7 @@ def known_drives(model: ArmModel) -> Vector:
     said = np.array([0.0 if joint is None else joint.drive_inertia or 0.0 for joint in joints])
     if model.prior is None:
         return 0.0 * said
-    return np.asarray(np.maximum(said - model.layout.term_values("drive_inertia", model.prior), 0.0))
+    return np.asarray(np.maximum(said - np.diag(drive_matrix(model, model.prior)), 0.0))
 
 
 def _postures(limits: MotionLimits) -> Vector:
@@ -308,7 +308,7 @@ def _ratios(
     """`M_true^-1 M_model` at all postures, case by case, each of shape (samples, joints, joints)."""
     nominal = _mass_matrices(model, used, postures)
     own = np.einsum("skk->sk", nominal)
-    stated = _drive_matrix(model, used) - _drive_matrix(model, prior)
+    stated = drive_matrix(model, used) - drive_matrix(model, prior)
     for factors in _link_factors(lightest):
         delta = np.array(prior, dtype=float)
         for link, factor in enumerate(factors):

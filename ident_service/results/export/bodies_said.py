@@ -23,7 +23,9 @@ def body_notes(arm: IdentifiedArm) -> tuple[str, ...]:
         f"link values are one feasible body of many with the same torques ({how}); "
         f"{count} of {size} base parameters are unidentified"
     )
-    return (first, *_implausible(arm.model, arm.delta))
+    payload = arm.model.config.payload
+    loaded = () if payload is None else (f"link values include the payload of the description: {payload.words}",)
+    return (first, *loaded, *_implausible(arm.model, arm.delta))
 
 
 def _implausible(model: ArmModel, delta: Array) -> tuple[str, ...]:

@@ -96,7 +96,8 @@ def report_html(evidence: Evidence, parameters: ParameterFile, config: ArmConfig
 
 def _subtitle(parameters: ParameterFile, config: ArmConfig) -> str:
     origin = parameters.content.get("provenance", {})
-    parts = [config.description, origin.get("created", ""), origin.get("software", "")]
+    load = "" if config.payload is None else f"with its payload of {config.payload.words}"
+    parts = [config.description, load, origin.get("created", ""), origin.get("software", "")]
     return " \u00b7 ".join(part for part in parts if part)
 
 
