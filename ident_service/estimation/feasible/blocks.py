@@ -106,8 +106,8 @@ class Block:
 
 
 def symmetric(entries: Array, size: int) -> Array:
-    """The symmetric matrix with this upper triangle."""
-    matrix = np.zeros((size, size))
+    """Fill a symmetric matrix with the entries of its upper triangle, shape (size, size, ...) from (entries, ...)."""
+    matrix = np.zeros((size, size, *entries.shape[1:]))
     for value, (i, j) in zip(entries, triangle_entries(size), strict=True):
         matrix[i, j] = matrix[j, i] = value
     return matrix
