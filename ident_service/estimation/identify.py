@@ -34,6 +34,7 @@ from ident_service.estimation.least_squares import (
     torque_error,
 )
 from ident_service.estimation.second_opinion import SecondOpinion, second_opinion
+from ident_service.estimation.spectra import remarks_on_noise
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters, base_parameters, remarks_on_angles
 from ident_service.model.chain import Array
@@ -310,7 +311,12 @@ def identify(
         chosen=chosen,
         standstill_shares=found.shares,
         choices=(*prepared.choices, *found.choices),
-        remarks=(*found.remarks, *_remarks_on_friction(model, prepared.model), *remarks_on_angles(base)),
+        remarks=(
+            *found.remarks,
+            *_remarks_on_friction(model, prepared.model),
+            *remarks_on_angles(base),
+            *_remarks_on_noise(found, recordings, prepared.model),
+        ),
         custom=None if free else knowledge,
         second=second,
     )
@@ -321,6 +327,12 @@ def _remarks_on_friction(described: ArmModel, fitted: ArmModel) -> tuple[str, ..
     asked = {key: getattr(shape, key) for key in type(shape).model_fields if getattr(wanted, key) == "fit"}
     given = {key: 0.0 if key == "presliding" else 0.1 for key in type(shape).model_fields}
     return at_the_edge(type(shape)(**(given | asked)), fitted.chain.names, fitted.layout.terms)
+
+
+def _remarks_on_noise(found: Fit, recordings: Sequence[Recording], model: ArmModel) -> tuple[str, ...]:
+    if found.method == "iv" or model.config.identification.period is not None:  # periods are averaged, not filtered
+        return ()
+    return remarks_on_noise(recordings, model)
 
 
 def _check(method: str, recordings: Sequence[Recording], validation: Sequence[Recording]) -> None:
