@@ -315,7 +315,7 @@ def identify(
             *found.remarks,
             *_remarks_on_friction(model, prepared.model),
             *remarks_on_angles(base),
-            *_remarks_on_noise(found, recordings, prepared.model),
+            *(() if found.method == "iv" else remarks_on_noise(recordings, prepared.model)),
         ),
         custom=None if free else knowledge,
         second=second,
@@ -327,12 +327,6 @@ def _remarks_on_friction(described: ArmModel, fitted: ArmModel) -> tuple[str, ..
     asked = {key: getattr(shape, key) for key in type(shape).model_fields if getattr(wanted, key) == "fit"}
     given = {key: 0.0 if key == "presliding" else 0.1 for key in type(shape).model_fields}
     return at_the_edge(type(shape)(**(given | asked)), fitted.chain.names, fitted.layout.terms)
-
-
-def _remarks_on_noise(found: Fit, recordings: Sequence[Recording], model: ArmModel) -> tuple[str, ...]:
-    if found.method == "iv" or model.config.identification.period is not None:  # periods are averaged, not filtered
-        return ()
-    return remarks_on_noise(recordings, model)
 
 
 def _check(method: str, recordings: Sequence[Recording], validation: Sequence[Recording]) -> None:

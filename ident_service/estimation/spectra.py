@@ -104,6 +104,8 @@ def remarks_on_noise(recordings: Sequence[Recording], model: ArmModel) -> tuple[
         RecordingError: a recording cannot be read.
     """
     options, fmt = model.config.identification, model.config.recording
+    if options.period is not None:  # periods are averaged, not filtered
+        return ()
     cutoff, found = float(options.smoothing.cutoff), []
     for recording in recordings:
         noise = spectrum(recording, fmt, measured=options.smoothing.velocity == "measured").noise
