@@ -99,15 +99,27 @@ def _run(model: ArmModel, folder: Path) -> list[Row]:
 def _estimation(model: ArmModel, folder: Path) -> list[Row]:
     path = folder / "run1.mcap"
     names = model.chain.names
+    table = [np.column_stack([one.stamp_ns * 1e-9, one.position, one.torque]) for one in open_recording(path).blocks()]
+    head = ",".join(["t", *(f"{kind}{number + 1}" for kind in ("q", "tau") for number in range(len(names)))])
+    as_csv = folder / "run1.csv"
+    np.savetxt(as_csv, np.concatenate(table), delimiter=",", fmt="%.12g", header=head, comments="")
 
-    def whole() -> None:
-        estimate = identify(model, [KeptRecording(open_recording(path, names))])  # as the command reads it
+    def whole(recorded: Path) -> None:
+        estimate = identify(model, [KeptRecording(open_recording(recorded, names))])  # as the command reads it
         write_parameters(folder / "parameters.json", parameters_document(estimate))
 
     base = base_parameters(model.chain, model.layout)
     total = equations(open_recording(path, names), model, base).total
     fit = ordinary_least_squares(total)
-    rows = [Row("62 s MCAP (62,500 samples) to certified parameters.json", median_seconds(whole, 5), "s", "<= 2")]
+    rows = [
+        Row(
+            f"62 s {kind} (62,500 samples) to certified parameters.json",
+            median_seconds(lambda p=file: whole(p), 5),
+            "s",
+            target,
+        )
+        for kind, file, target in (("MCAP", path, "<= 0.8"), ("CSV", as_csv, "<= 1.0"))
+    ]
     for kind in ("inertia", "pseudo_inertia"):
         conditions = feasible_set(kind, base.names, model.config)
         for name, call in (

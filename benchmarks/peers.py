@@ -1,8 +1,11 @@
-"""Whole processes beside each other: our command, and the script that a researcher would write instead.
+"""Whole processes beside each other: our command, and the scripts that a researcher would write instead.
 
 `python -m benchmarks.peers`, about a minute. An independent plant (pinocchio's inverse dynamics with friction along the
 published motions of the WAM, noise on positions and torques) is written as CSV, 62,500 rows of seven joints. Compared
 are CPU seconds of whole processes, in turns, and torque errors on the other published motion.
+
+figaroh is run, too, where `IDENT_BENCH_FIGAROH` names the Python of an environment that has it (`pip install figaroh`).
+FloBaRoID is on no package index.
 """
 
 from __future__ import annotations
@@ -31,7 +34,7 @@ TURNS = int(os.environ.get("IDENT_BENCH_TURNS", "3"))
 ROWS, RATE = 62_500, 1000.0
 TORQUE_NOISE, POSITION_NOISE = 0.1, 1e-5  # N m, rad
 _DATA = Path(__file__).parents[2] / "shared" / "data" / "wam7"
-_SCRIPT = Path(__file__).with_name("plain_script.py")
+_SCRIPTS = Path(__file__).parent
 _ARM = "wam7_sim"
 
 
@@ -45,28 +48,33 @@ def measure(folder: Path) -> list[Row]:
         _record(model, truth, motion, folder / f"{name}.csv", seed)
     (folder / "arm.urdf").write_text(urdf_text(model, model.prior), encoding="utf-8")
     fit, unseen = str(folder / "fit.csv"), str(folder / "unseen.csv")
-    plain = [sys.executable, str(_SCRIPT), str(folder / "arm.urdf"), fit, unseen]
     ours = [sys.executable, "-m", "ident_service", "identify", fit, "--arm", _ARM, "--json"]
-    seconds: dict[str, list[float]] = {"ours": [], "plain": []}
+    scripts = {"pinocchio + cvxpy": [sys.executable, str(_SCRIPTS / "plain_script.py")]}
+    if python := os.environ.get("IDENT_BENCH_FIGAROH"):
+        scripts["figaroh"] = [python, str(_SCRIPTS / "figaroh_script.py")]
+    seconds: dict[str, list[float]] = {name: [] for name in ("ours", *scripts)}
+    errors: dict[str, float] = {}
     for turn in range(TURNS + 1):
-        for name, words in (("ours", [*ours, "--out", str(folder / f"result{turn}")]), ("plain", plain)):
-            spent, said = _cpu_seconds(words)
+        words = {"ours": [*ours, "--out", str(folder / f"result{turn}")]}
+        words |= {name: [*script, str(folder / "arm.urdf"), fit, unseen] for name, script in scripts.items()}
+        for name, command in words.items():
+            spent, said = _cpu_seconds(command)
             if turn:  # once for warm files and compiled modules
                 seconds[name].append(spent)
-            if name == "plain":
-                error = json.loads(said)["error_percent"]
+            if name in scripts:
+                errors[name] = json.loads(said)["error_percent"]
     judged = [*ours, "--validate", unseen, "--out", str(folder / "judged")]
     _cpu_seconds(judged)
     own = json.loads((folder / "judged" / "parameters.json").read_text())["validation"][0]["relative_error_percent"]
-    mine, theirs = (statistics.median(seconds[name]) for name in ("ours", "plain"))
+    mine, *theirs = (statistics.median(spent) for spent in seconds.values())
     label = f"{ROWS} rows of seven joints, CSV, CPU of the whole process"
-    return [
-        Row(f"{label}: ident identify", mine, "s", "<= 1.2"),
-        Row(f"{label}: pinocchio + cvxpy, every tenth row", theirs, "s"),
-        Row("ours over the plain script's", mine / theirs, "", "<= 0.8"),
-        Row("torque error on the unseen motion: ident identify", own, "%"),
-        Row("torque error on the unseen motion: pinocchio + cvxpy", error, "%"),
-    ]
+    unseen_error = "torque error on the unseen motion"
+    rows = [Row(f"{label}: ident identify", mine, "s", "<= 1.2"), Row(f"{unseen_error}: ident identify", own, "%")]
+    for (name, error), spent in zip(errors.items(), theirs, strict=True):
+        rows.append(Row(f"{label}: {name}, every tenth row", spent, "s"))
+        rows.append(Row(f"ours over {name}", mine / spent, "", "<= 0.8"))
+        rows.append(Row(f"{unseen_error}: {name}", error, "%"))
+    return rows
 
 
 def _record(model: ArmModel, truth: np.ndarray, motion: str, path: Path, seed: int) -> None:

@@ -116,7 +116,7 @@ class Equations:
 
     def with_near(self, shares: Array) -> Equations:
         """The same equations with the rows near standstill among the blocks, multiplied by `shares` per joint."""
-        if not self.near:
+        if not any(near.rows.any() for near in self.near):
             return self
         pairs = zip(self.blocks, self.near, strict=True)
         return replace(self, blocks=tuple(block.merged(near.times(shares)) for block, near in pairs), near=())

@@ -34,6 +34,7 @@ from ident_service.estimation.least_squares import (
     torque_error,
 )
 from ident_service.estimation.second_opinion import SecondOpinion, second_opinion
+from ident_service.estimation.spectra import remarks_on_noise
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters, base_parameters, remarks_on_angles
 from ident_service.model.chain import Array
@@ -310,7 +311,12 @@ def identify(
         chosen=chosen,
         standstill_shares=found.shares,
         choices=(*prepared.choices, *found.choices),
-        remarks=(*found.remarks, *_remarks_on_friction(model, prepared.model), *remarks_on_angles(base)),
+        remarks=(
+            *found.remarks,
+            *_remarks_on_friction(model, prepared.model),
+            *remarks_on_angles(base),
+            *(() if found.method == "iv" else remarks_on_noise(recordings, prepared.model)),
+        ),
         custom=None if free else knowledge,
         second=second,
     )

@@ -193,10 +193,12 @@ def _motion(positions: _Positions, period: float | None, length: float, number: 
     shown = np.concatenate([same, np.zeros(lag, bool)]) | np.concatenate([np.zeros(lag, bool), same])
     mean = np.full((lag, q.shape[1]), np.nan)
     places = np.rint((np.arange(len(q)) * step % period) / step).astype(np.intp) % lag
-    for place in range(lag):
-        rows = q[shown & (places == place)]
-        if len(rows):
-            mean[place] = np.median(rows, axis=0)
+    rows = np.flatnonzero(shown)[np.argsort(places[shown], kind="stable")]
+    counts = np.bincount(places[shown], minlength=lag)
+    begins = np.cumsum(counts) - counts
+    for often in np.unique(counts[counts > 0]).tolist():
+        alike = np.flatnonzero(counts == often)
+        mean[alike] = np.median(q[rows[begins[alike, None] + np.arange(often)]], axis=1)
     count = max(phases, round(period / length))
     return _Motion(mean, period / lag, scale, period, period / count, number)
 

@@ -23,7 +23,8 @@ from ident_service.errors import RecordingError
 from ident_service.estimation.direction import direction
 from ident_service.estimation.spectra import with_filter
 from ident_service.model.zero_phase import local_polynomial, low_pass, widened
-from ident_service.record.grid import grid
+from ident_service.record.grid import Grid, grid
+from ident_service.record.kept import memory_of
 from ident_service.record.recording import Block, Recording, cut, join
 from ident_service.record.segments import Piece, uniform
 
@@ -116,26 +117,86 @@ def windows(
     stamps = grid(recording, fmt)
     period = stamps.period_s
     options = with_filter([recording], options, fmt)
-    smoother = _Smoother(recording, options, period, coupling)
+    smoother = _Smoother(recording, options, period)
+    way = _Way(recording.joints, options, period, coupling)
     left_out = float(options.edge)
     edge = int(np.ceil(left_out / period))
     # A window that is not the last must never hold samples of the recording's end edge.
     margin = max(smoother.margin + int(np.ceil(extra_margin / period)), edge)
     shortest = max(2.0 * left_out + 1.0, 2 * margin * period)
-    pieces = uniform(recording, fmt, stamps, shortest_s=shortest, samples=_WINDOW)
-    for window, start, stop, opens, closes in _overlapping(pieces, margin):
-        motion = smoother(window, stamps.first_ns, opens, slice(max(stop - margin, 0), stop))
+    for smooth in _smooth_windows(recording, fmt, stamps, smoother, margin, shortest):
+        motion = way(smooth, slice(max(smooth.stop - margin, 0), smooth.stop))
         # At the edges of a stretch the filter has only one side to look at.
-        low = max(start, edge) if opens else start
-        high = min(stop, len(window.stamp_ns) - edge) if closes else stop
+        low = max(smooth.start, edge) if smooth.opens else smooth.start
+        high = min(smooth.stop, len(motion.time) - edge) if smooth.closes else smooth.stop
         if high > low:
             yield Window(motion, slice(low, high))
 
 
-class _Smoother:
-    """The filter of one recording; its windows must come in order, because friction remembers the way it came."""
+@dataclass(frozen=True)
+class _Smooth:
+    """A window of smoothed samples, whatever is known of friction.
 
-    def __init__(self, recording: Recording, options: Identification, period: float, coupling: Array | None) -> None:
+    Attributes:
+        time: [s] since the recording's first sample, shape (samples,).
+        position, velocity, acceleration: [rad or m and derivatives], shape (samples, joints).
+        torque: [N m or N], shape (samples, joints).
+        start: of the samples that count, none of which is in another window.
+        stop: of them.
+        opens: whether a stretch without gaps begins with it.
+        closes: whether one ends with it.
+    """
+
+    time: Array
+    position: Array
+    velocity: Array
+    acceleration: Array
+    torque: Array
+    start: int
+    stop: int
+    opens: bool
+    closes: bool
+
+    @property
+    def nbytes(self) -> int:
+        """Size in memory."""
+        return self.time.nbytes + 4 * self.position.nbytes
+
+
+def _smooth_windows(
+    recording: Recording, fmt: RecordingFormat, stamps: Grid, smoother: _Smoother, margin: int, shortest: float
+) -> Iterator[_Smooth]:
+    """Smooth a recording, or recall what the same filter made of it: trials, equations and evidence ask for it."""
+    memory, key = memory_of(recording), (fmt, smoother.key, margin, shortest)
+    if memory is not None and (found := memory.recall("smoothed", key)) is not None:
+        yield from found
+        return
+    kept: list[_Smooth] | None = None if memory is None else []
+    size = 0
+    pieces = uniform(recording, fmt, stamps, shortest_s=shortest, samples=_WINDOW)
+    for window, start, stop, opens, closes in _overlapping(pieces, margin):
+        smooth = _Smooth(*smoother(window, stamps.first_ns), start, stop, opens, closes)
+        for array in (smooth.time, smooth.position, smooth.velocity, smooth.acceleration, smooth.torque):
+            array.setflags(write=False)
+        size += smooth.nbytes
+        if memory is not None and size > memory.max_bytes:
+            kept = None
+        if kept is not None:
+            kept.append(smooth)
+        yield smooth
+    if memory is not None and kept is not None:
+        memory.remember("smoothed", key, kept)
+
+
+class _Smoother:
+    """The filter of one recording.
+
+    Attributes:
+        margin: samples on either side of a window that its ends reach.
+        key: what its results depend on beside the recording.
+    """
+
+    def __init__(self, recording: Recording, options: Identification, period: float) -> None:
         smoothing = options.smoothing
         self._cutoff = float(smoothing.cutoff)
         if self._cutoff >= 0.5 / period:
@@ -144,14 +205,8 @@ class _Smoother:
                 f"sampled at {1.0 / period:.4g} Hz, too slow for a cut-off of {self._cutoff:g} Hz; "
                 "lower identification.smoothing.cutoff",
             )
-        self._options, self._period, self._held = options, period, recording.torque_held
+        self._smoothing, self._period, self._held = smoothing, period, recording.torque_held
         self._path = recording.path
-        self._coupling = np.eye(recording.joints) if coupling is None else coupling
-        presliding = options.friction.presliding
-        if presliding == "fit":
-            presliding = 0.0
-        self._presliding = np.broadcast_to(np.asarray(presliding, dtype=float), (recording.joints,))
-        self._direction = np.zeros((0, recording.joints))
         self._delay = 0.0 if isinstance(options.delay, str) else float(options.delay)
         slowest = 2.0 * np.pi * self._cutoff * np.sin(np.pi / (2 * smoothing.order))
         memory = _DECAY / slowest
@@ -162,10 +217,10 @@ class _Smoother:
             memory = max(half * period, memory if smoothing.filter_torque else 0.0)
         reach = options.reversal.window + abs(self._delay)
         self.margin = int(np.ceil(memory / period)) + int(np.ceil(reach / period)) + 4
+        self.key = (smoothing.model_copy(update={"decimate": 1}), self._delay)
 
-    def __call__(self, window: Block, first_ns: int, opens: bool, again: slice) -> Motion:
-        """Smooth a window; the next one of this stretch begins with the samples `again` of this one."""
-        options = self._options
+    def __call__(self, window: Block, first_ns: int) -> tuple[Array, Array, Array, Array, Array]:
+        """Give time, position, velocity, acceleration and torque of a window."""
         position, velocity, acceleration = self._derivatives(window)
         torque = window.torque
         if self._held:
@@ -177,25 +232,15 @@ class _Smoother:
             torque = np.column_stack(
                 [scipy.ndimage.shift(column, -steps, order=3, mode="nearest") for column in torque.T]
             )
-        if options.smoothing.filter_torque:
+        if self._smoothing.filter_torque:
             torque = self._low_pass(torque)
-        rate = velocity @ self._coupling.T
-        near = np.abs(rate) <= options.reversal.speed
-        near[1:] |= np.diff(np.signbit(rate), axis=0)
-        reach = round(options.reversal.window / self._period)
-        keep = ~(widened(near, reach) @ (self._coupling != 0.0))
-        # What the window before knew better, because it had both sides to look at, stands.
-        known = self._direction[:0] if opens else self._direction
-        start = known[-1] if len(known) else None
-        way = np.vstack([known, direction(rate[len(known) :], self._period, self._presliding, start)])
-        self._direction = way[again]
         time = np.asarray((window.stamp_ns - first_ns) * 1e-9, dtype=np.float64)
-        return Motion(time, position, velocity, acceleration, torque, keep, way)
+        return time, position, velocity, acceleration, torque
 
     def _derivatives(self, window: Block) -> tuple[Array, Array, Array]:
         values, measured = window.position, self._measured(window)
-        if self._options.smoothing.method == "savitzky_golay":
-            length, degree = min(self._length, len(values) - (len(values) + 1) % 2), self._options.smoothing.order
+        if self._smoothing.method == "savitzky_golay":
+            length, degree = min(self._length, len(values) - (len(values) + 1) % 2), self._smoothing.order
 
             def fitted(of: Array, derivative: int) -> Array:
                 return np.asarray(local_polynomial(of, length, degree, derivative, self._period))
@@ -208,7 +253,7 @@ class _Smoother:
         return position, velocity, self._differenced(velocity)
 
     def _measured(self, window: Block) -> Array | None:
-        if self._options.smoothing.velocity != "measured":
+        if self._smoothing.velocity != "measured":
             return None
         if window.velocity is None:
             raise RecordingError(
@@ -217,13 +262,40 @@ class _Smoother:
         return window.velocity
 
     def _low_pass(self, values: Array) -> Array:
-        smoothing = self._options.smoothing
+        smoothing = self._smoothing
         pad = min(3 * int(1.0 / (self._cutoff * self._period)), len(values) - 1)
         return low_pass(values, smoothing.order, self._cutoff, 1.0 / self._period, pad)
 
     def _differenced(self, values: Array) -> Array:
         padded = np.pad(values, ((2, 2), (0, 0)), mode="edge")
         return np.asarray((8.0 * (padded[3:-1] - padded[1:-3]) - (padded[4:] - padded[:-4])) / (12.0 * self._period))
+
+
+class _Way:
+    """Which way friction acts; its windows must come in order, because friction remembers the way it came."""
+
+    def __init__(self, joints: int, options: Identification, period: float, coupling: Array | None) -> None:
+        self._reversal, self._period = options.reversal, period
+        self._coupling = np.eye(joints) if coupling is None else coupling
+        presliding = options.friction.presliding
+        if presliding == "fit":
+            presliding = 0.0
+        self._presliding = np.broadcast_to(np.asarray(presliding, dtype=float), (joints,))
+        self._direction = np.zeros((0, joints))
+
+    def __call__(self, smooth: _Smooth, again: slice) -> Motion:
+        """Say of a window which of its equations count; the next one begins with the samples `again` of this one."""
+        rate = smooth.velocity @ self._coupling.T
+        near = np.abs(rate) <= self._reversal.speed
+        near[1:] |= np.diff(np.signbit(rate), axis=0)
+        reach = round(self._reversal.window / self._period)
+        keep = ~(widened(near, reach) @ (self._coupling != 0.0))
+        # What the window before knew better, because it had both sides to look at, stands.
+        known = self._direction[:0] if smooth.opens else self._direction
+        start = known[-1] if len(known) else None
+        way = np.vstack([known, direction(rate[len(known) :], self._period, self._presliding, start)])
+        self._direction = way[again]
+        return Motion(smooth.time, smooth.position, smooth.velocity, smooth.acceleration, smooth.torque, keep, way)
 
 
 def _overlapping(pieces: Iterable[Piece], margin: int) -> Iterator[tuple[Block, int, int, bool, bool]]:

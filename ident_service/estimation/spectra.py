@@ -27,6 +27,7 @@ _LEAST_MARGIN = 2.0  # of it, however noisy the positions are
 _MOVING = 0.99  # of the velocity's energy is motion
 _ABOVE_NOISE = 3.0  # power that is no noise, of the noise's
 _NOISE = 1e-3  # of the acceleration's power; 3 % of its size
+_ROUNDED = 1.1  # of the frequency where noise begins: cut-offs that are chosen there have two digits
 _HIGHEST = 0.2  # of the sampling rate; above half of it there is nothing
 _KEPT = 10.0  # samples a period of the cut-off
 EDGE = 2.0  # periods of the cut-off at the ends, where the filter has one side to look at
@@ -90,6 +91,32 @@ def settled(model: ArmModel, recordings: Sequence[Recording]) -> ArmModel:
     """
     options = with_filter(recordings, model.config.identification, model.config.recording)
     return replace(model, config=model.config.model_copy(update={"identification": options}))
+
+
+def remarks_on_noise(recordings: Sequence[Recording], model: ArmModel) -> tuple[str, ...]:
+    """Say of which recordings the filter passes noise of the positions that biases least squares.
+
+    Args:
+        recordings: that are fitted to.
+        model: the arm, with numbers for its filter.
+
+    Raises:
+        RecordingError: a recording cannot be read.
+    """
+    options, fmt = model.config.identification, model.config.recording
+    if options.period is not None:  # periods are averaged, not filtered
+        return ()
+    cutoff, found = float(options.smoothing.cutoff), []
+    for recording in recordings:
+        noise = spectrum(recording, fmt, measured=options.smoothing.velocity == "measured").noise
+        if cutoff > _ROUNDED * noise:
+            found.append(
+                f"{recording.path.name}: noise of the positions is more than 3 % of the accelerations from"
+                f" {noise:.2g} Hz on, and the filter passes up to {cutoff:.2g} Hz: least squares is then biased by more"
+                " than its deviations say; identification.method: iv is not, and a lower"
+                " identification.smoothing.cutoff lets less of it pass"
+            )
+    return tuple(found)
 
 
 def spectrum(recording: Recording, fmt: RecordingFormat, *, measured: bool = False) -> Spectrum:

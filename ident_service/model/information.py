@@ -6,7 +6,7 @@ can be weighted afterwards. Columns that a joint cannot feel (links nearer the b
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,7 +49,7 @@ class Information:
             ModelError: the two belong to different models.
         """
         self.require_same(other)
-        factors = tuple(triangle(np.vstack(pair)) for pair in zip(self.factors, other.factors, strict=True))
+        factors = tuple(_stacked(pair) for pair in zip(self.factors, other.factors, strict=True))
         return Information(self.supports, factors, self.rows + other.rows, self.base)
 
     @staticmethod
@@ -65,7 +65,7 @@ class Information:
             return first
         for other in every[1:]:
             first.require_same(other)
-        factors = tuple(triangle(np.vstack([part.factors[joint] for part in every])) for joint in range(first.joints))
+        factors = tuple(_stacked([part.factors[joint] for part in every]) for joint in range(first.joints))
         rows = np.sum([part.rows for part in every], axis=0)
         return Information(first.supports, factors, rows, first.base)
 
@@ -138,6 +138,12 @@ class Information:
         return total
 
 
+def _stacked(factors: Sequence[Array]) -> Array:
+    """R of triangular factors together; most stretches have no rows near standstill, and none cost nothing."""
+    some = [factor for factor in factors if len(factor)] or factors[:1]
+    return some[0] if len(some) == 1 else triangle(np.vstack(some))
+
+
 def triangle(rows: Array) -> Array:
     """R of a QR decomposition, signs as they fall."""
     return np.asarray(np.linalg.qr(rows, mode="r"))
@@ -184,5 +190,5 @@ def information_of(
         rows[:, -1] = torque[mask, joint]
         if row_weights is not None:
             rows *= row_weights[mask, joint][:, None]
-        factors.append(triangle(rows))
+        factors.append(triangle(rows) if len(rows) else rows)
     return Information(joint_supports, tuple(factors), keep.sum(axis=0).astype(np.int64), H_b.shape[1])

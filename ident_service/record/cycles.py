@@ -66,16 +66,15 @@ def read_cycles(path: Path) -> Iterator[Cycles]:
 
 def _payloads(stream: IO[bytes], size: int) -> Iterator[bytes]:
     directory = mcap.Directory()
-    ours: dict[int, bool] = {}
+
+    def choose(channel_id: int) -> bool:
+        channel = directory.channels.get(channel_id)
+        return channel is not None and channel.topic == TOPIC and directory.schema_of(channel) == CYCLE
+
     try:
         for run in mcap.contents(stream, size):
-            for channel_id, _, payload in mcap.messages(run, directory):
-                if (wanted := ours.get(channel_id)) is None:
-                    channel = directory.channels.get(channel_id)
-                    wanted = channel is not None and channel.topic == TOPIC and directory.schema_of(channel) == CYCLE
-                    ours[channel_id] = wanted
-                if wanted:
-                    yield payload
+            for _, _, payload in mcap.messages(run, directory, choose):
+                yield payload
     except mcap.TornError:
         return
 

@@ -15,6 +15,7 @@ from ident_service.record.messages import LOG, STRING
 
 _EVENTS: Final = "/events"
 _DESCRIPTION: Final = "/robot_description"
+_READ: Final = {(_EVENTS, LOG), (_DESCRIPTION, STRING)}
 _LOG_TEXTS: Final = 13  # encapsulation header, stamp, level
 
 
@@ -69,6 +70,13 @@ def read_extras(path: Path, stream: IO[bytes], size: int, utc_offset_ns: int) ->
     events: list[Event] = []
     description: str | None = None
     directory = mcap.Directory()
+
+    def kind(channel_id: int) -> str:
+        channel = directory.channels.get(channel_id)
+        if channel is None:
+            raise mcap.TornError("a message of a channel that was never announced")
+        return channel.topic if (channel.topic, directory.schema_of(channel)) in _READ else ""
+
     try:
         for opcode, content in mcap.records(stream, size, {Opcode.METADATA, Opcode.ATTACHMENT}):
             if opcode == Opcode.METADATA:
@@ -85,14 +93,10 @@ def read_extras(path: Path, stream: IO[bytes], size: int, utc_offset_ns: int) ->
         raise RecordingError(path, str(error)) from error
     try:
         for run in mcap.contents(stream, size):
-            for channel_id, _, payload in mcap.messages(run, directory):
-                channel = directory.channels.get(channel_id)
-                if channel is None:
-                    raise mcap.TornError("a message of a channel that was never announced")
-                schema = directory.schema_of(channel)
-                if channel.topic == _EVENTS and schema == LOG:
+            for channel_id, _, payload in mcap.messages(run, directory, lambda channel_id: bool(kind(channel_id))):
+                if kind(channel_id) == _EVENTS:
                     events.append(event(payload, utc_offset_ns))
-                elif channel.topic == _DESCRIPTION and schema == STRING:
+                else:
                     description = _string(payload, 4)[0]
     except mcap.TornError:
         pass

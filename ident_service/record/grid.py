@@ -16,6 +16,7 @@ import numpy as np
 
 from ident_service.config.recording import RecordingFormat
 from ident_service.errors import RecordingError
+from ident_service.record.kept import memory_of
 from ident_service.record.recording import Block, Recording, Stamps, cut
 
 REGULAR: Final = 1e-3  # of a period; what stamps in whole nanoseconds or few decimals differ by
@@ -102,6 +103,16 @@ def grid(recording: Recording, fmt: RecordingFormat) -> Grid:
         RecordingError: fewer than two samples, or none left after trimming; more than 1000 gaps; a rate asked for
             that is too far from the recording's own; and whatever reading the blocks raises.
     """
+    memory = memory_of(recording)
+    found: Grid | None = None if memory is None else memory.recall("grid", fmt)
+    if found is None:
+        found = _grid(recording, fmt)
+        if memory is not None:
+            memory.remember("grid", fmt, found)
+    return found
+
+
+def _grid(recording: Recording, fmt: RecordingFormat) -> Grid:
     steps = _Steps()
     first_ns = last_ns = samples = repeats = skipped = 0
     lost: list[tuple[int, int]] = []

@@ -1,14 +1,41 @@
-"""A recording whose samples stay in memory once they have been read, so that decoding is paid for once."""
+"""A recording whose samples stay in memory once they have been read, so that decoding is paid for once.
+
+With them stays what was computed from them last, of each kind: their stamps' grid, and the smoothed samples.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from ident_service.record.recording import BLOCK_SAMPLES, Block, Matrix, Recording, Stamps, cut, join
 
 MAX_BYTES: Final = 128 << 20  # a quarter of an hour of seven joints at 1 kHz
+
+
+class Memory:
+    """What was computed from samples that do not change, of each kind the last."""
+
+    def __init__(self, max_bytes: int = MAX_BYTES) -> None:
+        """Keep nothing that is larger than `max_bytes`."""
+        self.max_bytes = max_bytes
+        self._kept: dict[str, tuple[object, Any]] = {}
+
+    def recall(self, kind: str, key: object) -> Any:
+        """Return what was computed with an equal key; None where the last one of that kind was not."""
+        of, value = self._kept.get(kind, (None, None))
+        return value if of == key else None
+
+    def remember(self, kind: str, key: object, value: Any) -> None:
+        """Keep what was computed with a key, in the place of the last of that kind. Nobody may write into it."""
+        self._kept[kind] = (key, value)
+
+
+def memory_of(recording: Recording) -> Memory | None:
+    """Return the memory of a recording that has one: of one whose samples are kept, or a range of it."""
+    found = getattr(recording, "memory", None)
+    return found if isinstance(found, Memory) else None
 
 
 class KeptRecording:
@@ -24,6 +51,7 @@ class KeptRecording:
         self.whole: Recording = whole
         self._whole, self._max_bytes = whole, max_bytes
         self._kept: Block | None = None
+        self.memory = Memory(max_bytes)
 
     @property
     def torn(self) -> bool:

@@ -176,15 +176,15 @@ class McapRecording:
     ) -> Iterator[tuple[int, bytes]]:
         """Log time [ns] and payload of each message on a topic, that of the states if None, up to the tear."""
         directory, topic = directory or mcap.Directory(), topic or self._topic
-        chosen: dict[int, bool] = {}
+
+        def choose(channel_id: int) -> bool:
+            return self._is_chosen(channel_id, directory, topic)
+
         try:
             with self._open() as stream:
                 for run in mcap.contents(stream, self._size):
-                    for channel_id, log_time, payload in mcap.messages(run, directory):
-                        if (wanted := chosen.get(channel_id)) is None:
-                            wanted = chosen[channel_id] = self._is_chosen(channel_id, directory, topic)
-                        if wanted:
-                            yield log_time, payload
+                    for _, log_time, payload in mcap.messages(run, directory, choose):
+                        yield log_time, payload
         except mcap.TornError as error:
             self._tear(error)
         except (mcap.TooLargeError, OSError) as error:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from io import BytesIO
 from typing import IO, Any, Final
 
@@ -24,6 +24,8 @@ MAX_RECORD: Final = 64 << 20
 
 _HEAD: Final = struct.Struct("<BQ")
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
+_MESSAGE_HEAD: Final = struct.Struct("<BQH")
+_A_MESSAGE: Final = int(Opcode.MESSAGE)
 _MESSAGE_FIELDS: Final = _MESSAGE.size - _HEAD.size
 _CONTENTS: Final = frozenset({Opcode.CHUNK, Opcode.MESSAGE, Opcode.CHANNEL, Opcode.SCHEMA})
 
@@ -39,11 +41,12 @@ class TooLargeError(Exception):
 
 
 class Directory:
-    """The channels and schemas met so far, by id."""
+    """The channels and schemas met so far, by id, and which channels are read."""
 
     def __init__(self) -> None:
         self.channels: dict[int, Channel] = {}
         self.schemas: dict[int, str] = {}
+        self.chosen: dict[int, bool] = {}
 
     def schema_of(self, channel: Channel) -> str:
         """Name of the channel's message type, empty where the file does not say."""
@@ -127,8 +130,13 @@ def expand(content: bytes) -> bytes:
     return bytes(data)
 
 
-def messages(run: bytes, directory: Directory) -> Iterator[Message]:
+def messages(run: bytes, directory: Directory, choose: Callable[[int], bool] = lambda _: True) -> Iterator[Message]:
     """The messages in a run of records; channels and schemas go into `directory`.
+
+    Args:
+        run: of records.
+        directory: of the file so far.
+        choose: which channels to read, asked at each one's first message.
 
     Yields:
         Channel id, log time [ns], payload.
@@ -136,16 +144,21 @@ def messages(run: bytes, directory: Directory) -> Iterator[Message]:
     Raises:
         TornError: the bytes cannot be records.
     """
-    position, end = 0, len(run)
+    position, end, chosen = 0, len(run), directory.chosen
+    head, unpack = _HEAD.size, _MESSAGE_HEAD.unpack_from  # three messages a cycle: what is looked up here counts
     try:
         while position < end:
-            if run[position] == Opcode.MESSAGE:
-                _, length, channel, _, log_time, _ = _MESSAGE.unpack_from(run, position)
-                start = position + _MESSAGE.size
-                position += _HEAD.size + length
+            if run[position] == _A_MESSAGE:
+                _, length, channel = unpack(run, position)
+                begin = position
+                position += head + length
                 if length < _MESSAGE_FIELDS or position > end:
                     raise TornError("a chunk ends within a message")
-                yield channel, log_time, run[start:position]
+                if (wanted := chosen.get(channel)) is None:
+                    wanted = chosen[channel] = choose(channel)
+                if wanted:
+                    log_time = _MESSAGE.unpack_from(run, begin)[4]
+                    yield channel, log_time, run[begin + _MESSAGE.size : position]
                 continue
             opcode, length = _HEAD.unpack_from(run, position)
             start = position + _HEAD.size

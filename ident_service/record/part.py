@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from ident_service.errors import RecordingError
+from ident_service.record.kept import Memory, memory_of
 from ident_service.record.quality import STANDSTILL
 from ident_service.record.recording import BLOCK_SAMPLES, Block, Matrix, Recording, cut
 
@@ -48,6 +49,8 @@ class RangeRecording:
         self.standstill = (0.0, 0.0)
         self.ended: float | None = whole.ended if isinstance(whole, RangeRecording) else None
         self.whole: Recording = whole.whole if isinstance(whole, RangeRecording) else whole
+        kept = memory_of(self.whole)
+        self.memory = None if kept is None else Memory(kept.max_bytes)
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
         """Read the samples in order; see `Recording.blocks`. Blocks at the ends are shorter.

@@ -8,11 +8,14 @@ import scipy.signal
 from estimation.synthetic import SampledRecording, stamps, waves
 from helpers.plain import plain_options, plain_smoothing
 
-from ident_service.config.schema import Identification, Reversal
+from ident_service.config.recording import RecordingFormat
+from ident_service.config.schema import FrictionShape, Identification, Reversal
 from ident_service.errors import RecordingError
 from ident_service.estimation import smoothing
 from ident_service.estimation.equations import kept_motion
 from ident_service.estimation.smoothing import Motion, smoothed
+from ident_service.record.kept import KeptRecording
+from ident_service.record.part import RangeRecording
 
 RATE = 200.0
 
@@ -224,3 +227,71 @@ def test_recordings_slower_than_the_cut_off_are_refused() -> None:
     recording = SampledRecording(stamps(300, 10.0), np.zeros((300, 2)), np.zeros((300, 2)))
     with pytest.raises(RecordingError, match=r"sampled at 10 Hz, too slow for a cut-off of 8 Hz"):
         kept_motion(recording, plain_options())
+
+
+def test_what_depends_on_friction_alone_filters_nothing_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    filtered = []
+    low_pass = smoothing.low_pass
+
+    def counted(*arguments: object) -> np.ndarray:
+        filtered.append(arguments)
+        return low_pass(*arguments)
+
+    monkeypatch.setattr(smoothing, "low_pass", counted)
+    options = plain_options(smoothing=plain_smoothing(filter_torque=True))
+    recording = KeptRecording(noisy(4013))
+    kept_motion(recording, options)
+    once = len(filtered)
+    others = {
+        "friction": FrictionShape(presliding=0.01),
+        "reversal": Reversal(speed=0.3, window=options.reversal.window),
+        "smoothing": options.smoothing.model_copy(update={"decimate": 5}),
+    }
+    for key, value in others.items():
+        changed = options.model_copy(update={key: value})
+        again, fresh = kept_motion(recording, changed), kept_motion(noisy(4013), changed)
+        for name in Motion.__dataclass_fields__:
+            assert np.array_equal(getattr(again, name), getattr(fresh, name)), (key, name)
+    assert len(filtered) == once * (1 + len(others))  # those of `fresh`, and none else
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"smoothing": plain_smoothing(cutoff=5.0)},
+        {"smoothing": plain_smoothing(order=2)},
+        {"smoothing": plain_smoothing(filter_torque=True)},
+        {"smoothing": plain_smoothing(method="savitzky_golay")},
+        {"delay": 0.004},
+        {"edge": 0.7},
+        {"reversal": Reversal(speed=0.1, window=0.5)},
+    ],
+)
+def test_another_filter_is_never_taken_for_the_last(change: dict[str, object]) -> None:
+    kept, options = KeptRecording(noisy(4013)), plain_options()
+    changed = options.model_copy(update=change)
+    for asked in (options, changed, options):
+        found, fresh = kept_motion(kept, asked), kept_motion(noisy(4013), asked)
+        for name in Motion.__dataclass_fields__:
+            assert np.array_equal(getattr(found, name), getattr(fresh, name)), name
+
+
+def test_another_part_of_a_recording_has_its_own_smoothed_samples() -> None:
+    kept, options = KeptRecording(noisy(4013)), plain_options()
+    whole = kept_motion(kept, options)
+    for start, end in ((2.0, 12.0), (5.0, 15.0)):
+        part = kept_motion(RangeRecording(kept, start, end), options)
+        fresh = kept_motion(RangeRecording(noisy(4013), start, end), options)
+        assert np.array_equal(part.position, fresh.position)
+        assert len(part.time) < len(whole.time)
+    assert np.array_equal(kept_motion(kept, options).position, whole.position)
+
+
+def test_smoothed_samples_of_a_large_recording_are_not_kept() -> None:
+    recording, options = KeptRecording(noisy(4013), max_bytes=100_000), plain_options()
+    first, second = (next(smoothed(recording, options)) for _ in range(2))
+    kept_motion(recording, options)
+    assert recording.memory.recall("grid", RecordingFormat()) is not None
+    assert not np.shares_memory(first.position, second.position)
+    again = [next(smoothed(recording, options)).position for _ in range(2)]
+    assert not np.shares_memory(*again)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from estimation.synthetic import SampledRecording, stamps
+from estimation.synthetic import SampledRecording, stamps, with_options
 from helpers.plain import plain_options, plain_smoothing
 
+from ident_service.config.load import load_arm
 from ident_service.config.recording import RecordingFormat
 from ident_service.config.schema import Identification
-from ident_service.estimation.spectra import spectrum, with_filter
+from ident_service.estimation.spectra import remarks_on_noise, spectrum, with_filter
+from ident_service.model.arm_model import arm_model
 
 
 def moving(frequency: float, rate: float, noise: float = 0.0, seconds: float = 40.0) -> SampledRecording:
@@ -43,6 +45,23 @@ def test_noise_lowers_the_cut_off_to_where_it_is_a_few_percent_of_the_accelerati
         assert share < 0.06 * (2.0 * np.pi * 0.5) ** 2 / np.sqrt(2.0)
     assert cutoffs[0] == cutoffs[1] == 8.0
     assert cutoffs[1] > cutoffs[2] > cutoffs[3] >= 1.0
+
+
+def test_noise_that_the_filter_passes_is_told_with_the_way_out() -> None:
+    model = arm_model(load_arm("planar2"))
+
+    def told(recording: SampledRecording, **smoothing: object) -> tuple[str, ...]:
+        options = plain_options(smoothing=plain_smoothing(**smoothing))
+        return remarks_on_noise([recording], with_options(model, with_filter([recording], options)))
+
+    noisy = moving(0.5, 250.0, 3e-3)
+    begins = spectrum(noisy, RecordingFormat()).noise
+    (remark,) = told(noisy, cutoff=8.0)
+    assert f"from {begins:.2g} Hz on, and the filter passes up to 8 Hz" in remark
+    assert "identification.method: iv" in remark
+    assert not told(noisy, cutoff=begins)
+    assert not told(noisy, cutoff="choose")
+    assert not told(moving(0.5, 250.0), cutoff=40.0)
 
 
 def test_a_cut_off_stays_below_a_fifth_of_the_rate() -> None:

@@ -12,6 +12,7 @@ from helpers.plain import plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_delta
 
 from ident_service.config.schema import Reversal
+from ident_service.estimation import robust
 from ident_service.estimation.equations import equations
 from ident_service.estimation.identify import identify
 from ident_service.estimation.least_squares import ordinary_least_squares, weighted_least_squares
@@ -215,3 +216,12 @@ def test_weights_that_do_not_settle_give_the_best_round_and_say_so(monkeypatch: 
     assert "Huber's weights did not settle: of all rounds the one is used" in estimate.remarks[0]
     monkeypatch.undo()
     assert identify(model, [with_noise(0.02)], method="huber").remarks == ()
+
+
+def test_the_rows_that_weights_are_found_on_do_not_grow_with_the_recording(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, base, _ = three_links()
+    monkeypatch.setattr(robust, "_SPREAD", 300)
+    for count in (1, 2, 5):
+        recordings = [with_noise(0.0, seed=seed) for seed in range(count)]
+        found = robust._spread(recordings, model, base, np.ones(3), np.ones(3))
+        assert all(300 < len(table) <= 600 for table in found.tables)

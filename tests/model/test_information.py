@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ident_service.errors import ModelError
+from ident_service.model import information
 from ident_service.model.base import BaseParameters, base_parameters
 from ident_service.model.chain import Chain
 from ident_service.model.information import Information, empty_information, information_of, supports
@@ -184,3 +185,15 @@ def test_factors_cannot_be_changed() -> None:
     information = Equations(9, 2).information()
     with pytest.raises(ValueError, match="read-only"):
         information.factors[0][0, 0] = 1.0
+
+
+def test_where_only_one_has_equations_its_factors_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    arm = Equations(3, 2)
+    some, none = arm.information(), empty_information(arm.supports, arm.base.size)
+    nothing_kept = information_of(arm.H_b, arm.torque, np.zeros_like(arm.keep), arm.supports)
+    monkeypatch.setattr(information, "triangle", None)  # nothing is factored
+    for empty in (none, nothing_kept):
+        for both in (some.merged(empty), empty.merged(some), Information.sum([empty, some, empty])):
+            assert all(np.array_equal(one, other) for one, other in zip(both.factors, some.factors, strict=True))
+            assert both.rows.tolist() == some.rows.tolist()
+        assert not empty.merged(empty).rows.any()

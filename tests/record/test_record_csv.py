@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import gzip
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from record_samples import read_all
 
@@ -55,6 +56,44 @@ def test_numbers_round_trip(tmp_path: Path, values, header, compressed, end, sam
     assert np.array_equal(block.torque[:, 0], [tau for _, _, tau in values])
 
 
+@pytest.mark.parametrize("word", ["+1.5", ".25", "-.5", "3.", "007", " 2", "\t2 ", "1E3", "1" * 400 + "e-399", "-0"])
+@pytest.mark.parametrize(
+    "beside", ["0.1", "2.5e-324", "123456789012345678901234567890", "5.00000000000000011102230246"]
+)
+def test_numbers_as_python_reads_them(tmp_path: Path, word: str, beside: str) -> None:
+    path = write(tmp_path / "run.csv", f"t,q1,tau1\n0,{word},{beside}\n1,{beside},{word}\n")
+    block = read_all(CsvRecording(path))
+    assert block.position[:, 0].tolist() == [float(word), float(beside)]
+    assert block.torque[:, 0].tolist() == [float(beside), float(word)]
+
+
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.decimals(min_value=0, max_value=10_000, places=11), min_size=2, max_size=9, unique=True))
+def test_times_are_rounded_as_they_are_written(tmp_path: Path, times: list[Decimal]) -> None:
+    written = sorted(times)
+    stamps = [round(time * 10**9) for time in written]
+    assume(len(set(stamps)) == len(stamps))
+    text = "".join(f"{time},{k},0\n" for k, time in enumerate(written))
+    assert read_all(CsvRecording(write(tmp_path / "run.csv", "t,q1,tau1\n" + text))).stamp_ns.tolist() == stamps
+
+
+@pytest.mark.parametrize(
+    ("time", "stamp_ns"),
+    [
+        ("0.0000000025", 2),
+        ("0.0000000035", 4),
+        ("0.00000000250000000000000001", 3),
+        ("8796.0930222084999", 8_796_093_022_208),
+        ("1e-99999999999999999999", 0),
+    ],
+)
+@pytest.mark.parametrize("end", ["20000", "1700000000.123456789"])
+def test_half_nanoseconds(tmp_path: Path, time: str, stamp_ns: int, end: str) -> None:
+    stamps = read_all(CsvRecording(write(tmp_path / "run.csv", f"t,q1,tau1\n{time},1,2\n{end},3,4\n"))).stamp_ns
+    assert stamps.tolist() == [stamp_ns, round(Decimal(end) * 10**9)]
+    assert read_all(CsvRecording(write(tmp_path / "one.csv", f"t,q1,tau1\n{time},1,2\n"))).stamp_ns[0] == stamp_ns
+
+
 def test_door(tmp_path: Path) -> None:
     recording = CsvRecording(write(tmp_path / "run.csv", HEADER + rows(10)))
     assert (recording.joints, recording.joint_names, recording.torque_held, recording.torn) == (2, (), False, False)
@@ -92,7 +131,11 @@ def test_ends_that_are_no_mistake(tmp_path: Path) -> None:
         (rows(2) + "-1,1,1,3,4\n", "line 4, .* the stamp does not increase, it runs back by 1.004 s"),
         (rows(2) + "nan,1,1,3,4\n", "line 4: time t is nan"),
         (rows(2) + "1700000000000,1,1,3,4\n", "line 4: time t is 1700000000000; not in seconds"),
-        ("1e-99999999999999999999,1,1,3,4\n", "time t is beyond"),
+        (rows(2) + "0.008,1,true,3,4\n", "line 4: q2 is 'true', not a number"),
+        (rows(2) + "0.008,1,null,3,4\n", "line 4: q2 is 'null', not a number"),
+        (rows(2) + "0.008,1,1 2,3,4\n", "line 4: q2 is '1 2', not a number"),
+        (rows(2) + "0.008,1,[1],3,4\n", r"line 4: q2 is '\[1\]', not a number"),
+        (rows(2) + "0.008,1,1e400,3,4\n", r"line 4, 0\.008000 s after the first: position of joint 2 is inf"),
     ],
 )
 def test_mistakes_name_their_line(tmp_path: Path, text: str, message: str) -> None:

@@ -17,9 +17,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ident_service.config.schema import FeasibleSetName
 from ident_service.estimation.feasible.conic import triangle_entries
@@ -43,6 +45,11 @@ def reference(name: str) -> float:
     if symbol in ("lx", "ly", "lz"):
         return REFERENCE_MOMENT
     return REFERENCE_INERTIA if symbol.startswith("L") or symbol == "Ia" else REFERENCE_FRICTION
+
+
+def link_of(name: str) -> str:
+    """Return the number of the link that a parameter belongs to, which its name ends in."""
+    return name[len(name.rstrip("0123456789")) :]
 
 
 @dataclass(frozen=True)
@@ -84,8 +91,12 @@ class Block:
 
     def times(self, T: Array) -> Array:
         """F T, shape (entries, columns of T), from the few parameters that the block is about."""
-        columns = np.flatnonzero(np.any(self.F != 0.0, axis=0))
-        return np.asarray(self.F[:, columns] @ T[columns])
+        return np.asarray(self.F[:, self.felt] @ T[self.felt])
+
+    @cached_property
+    def felt(self) -> NDArray[np.intp]:
+        """The parameters that it is about, as columns of F."""
+        return np.flatnonzero(np.any(self.F != 0.0, axis=0))
 
     def identity(self) -> Array:
         """Entries of the identity matrix (or of ones), shape (entries,)."""
@@ -106,8 +117,8 @@ class Block:
 
 
 def symmetric(entries: Array, size: int) -> Array:
-    """The symmetric matrix with this upper triangle."""
-    matrix = np.zeros((size, size))
+    """Fill a symmetric matrix with the entries of its upper triangle, shape (size, size, ...) from (entries, ...)."""
+    matrix = np.zeros((size, size, *entries.shape[1:]))
     for value, (i, j) in zip(entries, triangle_entries(size), strict=True):
         matrix[i, j] = matrix[j, i] = value
     return matrix

@@ -63,20 +63,18 @@ class Near:
 
 
 @dataclass(frozen=True)
-class _Matrix:
-    """One symmetric matrix of the set over its reference scale, as an affine function of the free directions.
+class _Matrices:
+    """Symmetric matrices of the set, all of one size, over their reference scales: affine in the free directions.
 
     Attributes:
-        value: shape (size, size).
-        directions: which change it, shape (changing,).
-        slopes: its derivatives along them, shape (changing, size, size).
-        bounded: whether its trace is part of f, as that of a link's inertia is.
+        values: shape (matrices, size, size).
+        slopes: their derivatives along the directions, shape (matrices, size, size, directions).
+        bounded: 1 where the trace is part of f, as that of a link's inertia is, else 0, shape (matrices,).
     """
 
-    value: Array
-    directions: NDArray[np.intp]
+    values: Array
     slopes: Array
-    bounded: bool
+    bounded: Array
 
 
 def central(
@@ -110,24 +108,23 @@ def central(
         kept = scipy.linalg.null_space(E @ free)
         free, N = free @ kept, N @ kept
     inset = _KEPT * min(EPSILON, conditions.margin(delta)[0])
-    matrices = [matrix for block in conditions.blocks for matrix in _matrices(block, delta, free, inset, likely)]
+    groups = _matrices(conditions, delta, free, inset, likely)
     y, before = np.zeros(free.shape[1]), np.inf
-    for _ in range(_ITERATIONS if matrices else 0):
+    for _ in range(_ITERATIONS if groups else 0):
         # With D = L L^T and M_k = L^-1 dD/dy_k L^-T, f has the gradient -J^T r and the Hessian J^T J, where J has the
         # columns vec(M_k) and r is vec(1 - L^T L): Newton's step is a least-squares problem, without the square of its
         # condition number.
         rows, wanted, moves = [], [], []
-        for matrix in matrices:
+        for group in groups:
             try:
-                L = np.linalg.cholesky(matrix.value + np.tensordot(y[matrix.directions], matrix.slopes, 1))
+                L = np.linalg.cholesky(group.values + group.slopes @ y)
             except np.linalg.LinAlgError:  # so close to the boundary, at such size, that rounding decides
                 return delta
-            inverse = np.linalg.inv(L)
-            move = inverse @ matrix.slopes @ inverse.T
-            J = np.zeros((L.size, len(y)))
-            J[:, matrix.directions] = move.reshape(len(move), -1).T
-            rows.append(J)
-            wanted.append((np.eye(len(L)) - (L.T @ L if matrix.bounded else 0.0)).ravel())
+            inverse, (count, size, _, directions) = np.linalg.inv(L), group.slopes.shape
+            half = (inverse @ group.slopes.reshape(count, size, -1)).reshape(group.slopes.shape)
+            move = inverse[:, None] @ half
+            rows.append(move.reshape(-1, directions))
+            wanted.append((np.eye(size) - group.bounded[:, None, None] * (L.transpose(0, 2, 1) @ L)).ravel())
             moves.append(move)
         away = begin + N @ y
         left = 1.0 - float(away @ away)
@@ -140,8 +137,7 @@ def central(
         if decrement < _CONVERGED or (decrement < _QUADRATIC and decrement > 0.5 * before):
             break
         before = decrement
-        along = [np.tensordot(step[matrix.directions], move, 1) for matrix, move in zip(matrices, moves, strict=True)]
-        changes = np.concatenate([np.linalg.eigvalsh(change) for change in along])
+        changes = np.concatenate([np.linalg.eigvalsh(move @ step).ravel() for move in moves])
         y += _length(changes, away, N @ step, decrement) * step
     found = np.asarray(delta + free @ y)
     return found if conditions.margin(found)[0] > 0.0 else delta
@@ -174,26 +170,34 @@ def _length(changes: Array, away: Array, going: Array, decrement: float) -> floa
     return 0.5 * (low + high)
 
 
-def _matrices(block: Block, delta: Array, free: Array, inset: float, likely: LikelyBodies | None) -> list[_Matrix]:
-    """The block's matrix, or its numbers as matrices of one row, those that no direction changes left out."""
-    values, slopes = block.F @ delta + block.f - inset * block.identity(), block.F @ free
-    directions = np.flatnonzero(np.any(slopes != 0.0, axis=0))
-    if block.size:
-        G = np.linalg.inv(_root(block, likely))
-        value, *found = (G @ symmetric(entries, block.size) @ G.T for entries in (values, *slopes.T[directions]))
-        return [_Matrix(value, directions, np.array(found), bounded=True)] if found else []
-    units = block.references()
-    drives = np.zeros(len(units), dtype=bool)
-    if likely is not None:  # of drive inertias, which nothing else bounds
-        own = block.F @ likely.drives
-        drives = own > 0.0
-        units = np.where(drives, own, units)
-    scaled = zip(values / units, slopes / units[:, None], drives, strict=True)
-    return [
-        _Matrix(np.full((1, 1), value), np.flatnonzero(row), row[row != 0.0][:, None, None], bounded=bool(drive))
-        for value, row, drive in scaled
-        if np.any(row != 0.0)
-    ]
+def _matrices(
+    conditions: FeasibleSet, delta: Array, free: Array, inset: float, likely: LikelyBodies | None
+) -> list[_Matrices]:
+    """Gather the set's matrices and numbers, as matrices of one row, by size; those that no direction changes not."""
+    found: dict[int, list[_Matrices]] = {}
+    for block in conditions.blocks:
+        values, slopes = block.F @ delta + block.f - inset * block.identity(), block.F @ free
+        felt = slopes.any(axis=1)
+        if block.size:
+            G, felt = np.linalg.inv(_root(block, likely)), felt.any(keepdims=True)
+            value = (G @ symmetric(values, block.size) @ G.T)[None]
+            slope = np.einsum("ij,jkd,lk->ild", G, symmetric(slopes, block.size), G)[None]
+            bounded = np.ones(1)
+        else:
+            units = block.references()
+            bounded = np.zeros(len(units))
+            if likely is not None:  # drive inertias, which nothing else bounds
+                own = block.F @ likely.drives
+                units, bounded = np.where(own > 0.0, own, units), (own > 0.0).astype(float)
+            value, slope = (values / units)[:, None, None], (slopes / units[:, None])[:, None, None]
+        found.setdefault(value.shape[1], []).append(_Matrices(value[felt], slope[felt], bounded[felt]))
+    groups = []
+    for parts in found.values():
+        values, slopes, bounded = (
+            np.concatenate(of) for of in zip(*((one.values, one.slopes, one.bounded) for one in parts), strict=True)
+        )
+        groups.append(_Matrices(values, slopes, bounded))
+    return [group for group in groups if len(group.values)]
 
 
 def _root(block: Block, likely: LikelyBodies | None) -> Array:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from ident_service.estimation.feasible.blocks import (
     REFERENCE_MASS,
     Block,
     SetName,
+    link_of,
     matrix_block,
     symmetric,
 )
@@ -31,6 +33,24 @@ from ident_service.model.chain import Array
 from ident_service.model.layout import INERTIAL
 
 __all__ = ["Block", "FeasibleSet", "SetName", "feasible_set", "symmetric"]
+
+
+class _Group:
+    """Blocks of one size, whose smallest eigenvalues or numbers are found together."""
+
+    def __init__(self, size: int, places: tuple[int, ...], blocks: Sequence[Block]) -> None:
+        self.places = places
+        own = [blocks[place] for place in places]
+        self._size, self._ends = size, np.cumsum([0, *(len(block.f) for block in own)])[:-1]
+        self._F, self._f = np.vstack([block.F for block in own]), np.concatenate([block.f for block in own])
+
+    def smallest(self, delta: Array) -> Array:
+        """Smallest eigenvalue or number of each block, shape (blocks,)."""
+        entries = self._F @ delta + self._f
+        if self._size == 0:
+            return np.asarray(np.minimum.reduceat(entries, self._ends))
+        matrices = symmetric(entries.reshape(len(self.places), -1).T, self._size)
+        return np.asarray(np.linalg.eigvalsh(np.moveaxis(matrices, -1, 0))[:, 0])
 
 
 @dataclass(frozen=True)
@@ -51,7 +71,24 @@ class FeasibleSet:
 
     def margin(self, delta: Array) -> tuple[float, str]:
         """The smallest eigenvalue of all blocks and the block it belongs to; positive inside the set."""
-        return min((block.smallest(delta), block.name) for block in self.blocks)
+        return min(
+            (float(value), self.blocks[place].name)
+            for group in self._by_size
+            for value, place in zip(group.smallest(delta), group.places, strict=True)
+        )
+
+    @cached_property
+    def _by_size(self) -> tuple[_Group, ...]:
+        sizes = dict.fromkeys(block.size for block in self.blocks)
+        return tuple(
+            _Group(size, tuple(place for place, block in enumerate(self.blocks) if block.size == size), self.blocks)
+            for size in sizes
+        )
+
+    @cached_property
+    def links(self) -> tuple[frozenset[str], ...]:
+        """Numbers of the links that each block is about, as they end the names of its parameters."""
+        return tuple(frozenset(link_of(self.names[column]) for column in block.felt) for block in self.blocks)
 
     def scaled_margin(self, delta: Array) -> tuple[float, str]:
         """The largest t with D(delta) - t S >= 0, S the reference scales, and the block that allows no more."""

@@ -15,7 +15,7 @@ from typing import TypeVar
 import numpy as np
 
 from ident_service.errors import ParameterError, SolverError
-from ident_service.estimation.feasible.blocks import reference
+from ident_service.estimation.feasible.blocks import link_of, reference
 from ident_service.estimation.feasible.conic import ConicProblem, Solution
 from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet
 from ident_service.model.base import BaseParameters
@@ -69,11 +69,10 @@ def insets(conditions: FeasibleSet, base: BaseParameters, beta: Array) -> Array:
         name = base.names[column]
         if name.startswith(("L", "l", "m")):
             size = abs(float(value)) / reference(name)
-            sizes[_link(name)] = max(sizes.get(_link(name), 0.0), size)
+            sizes[link_of(name)] = max(sizes.get(link_of(name), 0.0), size)
     found = []
-    for block in conditions.blocks:
-        felt = {_link(base.names[column]) for column in np.flatnonzero(np.any(block.F != 0.0, axis=0))}
-        size = max((sizes.get(link, 1.0) for link in felt), default=1.0)
+    for links in conditions.links:
+        size = max((sizes.get(link, 1.0) for link in links), default=1.0)
         found.append(max(EPSILON * min(1.0, size), _LEAST_INSET))
     return np.array(found)
 
@@ -97,10 +96,6 @@ def with_insets(solve: Callable[[Array], Solved], conditions: FeasibleSet, base:
         if (inside == EPSILON).all():
             raise
         return solve(np.full_like(inside, EPSILON))
-
-
-def _link(name: str) -> str:
-    return name[len(name.rstrip("0123456789")) :]
 
 
 def constrain(problem: ConicProblem, block: Block, F: Array, f: Array) -> None:
