@@ -46,9 +46,18 @@ from ident_service.cli.answer import (
     print_answer,
     print_error,
     print_to_person,
+    state_folder,
 )
 from ident_service.cli.words import Parser, Verbs, WrongWords, asks_for_json
-from ident_service.errors import ArmFault, ConfigError, IdentError, MotionRefused, PersonNeeded, UsageError
+from ident_service.errors import (
+    ArmFault,
+    ConfigError,
+    DiskFull,
+    IdentError,
+    MotionRefused,
+    PersonNeeded,
+    UsageError,
+)
 
 __all__ = ["DONE", "FAILED", "FAULTED", "PERSON_NEEDED", "USAGE", "VERDICT_NO", "main"]
 
@@ -114,13 +123,40 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _asked(verb: Callable[[argparse.Namespace], Answer], arguments: argparse.Namespace) -> Answer:
-    """What a verb answers; a name that no file can have is a wrong word, wherever it is noticed."""
+    """What a verb answers; what the machine refuses is no defect of ours, wherever it is noticed."""
     try:
         return verb(arguments)
+    except IdentError as error:  # some of which are errors of the system, too
+        cause = error.__context__
+        if isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise DiskFull(str(error)) from None
+        raise
     except OSError as error:
-        if error.errno != errno.ENAMETOOLONG:
+        if (refused := _refused(arguments, error)) is None:
             raise
-        raise UsageError(f"{str(error.filename)[:40]}...: this name is too long for a file") from None
+        raise refused from None
+    except Exception as error:
+        # Named so, for the verbs that need no registry load no SQLite.
+        if type(error).__module__ != "sqlite3":
+            raise
+        from ident_service.service.registry.database import FILE, registry_error
+
+        raise registry_error(state_folder(arguments) / FILE, error) from None
+
+
+def _refused(arguments: argparse.Namespace, error: OSError) -> IdentError | None:
+    """Return what it means to a person that the operating system refused; None where it can only be our mistake."""
+    place = str(error.filename) if error.filename is not None else "the disk"
+    if error.errno == errno.ENAMETOOLONG:
+        return UsageError(f"{place[:40]}...: this name is too long for a file")
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return DiskFull(f"{place}: cannot be written: {error.strerror}; make room, then ask again")
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        from ident_service.service.state_folder import shut_out
+
+        hint = shut_out(state_folder(arguments))
+        return UsageError(f"{place}: {error.strerror}" + (f"; {hint}" if hint else ""))
+    return None
 
 
 def parser() -> Parser:

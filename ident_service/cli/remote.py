@@ -385,12 +385,20 @@ def word_of_address(word: str) -> str:
 def _client(arguments: argparse.Namespace) -> IdentClient:
     from ident_service.client import IdentClient
     from ident_service.service.registry.tokens import TOKEN_FILE, read_token
+    from ident_service.service.state_folder import shut_out
 
     state, url = state_folder(arguments), arguments.server
     if url is None:
         try:
             url = (state / "serve.url").read_text(encoding="ascii").strip()
         except OSError:
+            if (refusal := shut_out(state)) is not None:
+                raise UsageError(refusal) from None
             raise UsageError(f"no daemon serves {state}; start one with `ident serve`, or give --server URL") from None
-    token = os.environ.get("IDENT_TOKEN") or read_token(state / TOKEN_FILE)
+    token = os.environ.get("IDENT_TOKEN")
+    try:
+        token = token or read_token(state / TOKEN_FILE)
+    except UsageError:
+        if arguments.word != "stop":  # which a daemon of this machine does for anybody
+            raise
     return IdentClient(url, token)
