@@ -208,7 +208,10 @@ def _restore(arguments: argparse.Namespace) -> Answer:
     when = datetime.fromtimestamp(done.created, UTC).strftime("%Y-%m-%d %H:%M UTC")
     text = f"{state}: as of {when}, {done.files} files, {done.bytes / 2**20:.1f} MiB\n"
     text += "" if done.replaced is None else f"what stood there before: {done.replaced}\n"
-    text += "tokens that were revoked since then count again (ident token list); each arm needs a new preflight\n"
+    text += (
+        "tokens that were revoked since then count again (ident token list), the owner's does not: the daemon writes "
+    )
+    text += "a new one; each arm needs a new preflight\n"
     return DONE, text, {**asdict(done), "state": str(state)}
 
 
