@@ -7,28 +7,32 @@ STATE/runs/RUN/                  a whole one: NAME, upload.json, arm.json, colum
 ```
 
 The id is a hash of what was announced: whoever announces the same again goes on, after a restart, too. A whole one is a
-run of the kind `recording`, so whatever takes a recording of a run takes it. Boundary: nothing here looks into a
-recording; that is done by the process of a job.
+run of the kind `recording`, so whatever takes a recording of a run takes it. A columns file is held against the arm
+before anything is sent, and a CSV's header against both as soon as it has arrived. Boundary: nothing here looks further
+into a recording; that is done by the process of a job.
 """
 
 from __future__ import annotations
 
 import errno
 import fcntl
+import gzip
 import hashlib
 import json
 import os
 import re
 import shutil
+import tempfile
 import time
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
-from ident_service.errors import AlreadyThere, RecordingError, UnknownId, UsageError
+from ident_service.errors import AlreadyThere, ConfigError, Problem, RecordingError, UnknownId, UsageError
 from ident_service.results.files import appearing_folder, write_atomically
 from ident_service.results.manifest import named_files, write_manifest
 from ident_service.service.deletion import forget_run
@@ -38,6 +42,10 @@ from ident_service.service.registry.database import Database
 from ident_service.service.registry.motions import new_id
 from ident_service.service.registry.runs import COLUMNS, RUNS, UPLOAD, index_run
 
+if TYPE_CHECKING:
+    from ident_service.config.recording import RecordingFormat
+    from ident_service.config.schema import ArmConfig
+
 UPLOADS: Final = ".uploads"  # hidden: backups leave out what is half there
 MOST_BYTES: Final = 4 * 2**30  # of a recording
 MOST_OPEN: Final = 16
@@ -45,6 +53,8 @@ MOST_COLUMNS: Final = 2**16
 KEPT_FREE: Final = 2**30  # bytes of the disk that a motion's own recording may need meanwhile
 HALF_SECONDS: Final = 24 * 3600.0  # after its last piece
 _DATA, _ARM = "data", "arm.json"
+_JUDGED = "judged"  # is there once the header has been found good
+_LONGEST_HEADER = 2**20  # bytes
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,119}")
 _DOCUMENTS = (".json", ".yaml", ".partial")  # endings of what else may stand in the folder of a run
 
@@ -109,16 +119,20 @@ def begin_upload(db: Database, state: Path, announced: Announced) -> Upload:
 
     Raises:
         UnknownId: no such arm.
-        UsageError: a name that no recording can have, or too many uploads are under way.
+        UsageError: a name that no recording can have, a columns file that is not of this arm, or too many uploads are
+            under way.
+        ConfigError: mistakes in the columns file.
         NoRoom: the disk has no room for it.
     """
     name = announced.name
     if not _NAME.fullmatch(name) or name.endswith(_DOCUMENTS):
         raise UsageError(f"{name!r}: a recording has a plain name that does not end in {', '.join(_DOCUMENTS)}")
-    known_arm(db, state, announced.arm)
+    arm = known_arm(db, state, announced.arm)
     if (run := _same(db, state, announced)) is not None:
         return Upload(announced.id, announced, announced.bytes, run)
     folder = state / UPLOADS / announced.id
+    if announced.columns:
+        _format(announced, arm.config)
     # Without data, a disk was full when it was completed.
     if not all((folder / name).is_file() for name in (UPLOAD, _DATA)):
         others = uploads(state)
@@ -132,6 +146,69 @@ def begin_upload(db: Database, state: Path, announced: Announced) -> Upload:
             (folder / _DATA).touch(0o600)
             write_atomically(folder / UPLOAD, json.dumps(asdict(announced)))
     return known_upload(state, announced.id)
+
+
+def _format(announced: Announced, config: ArmConfig) -> RecordingFormat:
+    """Read the columns file of a recording as an identification will.
+
+    Raises:
+        ConfigError, UsageError: as `recordings.own_formats`, without the place where it was read.
+    """
+    from ident_service.model.arm_model import arm_model
+    from ident_service.service.recordings import own_formats
+
+    with tempfile.TemporaryDirectory(prefix="ident-columns.") as place:
+        file, recording = Path(place) / COLUMNS, Path(announced.name)
+        file.write_text(announced.columns, encoding="utf-8", errors="replace")
+        try:
+            return own_formats({recording: file}, [recording], arm_model(config))[recording]
+        except ConfigError as error:
+            raise ConfigError(
+                [Problem(Path(COLUMNS), one.line, one.column, one.message) for one in error.problems]
+            ) from None
+        except UsageError as error:
+            raise UsageError(str(error).replace(f"{place}/", "")) from None
+
+
+def require_header(db: Database, state: Path, upload: str) -> None:
+    """Refuse a CSV whose header has not the columns that were announced, once its first line has arrived.
+
+    Args:
+        db: the registry.
+        state: the state folder.
+        upload: id.
+
+    Raises:
+        UnknownId: no such upload, or its arm is gone.
+        RecordingError: all that is wrong with the header; the upload is deleted, for its columns cannot be changed.
+    """
+    from ident_service.record.csv_header import parse_header
+
+    seen, folder = known_upload(state, upload), state / UPLOADS / upload
+    announced = seen.announced
+    if not announced.columns or (folder / _JUDGED).exists() or ".csv" not in announced.name.lower():
+        return
+    with _known(upload):
+        line = _first_line(folder / _DATA, packed=announced.name.endswith(".gz"))
+    if not line.endswith(b"\n") and len(line) < _LONGEST_HEADER and seen.received < announced.bytes:
+        return  # it has not all arrived
+    form = _format(announced, known_arm(db, state, announced.arm).config)
+    with _deleted_if_wrong(folder):
+        parse_header(Path(announced.name), line.decode("utf-8-sig", "replace").rstrip("\r\n"), form.columns)
+    with _known(upload):
+        (folder / _JUDGED).touch(0o600)
+
+
+def _first_line(path: Path, *, packed: bool) -> bytes:
+    """Return the first line as far as it is there, and as a reader takes it."""
+    with path.open("rb") as stream:
+        if not packed:
+            return stream.readline(_LONGEST_HEADER)
+        try:
+            with gzip.open(stream) as unpacked:
+                return unpacked.readline(_LONGEST_HEADER)
+        except (EOFError, OSError, zlib.error):
+            return b""
 
 
 def known_upload(state: Path, upload: str) -> Upload:
@@ -180,7 +257,7 @@ class Piece:
             )
         try:
             fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            self._size = os.fstat(self._fd).st_size
+            self._begin = self._size = os.fstat(self._fd).st_size
             if offset != self._size:
                 raise AlreadyThere(f"{upload}: the next piece begins at byte {self._size}, not at {offset}")
         except BlockingIOError:
@@ -194,7 +271,7 @@ class Piece:
         """Append bytes.
 
         Raises:
-            UsageError: they are more than were announced; nothing of `data` is kept.
+            UsageError: they are more than were announced; `withdraw` is to follow.
             OSError: the disk is full, or does not take them.
         """
         if self._size + len(data) > self._most:
@@ -204,6 +281,11 @@ class Piece:
             written = os.write(self._fd, view)
             view, self._size = view[written:], self._size + written
 
+    def withdraw(self) -> None:
+        """Take back what was written of this piece: it is refused, and so none of it is kept."""
+        os.ftruncate(self._fd, self._begin)
+        self._size = self._begin
+
     def __enter__(self) -> Self:
         """Nothing more to do."""
         return self
@@ -212,6 +294,8 @@ class Piece:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Let the upload go."""
+        # The lock is of the open file, which a process that is being started has, too, until it runs its program.
+        fcntl.flock(self._fd, fcntl.LOCK_UN)
         os.close(self._fd)
 
 
