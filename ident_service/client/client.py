@@ -12,9 +12,9 @@ from types import MappingProxyType, TracebackType
 from typing import Any, Final, Self
 from urllib.parse import quote, urlencode
 
-from ident_service.client.connection import NOTHING, Connection, job_error
+from ident_service.client.connection import NOTHING, Connection, error_of
 from ident_service.client.upload import upload
-from ident_service.errors import ArmError, IdentError, MotionRefused, UsageError
+from ident_service.errors import ArmError, IdentError, MotionRefused, Stopped, Unavailable, UsageError
 
 _API: Final = "/api/v1"
 _RENEWED: Final = 0.5  # s between renewals of a lease, which lasts four times as long
@@ -109,7 +109,8 @@ class IdentClient(Connection):
 
         Raises:
             AlreadyThere: another arm has its name.
-            UsageError: its mistakes, each with line and column.
+            ConfigError: its mistakes, each with line and column.
+            UsageError: the files have no plain names, or are too many or too large.
         """
         body = {"description": description, "files": dict(files), "replace": replace}
         return self.arm(str(self.post(f"{_API}/arms", body)["name"]))
@@ -133,8 +134,8 @@ class IdentClient(Connection):
             samples: whether to tell samples and deviations of runs that are recorded.
 
         Raises:
-            UsageError: the token does not count.
-            ArmError: the daemon cannot be reached for a while.
+            AccessRefused: the token does not count.
+            ArmError, Unavailable: the daemon cannot be reached for a while, or is too busy.
         """
         failed = 0
         while True:
@@ -146,7 +147,7 @@ class IdentClient(Connection):
                     failed, after = 0, after if number is None else number
                     if kind:
                         yield Event(kind, number, MappingProxyType(value))
-            except ArmError:
+            except (ArmError, Unavailable):
                 failed += 1
                 if failed == _TRIES:
                     raise
@@ -202,9 +203,18 @@ class IdentClient(Connection):
         """
         ended = self.wait(self.begin(kind, key=key, **asked).id)
         if ended.state not in ("done", "refused"):
-            said = self.answer(ended.id).get("error") or {}
-            raise job_error(str(said.get("kind", "")), f"{ended.detail or ended.state} (job {ended.id})")
+            raise self.failure(ended)
         return ended
+
+    def failure(self, ended: Job) -> IdentError:
+        """Return the error that says how a job ended which is not `done`, as the command that did it raised it."""
+        said = self.answer(ended.id).get("error") or {}
+        words = f"{ended.detail or ended.state} (job {ended.id})"
+        if ended.state == "cancelled":
+            return Stopped(words)
+        if ended.state == "refused" and not said:
+            return MotionRefused(words)
+        return error_of(str(said.get("kind", "")), words)
 
     def wait(self, job: str) -> Job:
         """Wait until a job has ended."""
@@ -287,12 +297,18 @@ class RemoteArm:
 
 
 class RemoteMotion:
-    """A motion that was asked for; a `with` block renews its lease, and waits for its end."""
+    """A motion that was asked for; a `with` block renews its lease, and waits for its end.
+
+    The block raises what kept the motion from its end: `ArmFault` after a fault, `MotionRefused` where nothing moved (a
+    preflight that did not pass, for example), `Stopped` after a stop that another one asked for, else the error of the
+    command. `ended` is there all the same. An exception of the block's own goes on as it is.
+    """
 
     def __init__(self, client: IdentClient, begun: Job) -> None:
         """Take a job that the daemon has queued; its lease lasts two seconds from now."""
         self.client, self.id, self.uncertainty = client, begun.id, dict[str, Any]()
         self._ended: Job | None = None
+        self._cancelled = False
         self._leaving = threading.Event()
         self._thread = threading.Thread(target=self._keep, name=f"lease of {begun.id}", daemon=True)
 
@@ -318,7 +334,8 @@ class RemoteMotion:
                     yield LiveSample(at, joints, *rows)
 
     def cancel(self) -> None:
-        """Bring the arm to a controlled stop; the job then says what happened."""
+        """Bring the arm to a controlled stop; the job then says what happened, and the block raises nothing for it."""
+        self._cancelled = True
         self.client.post(f"{_API}/jobs/{self.id}/cancel")
 
     def __enter__(self) -> Self:
@@ -329,15 +346,28 @@ class RemoteMotion:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Wait for the end, the lease renewed; after an exception the arm is stopped first."""
+        """Wait for the end, the lease renewed; after an exception the arm is stopped first.
+
+        Raises:
+            IdentError: as the class says.
+            ArmError: the daemon cannot be reached any more.
+        """
         try:
             if kind is not None:
                 with suppress(UsageError):  # it has ended by itself
                     self.cancel()
             self._ended = self.client.wait(self.id)
+        except ArmError as gone:
+            raise ArmError(
+                f"{gone}. A daemon that ends brings its arms to rest first, and without a renewed lease the arm stops "
+                f"by itself. How the motion ended is told by the job {self.id}, once the daemon is there again"
+            ) from None
         finally:
             self._leaving.set()
             self._thread.join()
+        own = self._cancelled and self._ended.state == "cancelled"
+        if kind is None and self._ended.state != "done" and not own:
+            raise self.client.failure(self._ended)
 
     def _keep(self) -> None:
         while not self._leaving.wait(_RENEWED):

@@ -39,6 +39,9 @@ def commands() -> Iterator[list[str]]:
             words = shlex.split(line, comments=True)
             while words and re.fullmatch(r"[A-Z_]+=.*", words[0]):
                 words.pop(0)
+            if words[:3] == ["sudo", "-u", "ident"]:
+                words = words[4:]
+                words[0] = Path(words[0]).name
             if words[:1] == ["ident"]:
                 yield words[1:]
             elif words[:2] == ["podman", "run"]:

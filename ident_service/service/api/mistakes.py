@@ -46,6 +46,7 @@ _STATUS: Final[tuple[tuple[type[IdentError], int], ...]] = (
     (Unavailable, 503),
     (ArmError, 409),
 )
+_KINDS: Final = {413: "TooLarge"}  # whose phrase is another one in each version of Python
 _LOG = logging.getLogger("ident.http")
 _WORDS: Final = {
     400: "The request cannot be meant.",
@@ -113,7 +114,7 @@ def answer_mistakes(app: FastAPI) -> None:
 
     @app.exception_handler(HTTPException)
     async def _http(_: Request, error: HTTPException) -> JSONResponse:
-        kind = HTTPStatus(error.status_code).phrase.title().replace(" ", "").replace("-", "")
+        kind = _KINDS.get(error.status_code) or HTTPStatus(error.status_code).phrase.title().replace(" ", "")
         return _answer(error.status_code, kind, str(error.detail), dict(error.headers or {}))
 
     @app.exception_handler(Exception)

@@ -164,10 +164,15 @@ def _require_tls(settings: Settings) -> None:
         except OSError as error:
             raise UsageError(f"{path}: cannot be read: {error.strerror}; the daemon's user needs it") from None
     asked = list[bool]()
+
+    def password() -> str:
+        asked.append(True)
+        return ""
+
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
         # Without a word of ours, OpenSSL would ask the terminal for one.
-        context.load_cert_chain(settings.tls_cert, settings.tls_key, lambda: asked.append(True) or "")
+        context.load_cert_chain(settings.tls_cert, settings.tls_key, password)
     except (ssl.SSLError, ValueError, OSError) as error:
         why = "the key is encrypted; give one without a password" if asked else _tls_words(error)
         raise UsageError(f"{settings.tls_cert}, {settings.tls_key}: TLS cannot be spoken with these: {why}") from None
