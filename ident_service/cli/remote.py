@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.answer import DONE, FAILED, FAULTED, USAGE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
 from ident_service.cli.remote_recordings import file_of, recording
+from ident_service.cli.remote_words import in_words
 from ident_service.cli.words import Verbs, columns_files, count
 from ident_service.errors import IdentError, UnknownId, UsageError
 
@@ -85,12 +86,7 @@ def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
     return connected
 
 
-def as_it_is(_: IdentClient, __: argparse.Namespace, answer: Answer) -> Answer:
-    """What most verbs do with the answer of their job."""
-    return answer
-
-
-def asked(make: Callable[[IdentClient, argparse.Namespace], dict[str, Any]], ended: Ended = as_it_is) -> Verb:
+def asked(make: Callable[[IdentClient, argparse.Namespace], dict[str, Any]], ended: Ended = in_words) -> Verb:
     """A verb that is a job.
 
     Args:
@@ -240,13 +236,12 @@ def _list(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 
 
 def _show(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    return told(client, client.get(f"/api/v1/jobs/{word_of_address(arguments.job)}"), DONE)
+    return in_words(client, arguments, told(client, client.get(f"/api/v1/jobs/{word_of_address(arguments.job)}"), DONE))
 
 
 def _watch(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    return _followed(
-        client, arguments, client.get(f"/api/v1/jobs/{word_of_address(arguments.job)}"), moves=False, ours=False
-    )
+    job = client.get(f"/api/v1/jobs/{word_of_address(arguments.job)}")
+    return in_words(client, arguments, _followed(client, arguments, job, moves=False, ours=False))
 
 
 def _cancel(client: IdentClient, arguments: argparse.Namespace) -> Answer:

@@ -8,6 +8,7 @@ Boundary: words to requests by id, answers to words; the connection is `remote.p
 from __future__ import annotations
 
 import argparse
+import re
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -48,6 +49,12 @@ def _watch(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
 
 def _recover(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     return {"arm": arguments.arm, "kind": "leave_limit" if arguments.leave_limit else None}
+
+
+def _recovered(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
+    """The commands of the next steps are for the daemon, too."""
+    code, text, document = in_words(client, arguments, answer)
+    return code, re.sub(r"`(ident [^`]+)`", rf"`\1 --server {client.url}`", text), document
 
 
 def _preview(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -133,7 +140,7 @@ def held(
 
 VERBS: dict[str, Verb] = {
     "watch": asked(_watch, in_words),
-    "recover": asked(_recover, in_words),
+    "recover": asked(_recover, _recovered),
     "base": asked(_arm, in_words),
     "preview": asked(_preview, in_words),
     "bus load": asked(_bus_load, in_words),
