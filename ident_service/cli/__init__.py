@@ -54,6 +54,7 @@ from ident_service.errors import (
     ConfigError,
     DiskFull,
     IdentError,
+    ModelError,
     MotionRefused,
     PersonNeeded,
     UsageError,
@@ -130,6 +131,11 @@ def _asked(verb: Callable[[argparse.Namespace], Answer], arguments: argparse.Nam
         cause = error.__context__
         if isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT):
             raise DiskFull(str(error)) from None
+        if isinstance(error, ModelError) and (mistakes := _mistakes(arguments)) is not None:
+            raise mistakes from None
+        motion = getattr(arguments, "motion", None)
+        if isinstance(motion, Path) and motion.is_file() and "motion" in str(error) and str(motion) not in str(error):
+            error.add_note(f"motion: {motion}")
         raise
     except OSError as error:
         if (refused := _refused(arguments, error)) is None:
@@ -142,6 +148,21 @@ def _asked(verb: Callable[[argparse.Namespace], Answer], arguments: argparse.Nam
         from ident_service.service.registry.database import FILE, registry_error
 
         raise registry_error(state_folder(arguments) / FILE, error) from None
+
+
+def _mistakes(arguments: argparse.Namespace) -> ConfigError | None:
+    """Return the mistakes of the description that a model could not be made of, with their places; None without any."""
+    from ident_service.service.description_check import check_description
+
+    if not isinstance(arm := getattr(arguments, "arm", None), str) or arguments.server is not None:
+        return None
+    try:
+        check_description(arm)
+    except ConfigError as error:
+        return error
+    except IdentError:
+        pass
+    return None
 
 
 def _refused(arguments: argparse.Namespace, error: OSError) -> IdentError | None:

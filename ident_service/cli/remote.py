@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.answer import DONE, FAILED, FAULTED, USAGE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
-from ident_service.cli.remote_recordings import file_of, recording
+from ident_service.cli.remote_recordings import file_of, recording, require_known
 from ident_service.cli.remote_words import in_words
 from ident_service.cli.words import Verbs, columns_files, count
 from ident_service.errors import IdentError, UnknownId, UsageError
@@ -367,6 +367,7 @@ def motion_id(client: IdentClient, arm: str, motion: Path | None) -> str | None:
     if motion.is_file():
         content = motion.read_text(encoding="utf-8", errors="replace")
         return str(client.post("/api/v1/motions", {"arm": arm, "motion": content})["id"])
+    require_known(client, "motion", str(motion), motion)
     return str(motion)
 
 

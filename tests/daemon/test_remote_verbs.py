@@ -319,3 +319,29 @@ def test_a_person_elsewhere_reads_what_one_at_the_machine_does(
         assert main([*next(one for one in commands if one[0] == "ack"), "--state", str(state)]) == 0
         assert main(["recover", "quick", *server]) == 0
         assert client.answer(next(client.jobs()).id)["steps"] == ["`ident check quick` for the next motion."]
+
+
+@pytest.mark.slow
+def test_what_is_no_file_here_is_told_so_and_files_of_a_description_are_sent(
+    state: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with daemon_process(state) as (_, client):
+        server = ["--server", client.url, "--state", str(state)]
+        for words in (
+            ["identify", "monday.csv", "--arm", "planar2"],
+            ["identify", "runs/monday.csv", "--arm", "planar2"],
+            ["preview", "planar2", "monday.json"],
+            ["run", "planar2", str(tmp_path / "monday.json"), "--confirm", "planar2"],
+        ):
+            assert main([*words, *server]) == 2
+            assert re.search(r"monday.\w+: no such file here, and the daemon at http", capsys.readouterr().err)
+        body = on_a_bus()
+        (tmp_path / "arm.yaml").write_text(body["description"])
+        (tmp_path / "puck.eds").write_text(body["files"]["puck.eds"])
+        assert main(["config", "check", str(tmp_path / "arm.yaml"), *server]) == 0
+        broken = "format: ident-arm\nversion: 1\nname: broken\nkinematics: {urdf: broken.urdf}\n"
+        (tmp_path / "arm.yaml").write_text(broken)
+        (tmp_path / "broken.urdf").write_text("<robot name='a'><link name='b'/>")
+        capsys.readouterr()
+        assert main(["config", "check", str(tmp_path / "arm.yaml"), *server]) == 2
+        assert "arm.yaml:4:1: kinematics: broken.urdf: not a URDF" in capsys.readouterr().err
