@@ -310,7 +310,10 @@ def _followed(
             elif moves and not cancelled:
                 renew(client, job["id"])
             time.sleep(_LOOK)
-            job = client.get(f"/api/v1/jobs/{job['id']}")
+            job, held = client.get(f"/api/v1/jobs/{job['id']}"), job["held"]
+            if job["held"] and not held:
+                for fault in client.get(f"/api/v1/arms/{job['arm']}/faults"):
+                    tell(arguments, f"fault: {fault['code']}: {fault['cause']}")
             said = (job["progress"] or {}).get("phase", job["state"])
             if said != phase:
                 phase = said

@@ -14,7 +14,7 @@ from urllib.parse import quote, urlencode
 
 from ident_service.client.connection import NOTHING, Connection, error_of
 from ident_service.client.upload import upload
-from ident_service.errors import ArmError, IdentError, MotionRefused, Stopped, Unavailable, UsageError
+from ident_service.errors import ArmError, ArmFault, IdentError, MotionRefused, Stopped, Unavailable, UsageError
 
 _API: Final = "/api/v1"
 _RENEWED: Final = 0.5  # s between renewals of a lease, which lasts four times as long
@@ -36,6 +36,8 @@ class Job:
         run: id of the run, motion or export that it makes or is about.
         detail: why it ended so, in words; empty where there is nothing to say.
         phase: of one that runs.
+        held: whether the motion has stopped and its arm, which has no brakes, is held until a person confirms that it
+            is supported; until then the job runs.
         document: everything that the daemon tells of it (`JobAnswer` in the OpenAPI description).
     """
 
@@ -46,6 +48,7 @@ class Job:
     run: str | None
     detail: str
     phase: str | None
+    held: bool
     document: Mapping[str, Any] = field(repr=False)
 
     @property
@@ -207,7 +210,12 @@ class IdentClient(Connection):
         return ended
 
     def failure(self, ended: Job) -> IdentError:
-        """Return the error that says how a job ended which is not `done`, as the command that did it raised it."""
+        """Return the error that says how a job ended which is not `done`, as the command that did it raised it.
+
+        Of one whose arm is held, it says why the arm was stopped.
+        """
+        if ended.held:
+            return self._held(ended)
         said = self.answer(ended.id).get("error") or {}
         words = f"{ended.detail or ended.state} (job {ended.id})"
         if ended.state == "cancelled":
@@ -216,9 +224,17 @@ class IdentClient(Connection):
             return MotionRefused(words)
         return error_of(str(said.get("kind", "")), words)
 
+    def _held(self, job: Job) -> ArmError:
+        arm = str(job.arm)
+        words = f"the arm is held until a person confirms that it is supported: `ident supported {arm}` (job {job.id})"
+        faults = self.arm(arm).faults()
+        if not faults:  # a stop that was asked for, or no room to write a fault down
+            return Stopped(f"{arm} was stopped; {words}")
+        return ArmFault(faults[0]["code"], f"{faults[0]['cause']}; {words}")
+
     def wait(self, job: str) -> Job:
-        """Wait until a job has ended."""
-        while (seen := self.job(job)).live:
+        """Wait until a job has ended, or its arm is held until a person confirms that it is supported (`held`)."""
+        while (seen := self.job(job)).live and not seen.held:
             time.sleep(_LOOK)
         return seen
 
@@ -250,6 +266,17 @@ class RemoteArm:
         """List the faults that nobody has acknowledged (`FaultAnswer`)."""
         found: list[dict[str, Any]] = self.client.get(f"{self._path}/faults")
         return found
+
+    def supported(self, *, confirm: str) -> None:
+        """Confirm that the arm, which is held after a stop, is supported or home; it is then let down.
+
+        Args:
+            confirm: the arm's name, as a person has typed it who sees it.
+
+        Raises:
+            MotionRefused: the name is not the arm's.
+        """
+        self.client.post(f"{self._path}/supported", {"confirm": confirm})
 
     def acknowledge(self, code: str) -> None:
         """Acknowledge a fault by its name."""
@@ -302,6 +329,9 @@ class RemoteMotion:
     The block raises what kept the motion from its end: `ArmFault` after a fault, `MotionRefused` where nothing moved (a
     preflight that did not pass, for example), `Stopped` after a stop that another one asked for, else the error of the
     command. `ended` is there all the same. An exception of the block's own goes on as it is.
+
+    An arm without brakes that was stopped is held until a person confirms that it is supported. The block does not wait
+    for that, and nothing that becomes of this program lets the arm go: `ended.held` tells of it.
     """
 
     def __init__(self, client: IdentClient, begun: Job) -> None:
@@ -324,8 +354,10 @@ class RemoteMotion:
         return self._ended
 
     def live(self) -> Iterator[LiveSample]:
-        """Yield samples while the run is recorded, until it ends; `uncertainty` has the deviations so far."""
+        """Yield samples of a run until it ends, or its arm is held; `uncertainty` has the deviations so far."""
         for kind, _, value in self.client.stream(f"{_API}/jobs/{self.id}/live"):
+            if kind == "job" and value["job"].get("held"):
+                return
             if kind == "doubt":
                 self.uncertainty = value
             elif kind == "samples":
@@ -365,7 +397,7 @@ class RemoteMotion:
         finally:
             self._leaving.set()
             self._thread.join()
-        own = self._cancelled and self._ended.state == "cancelled"
+        own = self._cancelled and (self._ended.state == "cancelled" or self._ended.held)
         if kind is None and self._ended.state != "done" and not own:
             raise self.client.failure(self._ended)
 
@@ -382,7 +414,9 @@ class RemoteMotion:
 def _job(document: Mapping[str, Any]) -> Job:
     progress = document.get("progress") or {}
     known = {name: document[name] for name in ("id", "kind", "arm", "state", "run", "detail")}
-    return Job(**known, phase=progress.get("phase"), document=MappingProxyType(dict(document)))
+    return Job(
+        **known, phase=progress.get("phase"), held=bool(document.get("held")), document=MappingProxyType(dict(document))
+    )
 
 
 def _listed(what: str, arm: str | None) -> str:

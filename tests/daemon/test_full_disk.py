@@ -9,7 +9,7 @@ import sqlite3
 import subprocess
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
 from pathlib import Path
@@ -17,11 +17,14 @@ from typing import Any
 
 import httpx
 import pytest
-from daemon.conftest import Asked, serving
+from daemon.conftest import Asked, checked_before, patient_text, serving
+from daemon.served import daemon_process
 
 from ident_service.cli import main
+from ident_service.errors import ArmError, ArmFault, UsageError
 from ident_service.motion.control_file import ControlFile
 from ident_service.service.arm_state import control_path
+from ident_service.service.jobs.reach import held_arm
 from ident_service.service.registry import jobs as rows
 from ident_service.service.registry.audit import note, trail
 from ident_service.service.registry.database import FILE, Database
@@ -128,10 +131,10 @@ def test_a_full_disk_has_no_room(
 
 @pytest.fixture
 def small(tmp_path: Path) -> Iterator[Path]:
-    """Mount a disk of a megabyte; full once a file of it is."""
+    """Mount a disk of 16 megabytes."""
     folder = tmp_path / "small"
     folder.mkdir(mode=0o700)
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m,mode=700", "none", str(folder)], check=False)
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=16m,mode=700", "none", str(folder)], check=False)
     if mounted.returncode != 0:
         pytest.skip("a disk can be mounted here by nobody")
     yield folder
@@ -215,3 +218,68 @@ def test_a_stop_that_the_registry_does_not_take_is_entered_later(
     assert len(found) == 1
     assert before <= found[0]["at"] <= after
     assert found[0]["who"].startswith("terminal:")
+
+
+def held_text() -> str:
+    """The arm `quick` without brakes, with motions that outlast a test."""
+    text = patient_text().replace("control: {rate: 250}", "control: {rate: 250, after_stop: hold}")
+    assert "hold" in text
+    return text
+
+
+def wait_for(found: Callable[[], Any]) -> Any:
+    until = time.monotonic() + 60.0
+    while not (value := found()):
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    return value
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_disk_that_fills_while_an_arm_without_brakes_moves_is_told_while_it_is_held(small: Path) -> None:
+    state = small / "state"
+    checked_before(state, held_text())
+    with daemon_process(state) as (_, client):
+        client.add_arm(held_text())
+        filled = list[Path]()
+        with (  # noqa: PT012 - it is raised at the end of the block of the motion
+            pytest.raises(ArmError, match="held until a person confirms that it is supported"),
+            client.arm("quick").run(confirm="quick") as job,
+        ):
+            for _ in job.live():
+                if not filled:
+                    filled.append(fill(small))
+        assert job.ended.held
+        assert client.job(job.id).state == "running"
+        assert held_arm(state, "quick")
+        filled[0].unlink()
+        client.arm("quick").supported(confirm="quick")
+        wait_for(lambda: not client.job(job.id).live)
+        assert client.job(job.id).state == "faulted"
+        assert [fault["code"] for fault in client.arm("quick").faults()] == ["recorder_behind"]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_fault_of_an_arm_that_is_held_is_told_before_it_is_supported(
+    state: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = held_text().replace("driver:\n", "driver:\n  faults: [{kind: late_cycle, at: 100, duration: 1, size: 0.006}]\n", 1)
+    checked_before(state, text)
+    with daemon_process(state) as (_, client):
+        client.add_arm(text)
+        with (
+            pytest.raises(ArmFault, match="held until a person confirms") as caught,
+            client.arm("quick").run(confirm="quick"),
+        ):
+            pass
+        assert [fault["code"] for fault in client.arm("quick").faults()] == [caught.value.code]
+        # It is acknowledged once the arm is let down; before, it would be latched again.
+        with pytest.raises(UsageError, match="ident supported"):
+            client.arm("quick").acknowledge(caught.value.code)
+        job = next(client.jobs())
+        assert main(["supported", "quick", "--confirm", "quick", "--state", str(state)]) == 0
+        wait_for(lambda: not client.job(job.id).live)
+        client.arm("quick").acknowledge(caught.value.code)
+        assert client.arm("quick").faults() == []

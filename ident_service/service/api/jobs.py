@@ -25,6 +25,7 @@ from ident_service.service.api.paging import PAGES, BeforeNumber, Most, Page
 from ident_service.service.jobs.asked import MOVES, ArmName, Asked, Id
 from ident_service.service.jobs.commands import JOBS
 from ident_service.service.jobs.outcome import said
+from ident_service.service.jobs.reach import held_arm
 from ident_service.service.registry import jobs as rows
 from ident_service.service.registry.database import Row
 from ident_service.service.registry.tokens import Access
@@ -213,7 +214,8 @@ def answer_of(service: Service, row: Row) -> JobAnswer:
     shown = {key: value for key, value in row.items() if key in JobAnswer.model_fields}
     shown["detail"] = _named(row["detail"], service, row)
     progress = None if found is None else _named(asdict(found), service, row)
-    return JobAnswer(**{**shown, "progress": progress})
+    held = bool(row["motion"]) and row["state"] == "running" and held_arm(service.state, str(row["arm"]))
+    return JobAnswer(**{**shown, "progress": progress, "held": held})
 
 
 def _named(value: Any, service: Service, row: Row) -> Any:
