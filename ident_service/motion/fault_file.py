@@ -106,11 +106,6 @@ class FaultFile:
             UsageError: no fault of this name is latched, or a file was damaged by somebody; or the arm is still held
                 after it, whereupon it would be latched again.
         """
-        if in_use(self._controls):
-            raise UsageError(
-                f"{self._arm}: a process still has the arm; see it stopped and supported (`ident stop`, `ident "
-                "supported`), then acknowledge"
-            )
         with self._alone():
             return self._acknowledged(code)
 
@@ -119,6 +114,11 @@ class FaultFile:
         if code not in faults:
             known = ", ".join(faults) or "none"
             raise UsageError(f"{self._arm}: no fault {code!r} is latched (latched: {known})")
+        if in_use(self._controls):
+            raise UsageError(
+                f"{self._arm}: a process still has the arm; see it stopped and supported (`ident stop`, `ident "
+                "supported`), then acknowledge"
+            )
         self._write(tuple(row for row in self._rows() if row.code != code))
         if code == UNFINISHED:
             self.ended()
@@ -136,6 +136,7 @@ class FaultFile:
             fcntl.flock(fd, fcntl.LOCK_EX)
             yield
         finally:
+            fcntl.flock(fd, fcntl.LOCK_UN)  # a process that is being started has the open folder, too
             os.close(fd)
 
     def _remembered(self, *, moving: bool) -> tuple[Remembered, ...]:
