@@ -265,7 +265,8 @@ def test_a_disk_that_fills_while_an_arm_without_brakes_moves_is_told_while_it_is
 def test_a_fault_of_an_arm_that_is_held_is_told_before_it_is_supported(
     state: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    text = held_text().replace("driver:\n", "driver:\n  faults: [{kind: late_cycle, at: 100, duration: 1, size: 0.006}]\n", 1)
+    late = "driver:\n  faults: [{kind: late_cycle, at: 100, duration: 1, size: 0.006}]\n"
+    text = held_text().replace("driver:\n", late, 1)
     checked_before(state, text)
     with daemon_process(state) as (_, client):
         client.add_arm(text)
