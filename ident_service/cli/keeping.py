@@ -77,7 +77,7 @@ def note_act(arguments: argparse.Namespace, what: str, about: str, **detail: Any
         except (IdentError, OSError) as refusal:
             print_to_person(f"ident: done, but not entered in the audit trail: {error}; {refusal}\n")
         else:
-            print_to_person(f"ident: done; its line in the audit trail follows, for now: {error}\n")
+            print_to_person(f"ident: done, but not entered in the audit trail yet; its line follows: {error}\n")
 
 
 def add(verbs: Verbs) -> None:
