@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.answer import DONE, FAILED, FAULTED, USAGE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
 from ident_service.cli.remote_recordings import file_of, recording, require_known
+from ident_service.cli.remote_recordings import word_of_address as word_of_address
 from ident_service.cli.remote_words import in_words
 from ident_service.cli.words import Verbs, columns_files, count
 from ident_service.errors import IdentError, UnknownId, UsageError
@@ -372,13 +373,6 @@ def motion_id(client: IdentClient, arm: str, motion: Path | None) -> str | None:
         return str(client.post("/api/v1/motions", {"arm": arm, "motion": content})["id"])
     require_known(client, "motion", str(motion), motion)
     return str(motion)
-
-
-def word_of_address(word: str) -> str:
-    """A word that may stand in an address."""
-    if not word or any(letter in word for letter in "/?#% \\") or not word.isprintable() or word.startswith("."):
-        raise UsageError(f"{word!r}: with --server, arms, runs and jobs are named by id, not by path")
-    return word
 
 
 def _client(arguments: argparse.Namespace) -> IdentClient:

@@ -64,6 +64,13 @@ def require_known(client: IdentClient, kind: str, named: str, path: Path) -> Non
         raise UnknownId(f"{path}: no such file here, and the daemon at {client.url} has no {kind} {named!r}")
 
 
+def word_of_address(word: str) -> str:
+    """A word that may stand in an address."""
+    if not word or any(letter in word for letter in "/?#% \\") or not word.isprintable() or word.startswith("."):
+        raise UsageError(f"{word!r}: with --server, arms, runs and jobs are named by id, not by path")
+    return word
+
+
 def file_of(path: Path) -> Path:
     """Return what `FILE@START:END` names without the range, unless a file is called that."""
     from ident_service.record.files import split_range

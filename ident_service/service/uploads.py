@@ -16,23 +16,20 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import gzip
 import hashlib
 import json
 import os
 import re
 import shutil
-import tempfile
 import time
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Final, Self
+from typing import Final, Self
 
-from ident_service.errors import AlreadyThere, ConfigError, Problem, RecordingError, UnknownId, UsageError
+from ident_service.errors import AlreadyThere, RecordingError, UnknownId, UsageError
 from ident_service.results.files import appearing_folder, write_atomically
 from ident_service.results.manifest import named_files, write_manifest
 from ident_service.service.deletion import forget_run
@@ -41,10 +38,7 @@ from ident_service.service.registry.audit import note
 from ident_service.service.registry.database import Database
 from ident_service.service.registry.motions import new_id
 from ident_service.service.registry.runs import COLUMNS, RUNS, UPLOAD, index_run
-
-if TYPE_CHECKING:
-    from ident_service.config.recording import RecordingFormat
-    from ident_service.config.schema import ArmConfig
+from ident_service.service.upload_columns import LONGEST_HEADER, first_line, format_of
 
 UPLOADS: Final = ".uploads"  # hidden: backups leave out what is half there
 MOST_BYTES: Final = 4 * 2**30  # of a recording
@@ -54,7 +48,6 @@ KEPT_FREE: Final = 2**30  # bytes of the disk that a motion's own recording may 
 HALF_SECONDS: Final = 24 * 3600.0  # after its last piece
 _DATA, _ARM = "data", "arm.json"
 _JUDGED = "judged"  # is there once the header has been found good
-_LONGEST_HEADER = 2**20  # bytes
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,119}")
 _DOCUMENTS = (".json", ".yaml", ".partial")  # endings of what else may stand in the folder of a run
 
@@ -132,7 +125,7 @@ def begin_upload(db: Database, state: Path, announced: Announced) -> Upload:
         return Upload(announced.id, announced, announced.bytes, run)
     folder = state / UPLOADS / announced.id
     if announced.columns:
-        _format(announced, arm.config)
+        format_of(announced.columns, announced.name, arm.config)
     # Without data, a disk was full when it was completed.
     if not all((folder / name).is_file() for name in (UPLOAD, _DATA)):
         others = uploads(state)
@@ -146,28 +139,6 @@ def begin_upload(db: Database, state: Path, announced: Announced) -> Upload:
             (folder / _DATA).touch(0o600)
             write_atomically(folder / UPLOAD, json.dumps(asdict(announced)))
     return known_upload(state, announced.id)
-
-
-def _format(announced: Announced, config: ArmConfig) -> RecordingFormat:
-    """Read the columns file of a recording as an identification will.
-
-    Raises:
-        ConfigError, UsageError: as `recordings.own_formats`, without the place where it was read.
-    """
-    from ident_service.model.arm_model import arm_model
-    from ident_service.service.recordings import own_formats
-
-    with tempfile.TemporaryDirectory(prefix="ident-columns.") as place:
-        file, recording = Path(place) / COLUMNS, Path(announced.name)
-        file.write_text(announced.columns, encoding="utf-8", errors="replace")
-        try:
-            return own_formats({recording: file}, [recording], arm_model(config))[recording]
-        except ConfigError as error:
-            raise ConfigError(
-                [Problem(Path(COLUMNS), one.line, one.column, one.message) for one in error.problems]
-            ) from None
-        except UsageError as error:
-            raise UsageError(str(error).replace(f"{place}/", "")) from None
 
 
 def require_header(db: Database, state: Path, upload: str) -> None:
@@ -189,26 +160,14 @@ def require_header(db: Database, state: Path, upload: str) -> None:
     if not announced.columns or (folder / _JUDGED).exists() or ".csv" not in announced.name.lower():
         return
     with _known(upload):
-        line = _first_line(folder / _DATA, packed=announced.name.endswith(".gz"))
-    if not line.endswith(b"\n") and len(line) < _LONGEST_HEADER and seen.received < announced.bytes:
+        line = first_line(folder / _DATA, packed=announced.name.endswith(".gz"))
+    if not line.endswith(b"\n") and len(line) < LONGEST_HEADER and seen.received < announced.bytes:
         return  # it has not all arrived
-    form = _format(announced, known_arm(db, state, announced.arm).config)
+    form = format_of(announced.columns, announced.name, known_arm(db, state, announced.arm).config)
     with _deleted_if_wrong(folder):
         parse_header(Path(announced.name), line.decode("utf-8-sig", "replace").rstrip("\r\n"), form.columns)
     with _known(upload):
         (folder / _JUDGED).touch(0o600)
-
-
-def _first_line(path: Path, *, packed: bool) -> bytes:
-    """Return the first line as far as it is there, and as a reader takes it."""
-    with path.open("rb") as stream:
-        if not packed:
-            return stream.readline(_LONGEST_HEADER)
-        try:
-            with gzip.open(stream) as unpacked:
-                return unpacked.readline(_LONGEST_HEADER)
-        except (EOFError, OSError, zlib.error):
-            return b""
 
 
 def known_upload(state: Path, upload: str) -> Upload:
