@@ -6,7 +6,9 @@
     ├── UsageError (ValueError)        a command or call that cannot be meant: missing file, contradictory options
     │   ├── UnknownId (LookupError)    an id that the registry does not have
     │   ├── AlreadyThere               a name that is taken, where replacing it was not asked for
-    │   └── InUse                      something that cannot be deleted, because other things refer to it
+    │   ├── InUse                      something that cannot be deleted, because other things refer to it
+    │   ├── InvalidRequest             a request that the API of a daemon does not take as it is
+    │   └── AccessRefused              a daemon does not know who asks, or they may not do this
     ├── ConfigError (ValueError)       an arm description with mistakes, all of them, each with file:line:column
     ├── ModelError (ValueError)        a mechanism or array shape that the model cannot represent
     ├── RecordingError (ValueError)    a recording that cannot be used: wrong joints, NaN, too short, torn row
@@ -14,10 +16,14 @@
     ├── SolverError (RuntimeError)     the conic solver stopped anywhere but at an optimum
     ├── MotionRefused (ValueError)     a motion that would leave the arm's limits, refused before anything moves
     │   └── PersonNeeded               a re-identification that judged nothing: somebody must look at the arm first
+    ├── Unavailable (RuntimeError)     this machine, or a daemon, cannot do it now; asked again later, it may
+    │   ├── RegistryBusy               another process keeps the registry of the state folder
+    │   └── DiskFull (OSError)         the disk of the state folder has no room
     └── ArmError (RuntimeError)        something below the motion loop
         ├── DriverError (OSError)      the arm cannot be opened, enabled or reached
         │   ├── AnotherDrive           a drive answers that the description does not name
         │   └── PositionUnknown        its encoders lost their zero: a person must say where the arm stands
+        ├── Stopped                    a motion did not come to its end, because somebody asked for a stop
         └── ArmFault                   the guard or a drive stopped a motion; carries code and last samples
 
 Each leaf also is the builtin it resembles, so that callers who do not know this package can catch it.
@@ -77,6 +83,14 @@ class InUse(UsageError):
         super().__init__(message)
 
 
+class InvalidRequest(UsageError):
+    """A daemon's API does not take a request as it is: an unknown field, a value out of bounds, too many bytes."""
+
+
+class AccessRefused(UsageError):
+    """A daemon does not know who asks (no token that counts), or does not let them do this (their role)."""
+
+
 @dataclass(frozen=True)
 class Problem:
     """One mistake in a configuration file, with the place to mend it (lines and columns count from 1)."""
@@ -131,6 +145,18 @@ class PersonNeeded(MotionRefused):
     """A re-identification was refused by preflight or by the arm, so nothing is known about a change of the arm."""
 
 
+class Unavailable(IdentError, RuntimeError):
+    """Something cannot be done now, for want of what may be there again later; nothing has been changed."""
+
+
+class RegistryBusy(Unavailable):
+    """Another process keeps the registry of the state folder: a backup, a database browser, another command."""
+
+
+class DiskFull(Unavailable, OSError):
+    """The disk of the state folder has no room."""
+
+
 class ArmError(IdentError, RuntimeError):
     """Something below the motion loop failed."""
 
@@ -145,6 +171,10 @@ class AnotherDrive(DriverError):
 
 class PositionUnknown(DriverError):
     """Drives do not know where the arm stands; a person leads it home by hand and says so (`Arm.zero`)."""
+
+
+class Stopped(ArmError):
+    """A motion did not come to its end: somebody asked for a stop, or nobody renewed its lease."""
 
 
 class ArmFault(ArmError):

@@ -46,9 +46,19 @@ from ident_service.cli.answer import (
     print_answer,
     print_error,
     print_to_person,
+    state_folder,
 )
 from ident_service.cli.words import Parser, Verbs, WrongWords, asks_for_json
-from ident_service.errors import ArmFault, ConfigError, IdentError, MotionRefused, PersonNeeded, UsageError
+from ident_service.errors import (
+    ArmFault,
+    ConfigError,
+    DiskFull,
+    IdentError,
+    ModelError,
+    MotionRefused,
+    PersonNeeded,
+    UsageError,
+)
 
 __all__ = ["DONE", "FAILED", "FAULTED", "PERSON_NEEDED", "USAGE", "VERDICT_NO", "main"]
 
@@ -114,13 +124,60 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _asked(verb: Callable[[argparse.Namespace], Answer], arguments: argparse.Namespace) -> Answer:
-    """What a verb answers; a name that no file can have is a wrong word, wherever it is noticed."""
+    """What a verb answers; what the machine refuses is no defect of ours, wherever it is noticed."""
     try:
         return verb(arguments)
+    except IdentError as error:  # some of which are errors of the system, too
+        cause = error.__context__
+        if isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise DiskFull(str(error)) from None
+        if isinstance(error, ModelError) and (mistakes := _mistakes(arguments)) is not None:
+            raise mistakes from None
+        motion = getattr(arguments, "motion", None)
+        if isinstance(motion, Path) and motion.is_file() and "motion" in str(error) and str(motion) not in str(error):
+            error.add_note(f"motion: {motion}")
+        raise
     except OSError as error:
-        if error.errno != errno.ENAMETOOLONG:
+        if (refused := _refused(arguments, error)) is None:
             raise
-        raise UsageError(f"{str(error.filename)[:40]}...: this name is too long for a file") from None
+        raise refused from None
+    except Exception as error:
+        # Named so, for the verbs that need no registry load no SQLite.
+        if type(error).__module__ != "sqlite3":
+            raise
+        from ident_service.service.registry.database import FILE, registry_error
+
+        raise registry_error(state_folder(arguments) / FILE, error) from None
+
+
+def _mistakes(arguments: argparse.Namespace) -> ConfigError | None:
+    """Return the mistakes of the description that a model could not be made of, with their places; None without any."""
+    from ident_service.service.description_check import check_description
+
+    if not isinstance(arm := getattr(arguments, "arm", None), str) or arguments.server is not None:
+        return None
+    try:
+        check_description(arm)
+    except ConfigError as error:
+        return error
+    except IdentError:
+        pass
+    return None
+
+
+def _refused(arguments: argparse.Namespace, error: OSError) -> IdentError | None:
+    """Return what it means to a person that the operating system refused; None where it can only be our mistake."""
+    place = str(error.filename) if error.filename is not None else "the disk"
+    if error.errno == errno.ENAMETOOLONG:
+        return UsageError(f"{place[:40]}...: this name is too long for a file")
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return DiskFull(f"{place}: cannot be written: {error.strerror}; make room, then ask again")
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        from ident_service.service.state_folder import shut_out
+
+        hint = shut_out(state_folder(arguments))
+        return UsageError(f"{place}: {error.strerror}" + (f"; {hint}" if hint else ""))
+    return None
 
 
 def parser() -> Parser:

@@ -258,17 +258,34 @@ def _rehearse(arguments: argparse.Namespace) -> Answer:
 
 def _stop(arguments: argparse.Namespace) -> Answer:
     """Stop an arm, or all; what is told and entered of it comes after."""
+    from ident_service.service.state_folder import shut_out
+
+    os.umask(0o077)  # and no more: a stop is not refused for a folder that others can enter, or that is another's
+    try:
+        return _stopped(arguments, state_folder(arguments))
+    except (UsageError, PermissionError):
+        if (refusal := shut_out(state_folder(arguments))) is None:
+            raise
+        raise UsageError(f"nothing was stopped: {refusal}; or stop by its daemon: ident stop --server URL") from None
+
+
+def _stopped(arguments: argparse.Namespace, state: Path) -> Answer:
     from ident_service.motion.control_file import ControlFile
+    from ident_service.service.arm_state import control_path, known_arms
     from ident_service.service.jobs.reach import stop_arms
+    from ident_service.service.state_folder import leave_to_owner
 
     if arguments.arm is None:
-        reached = stop_arms(state_folder(arguments), None)
+        reached = stop_arms(state, None)
+        for name in known_arms(state):  # a file was made where there was none
+            leave_to_owner(state, control_path(state, name))
         note_act(arguments, "stop", "all arms", reached=reached)
         text = f"stop asked of {', '.join(reached)}" if reached else "nobody moves an arm"
         text += "; no motion will begin that was asked for before now\n"
         return DONE, text, {"arms": reached, "asked": "stop"}
     name, path = _control(arguments)
     pid = ControlFile.stop_all(path)
+    leave_to_owner(state, path)
     note_act(arguments, "stop", name, reached=[] if pid is None else [name])
     text = f"{name}: stop asked of process {pid}" if pid is not None else f"nobody moves {name}"
     text += "" if pid is not None else "; no motion will begin that was asked for before now"
@@ -278,6 +295,7 @@ def _stop(arguments: argparse.Namespace) -> Answer:
 def _ask(arguments: argparse.Namespace) -> Answer:
     from ident_service.motion.control_file import ControlFile, in_use
 
+    os.umask(0o077)
     name, path = _control(arguments)
     if arguments.asks == "supported":
         held = in_use(path)
@@ -338,18 +356,26 @@ def _ack(arguments: argparse.Namespace) -> Answer:
 def _control(arguments: argparse.Namespace) -> tuple[str, Path]:
     from ident_service.service.arm_state import control_path
 
-    os.umask(0o077)  # and no more: a stop is not refused for a folder that others can enter
     name = _name(arguments)
     return name, control_path(state_folder(arguments), name)
 
 
 def _name(arguments: argparse.Namespace) -> str:
-    """Of an arm: the word itself where the state folder remembers such an arm, whose description may be a daemon's."""
+    """Of an arm: the word itself where the state folder remembers such an arm, whose description may be a daemon's.
+
+    Raises:
+        UsageError: there is none, among those of the state folder or elsewhere; both are listed.
+        ConfigError: its description has mistakes.
+    """
     from ident_service.config.load import load_arm
-    from ident_service.service.arm_state import arm_folder
+    from ident_service.service.arm_state import arm_folder, known_arms
 
     word = str(arguments.arm)
     state = state_folder(arguments)
     if _PLAIN.fullmatch(word) and not Path(word).is_file() and arm_folder(state, word).is_dir():
         return word
-    return load_arm(word).name
+    try:
+        return load_arm(word).name
+    except UsageError as error:
+        known = ", ".join(known_arms(state)) or "none"
+        raise UsageError(f"{error}; arms that {state} remembers: {known}") from None

@@ -16,7 +16,7 @@ from typing import Any
 
 from ident_service.cli.answer import DONE, Answer, own_state_folder, print_to_person, state_folder
 from ident_service.cli.words import Parser, Verbs, count
-from ident_service.errors import UsageError
+from ident_service.errors import IdentError, UsageError
 
 _LONGEST_NAME = 80
 _PATIENCE = 1.0  # s that an act, which is done, waits for its line in the audit trail
@@ -48,7 +48,7 @@ def at_terminal(arguments: argparse.Namespace) -> str:
 def note_act(arguments: argparse.Namespace, what: str, about: str, **detail: Any) -> None:
     """Enter what was done at a terminal in the audit trail, where the state folder has one.
 
-    It has been done already: a registry that is kept or full is told of, and changes nothing.
+    It has been done already: a registry that is kept or full changes nothing, and the line is entered later.
 
     Args:
         arguments: of the verb.
@@ -58,17 +58,26 @@ def note_act(arguments: argparse.Namespace, what: str, about: str, **detail: Any
     """
     import sqlite3
 
-    from ident_service.service.registry.audit import note
-    from ident_service.service.registry.database import FILE, Database
+    from ident_service.service.registry.audit import enter_waiting, note, note_later
+    from ident_service.service.registry.database import FILE, Database, registry_error
 
     state = state_folder(arguments)
-    if not (state / FILE).is_file():
-        return
     try:
-        with Database(state, busy=_PATIENCE) as db:
-            note(db, at_terminal(arguments), what, about, **detail)
-    except (UsageError, sqlite3.Error) as error:
-        print_to_person(f"ident: done, but not entered in the audit trail: {error}\n")
+        if not (state / FILE).is_file():
+            return
+        try:
+            with Database(state, busy=_PATIENCE) as db:
+                enter_waiting(db, state)
+                note(db, at_terminal(arguments), what, about, **detail)
+        except sqlite3.Error as error:
+            raise registry_error(state / FILE, error) from None
+    except (IdentError, OSError) as error:
+        try:
+            note_later(state, at_terminal(arguments), what, about, **detail)
+        except (IdentError, OSError) as refusal:
+            print_to_person(f"ident: done, but not entered in the audit trail: {error}; {refusal}\n")
+        else:
+            print_to_person(f"ident: done, but not entered in the audit trail yet; its line follows: {error}\n")
 
 
 def add(verbs: Verbs) -> None:
@@ -199,7 +208,10 @@ def _restore(arguments: argparse.Namespace) -> Answer:
     when = datetime.fromtimestamp(done.created, UTC).strftime("%Y-%m-%d %H:%M UTC")
     text = f"{state}: as of {when}, {done.files} files, {done.bytes / 2**20:.1f} MiB\n"
     text += "" if done.replaced is None else f"what stood there before: {done.replaced}\n"
-    text += "tokens that were revoked since then count again (ident token list); each arm needs a new preflight\n"
+    text += (
+        "tokens that were revoked since then count again (ident token list), the owner's does not: the daemon writes "
+    )
+    text += "a new one; each arm needs a new preflight\n"
     return DONE, text, {**asdict(done), "state": str(state)}
 
 

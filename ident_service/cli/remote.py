@@ -15,7 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.answer import DONE, FAILED, FAULTED, USAGE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
-from ident_service.cli.remote_recordings import file_of, recording
+from ident_service.cli.remote_recordings import file_of, recording, require_known
+from ident_service.cli.remote_recordings import word_of_address as word_of_address
+from ident_service.cli.remote_words import in_words
 from ident_service.cli.words import Verbs, columns_files, count
 from ident_service.errors import IdentError, UnknownId, UsageError
 
@@ -85,12 +87,7 @@ def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
     return connected
 
 
-def as_it_is(_: IdentClient, __: argparse.Namespace, answer: Answer) -> Answer:
-    """What most verbs do with the answer of their job."""
-    return answer
-
-
-def asked(make: Callable[[IdentClient, argparse.Namespace], dict[str, Any]], ended: Ended = as_it_is) -> Verb:
+def asked(make: Callable[[IdentClient, argparse.Namespace], dict[str, Any]], ended: Ended = in_words) -> Verb:
     """A verb that is a job.
 
     Args:
@@ -240,13 +237,12 @@ def _list(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 
 
 def _show(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    return told(client, client.get(f"/api/v1/jobs/{word_of_address(arguments.job)}"), DONE)
+    return in_words(client, arguments, told(client, client.get(f"/api/v1/jobs/{word_of_address(arguments.job)}"), DONE))
 
 
 def _watch(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    return _followed(
-        client, arguments, client.get(f"/api/v1/jobs/{word_of_address(arguments.job)}"), moves=False, ours=False
-    )
+    job = client.get(f"/api/v1/jobs/{word_of_address(arguments.job)}")
+    return in_words(client, arguments, _followed(client, arguments, job, moves=False, ours=False))
 
 
 def _cancel(client: IdentClient, arguments: argparse.Namespace) -> Answer:
@@ -315,7 +311,10 @@ def _followed(
             elif moves and not cancelled:
                 renew(client, job["id"])
             time.sleep(_LOOK)
-            job = client.get(f"/api/v1/jobs/{job['id']}")
+            job, held = client.get(f"/api/v1/jobs/{job['id']}"), job["held"]
+            if job["held"] and not held:
+                for fault in client.get(f"/api/v1/arms/{job['arm']}/faults"):
+                    tell(arguments, f"fault: {fault['code']}: {fault['cause']}")
             said = (job["progress"] or {}).get("phase", job["state"])
             if said != phase:
                 phase = said
@@ -372,25 +371,27 @@ def motion_id(client: IdentClient, arm: str, motion: Path | None) -> str | None:
     if motion.is_file():
         content = motion.read_text(encoding="utf-8", errors="replace")
         return str(client.post("/api/v1/motions", {"arm": arm, "motion": content})["id"])
+    require_known(client, "motion", str(motion), motion)
     return str(motion)
-
-
-def word_of_address(word: str) -> str:
-    """A word that may stand in an address."""
-    if not word or any(letter in word for letter in "/?#% \\") or not word.isprintable() or word.startswith("."):
-        raise UsageError(f"{word!r}: with --server, arms, runs and jobs are named by id, not by path")
-    return word
 
 
 def _client(arguments: argparse.Namespace) -> IdentClient:
     from ident_service.client import IdentClient
     from ident_service.service.registry.tokens import TOKEN_FILE, read_token
+    from ident_service.service.state_folder import shut_out
 
     state, url = state_folder(arguments), arguments.server
     if url is None:
         try:
             url = (state / "serve.url").read_text(encoding="ascii").strip()
         except OSError:
+            if (refusal := shut_out(state)) is not None:
+                raise UsageError(refusal) from None
             raise UsageError(f"no daemon serves {state}; start one with `ident serve`, or give --server URL") from None
-    token = os.environ.get("IDENT_TOKEN") or read_token(state / TOKEN_FILE)
+    token = os.environ.get("IDENT_TOKEN")
+    try:
+        token = token or read_token(state / TOKEN_FILE)
+    except UsageError:
+        if arguments.word != "stop":  # which a daemon of this machine does for anybody
+            raise
     return IdentClient(url, token)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.answer import tell
-from ident_service.errors import UsageError
+from ident_service.errors import UnknownId, UsageError
 
 if TYPE_CHECKING:
     from ident_service.client import IdentClient
@@ -37,7 +38,37 @@ def recording(
         text = "" if columns is None else _text(columns)
         return {**client.upload(arm, file, columns=text, tell=_percent(arguments, file)), **bounded}
     run, _, name = str(file).partition("/")
+    require_known(client, "run", run, path)
     return {"run": run, **({"name": name} if name else {}), **bounded}
+
+
+def require_known(client: IdentClient, kind: str, named: str, path: Path) -> None:
+    """Refuse what is neither a file here nor something that the daemon knows.
+
+    Args:
+        client: of the daemon.
+        kind: `run` or `motion`.
+        named: its id, if it is one.
+        path: as it was given.
+
+    Raises:
+        UnknownId: it is neither.
+    """
+    plain = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,119}", named) is not None
+    try:
+        if plain:
+            client.get(f"/api/v1/{kind}s/{named}")
+    except UnknownId:
+        plain = False
+    if not plain:
+        raise UnknownId(f"{path}: no such file here, and the daemon at {client.url} has no {kind} {named!r}")
+
+
+def word_of_address(word: str) -> str:
+    """A word that may stand in an address."""
+    if not word or any(letter in word for letter in "/?#% \\") or not word.isprintable() or word.startswith("."):
+        raise UsageError(f"{word!r}: with --server, arms, runs and jobs are named by id, not by path")
+    return word
 
 
 def file_of(path: Path) -> Path:

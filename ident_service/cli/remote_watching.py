@@ -8,9 +8,10 @@ Boundary: words to requests by id, answers to words; the connection is `remote.p
 from __future__ import annotations
 
 import argparse
+import re
 import time
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 _API = "/api/v1"
 _RENEW = 0.05  # s between looks at the key, each of which renews the lease; a rehearsal's lasts 0.25 s
 _LOOK = 0.4  # s between looks at the job
+_MOST_FILE = 8 * 2**20  # bytes of all files that a daemon takes
 
 
 def _arm(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -48,6 +50,12 @@ def _watch(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
 
 def _recover(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     return {"arm": arguments.arm, "kind": "leave_limit" if arguments.leave_limit else None}
+
+
+def _recovered(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
+    """The commands of the next steps are for the daemon, too."""
+    code, text, document = in_words(client, arguments, answer)
+    return code, re.sub(r"`(ident [^`]+)`", rf"`\1 --server {client.url}`", text), document
 
 
 def _preview(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -70,6 +78,40 @@ def _known(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     return {"kind": "config_check", "arm": word_of_address(arguments.file)}
 
 
+def named_files(path: Path) -> dict[str, str]:
+    """Read the files beside a description that it names by plain names, and those that they name if they are YAML.
+
+    Args:
+        path: of the description.
+
+    Returns:
+        Name to content; what cannot be read as text is left out, and the daemon says that it is not there.
+    """
+    from ident_service.config.source import read_alone
+
+    found: dict[str, str] = {}
+    waiting = [path]
+    while waiting:
+        for word in _words(read_alone(waiting.pop()).value):
+            beside = path.parent / word
+            if word in found or word == path.name or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,119}", word):
+                continue
+            with suppress(OSError, UnicodeDecodeError):
+                if beside.is_file() and beside.stat().st_size <= _MOST_FILE:
+                    found[word] = beside.read_text(encoding="utf-8")
+                    waiting += [beside] if beside.suffix in (".yaml", ".yml") else []
+    return found
+
+
+def _words(value: Any) -> Iterator[str]:
+    """Yield every text among JSON values."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | list):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from _words(part)
+
+
 def _config_check(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     """A file is sent and judged there; any other word is the name of an arm that the daemon knows."""
     path = Path(arguments.file)
@@ -79,7 +121,7 @@ def _config_check(client: IdentClient, arguments: argparse.Namespace) -> Answer:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"{path}: cannot be read as text: {error}") from None
-    found = client.post(f"{_API}/descriptions/check", {"description": text})
+    found = client.post(f"{_API}/descriptions/check", {"description": text, "files": named_files(path)})
     return VERDICT_NO if found["stable"] is False else DONE, found["text"], found
 
 
@@ -133,7 +175,7 @@ def held(
 
 VERBS: dict[str, Verb] = {
     "watch": asked(_watch, in_words),
-    "recover": asked(_recover, in_words),
+    "recover": asked(_recover, _recovered),
     "base": asked(_arm, in_words),
     "preview": asked(_preview, in_words),
     "bus load": asked(_bus_load, in_words),

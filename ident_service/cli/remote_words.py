@@ -6,10 +6,12 @@ Boundary: JSON values to lines.
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.answer import Answer
+from ident_service.errors import IdentError
 
 if TYPE_CHECKING:
     from ident_service.client import IdentClient
@@ -21,7 +23,21 @@ def in_words(_: IdentClient, __: argparse.Namespace, answer: Answer) -> Answer:
     """The answer with what its command said, where a person looks for it."""
     code, text, document = answer
     said = {key: value for key, value in document["answer"].items() if key not in _OURS}
+    text += _ticket(said.pop("ticket", None))
     return code, text + "".join(f"{line}\n" for line in lines_of(said)), document
+
+
+def _ticket(values: Any) -> str:
+    """The table of a preflight, as the command at the arm prints it; nothing where there is none that can be read."""
+    if not isinstance(values, dict):
+        return ""
+    from ident_service.motion.preflight.ticket import ticket_from_json
+    from ident_service.service.preflight import ticket_text
+
+    try:
+        return "\n" + ticket_text(ticket_from_json(json.dumps(values)))
+    except IdentError:  # another version's
+        return "".join(f"{line}\n" for line in lines_of(values))
 
 
 def lines_of(value: Any, indent: str = "") -> Iterator[str]:

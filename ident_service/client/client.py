@@ -6,86 +6,20 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Any, Final, Self
 from urllib.parse import quote, urlencode
 
-from ident_service.client.connection import NOTHING, Connection, job_error
+from ident_service.client.connection import NOTHING, Connection, error_of
 from ident_service.client.upload import upload
-from ident_service.errors import ArmError, IdentError, MotionRefused, UsageError
+from ident_service.client.values import Event, Job, LiveSample
+from ident_service.errors import ArmError, ArmFault, IdentError, MotionRefused, Stopped, Unavailable, UsageError
 
 _API: Final = "/api/v1"
 _RENEWED: Final = 0.5  # s between renewals of a lease, which lasts four times as long
 _LOOK = 0.3  # s between looks at a job
 _AGAIN, _TRIES = 1.0, 30  # s between tries to take up a stream, and how many
-_LIVE: Final = ("queued", "running")
-
-
-@dataclass(frozen=True)
-class Job:
-    """A job as it stood when it was asked for.
-
-    Attributes:
-        id: which names it.
-        kind: `run`, `identify` and so on.
-        arm: its arm's name, if it is about one.
-        state: `queued`, `running`, and after its end `done`, `refused`, `failed`, `faulted`, `cancelled` or
-            `interrupted`.
-        run: id of the run, motion or export that it makes or is about.
-        detail: why it ended so, in words; empty where there is nothing to say.
-        phase: of one that runs.
-        document: everything that the daemon tells of it (`JobAnswer` in the OpenAPI description).
-    """
-
-    id: str
-    kind: str
-    arm: str | None
-    state: str
-    run: str | None
-    detail: str
-    phase: str | None
-    document: Mapping[str, Any] = field(repr=False)
-
-    @property
-    def live(self) -> bool:
-        """Tell if the job has not ended."""
-        return self.state in _LIVE
-
-
-@dataclass(frozen=True)
-class LiveSample:
-    """A moment of a run while it is recorded; the daemon sends one every 20 ms.
-
-    Attributes:
-        time: since the first sample [s].
-        joints: names, in the order of the values.
-        position: measured [rad or m]; None for a value that was not valid.
-        torque: commanded [N m or N].
-        following_error: the largest of those 20 ms [rad or m].
-    """
-
-    time: float
-    joints: tuple[str, ...]
-    position: tuple[float | None, ...]
-    torque: tuple[float | None, ...]
-    following_error: tuple[float | None, ...]
-
-
-@dataclass(frozen=True)
-class Event:
-    """Something that a daemon tells of its arms and jobs.
-
-    Attributes:
-        kind: `happened` (a line of the audit trail), `job` or `arm` (how one stands), `samples` or `doubt` of a run.
-        number: of what has happened, to go on after it; None for all else.
-        value: `AuditLine`, `JobAnswer`, or as the OpenAPI description says of the stream.
-    """
-
-    kind: str
-    number: int | None
-    value: Mapping[str, Any]
 
 
 class IdentClient(Connection):
@@ -109,7 +43,8 @@ class IdentClient(Connection):
 
         Raises:
             AlreadyThere: another arm has its name.
-            UsageError: its mistakes, each with line and column.
+            ConfigError: its mistakes, each with line and column.
+            UsageError: the files have no plain names, or are too many or too large.
         """
         body = {"description": description, "files": dict(files), "replace": replace}
         return self.arm(str(self.post(f"{_API}/arms", body)["name"]))
@@ -133,8 +68,8 @@ class IdentClient(Connection):
             samples: whether to tell samples and deviations of runs that are recorded.
 
         Raises:
-            UsageError: the token does not count.
-            ArmError: the daemon cannot be reached for a while.
+            AccessRefused: the token does not count.
+            ArmError, Unavailable: the daemon cannot be reached for a while, or is too busy.
         """
         failed = 0
         while True:
@@ -146,7 +81,7 @@ class IdentClient(Connection):
                     failed, after = 0, after if number is None else number
                     if kind:
                         yield Event(kind, number, MappingProxyType(value))
-            except ArmError:
+            except (ArmError, Unavailable):
                 failed += 1
                 if failed == _TRIES:
                     raise
@@ -202,13 +137,35 @@ class IdentClient(Connection):
         """
         ended = self.wait(self.begin(kind, key=key, **asked).id)
         if ended.state not in ("done", "refused"):
-            said = self.answer(ended.id).get("error") or {}
-            raise job_error(str(said.get("kind", "")), f"{ended.detail or ended.state} (job {ended.id})")
+            raise self.failure(ended)
         return ended
 
+    def failure(self, ended: Job) -> IdentError:
+        """Return the error that says how a job ended which is not `done`, as the command that did it raised it.
+
+        Of one whose arm is held, it says why the arm was stopped.
+        """
+        if ended.held:
+            return self._held(ended)
+        said = self.answer(ended.id).get("error") or {}
+        words = f"{ended.detail or ended.state} (job {ended.id})"
+        if ended.state == "cancelled":
+            return Stopped(words)
+        if ended.state == "refused" and not said:
+            return MotionRefused(words)
+        return error_of(str(said.get("kind", "")), words)
+
+    def _held(self, job: Job) -> ArmError:
+        arm = str(job.arm)
+        words = f"the arm is held until a person confirms that it is supported: `ident supported {arm}` (job {job.id})"
+        faults = self.arm(arm).faults()
+        if not faults:  # a stop that was asked for, or no room to write a fault down
+            return Stopped(f"{arm} was stopped; {words}")
+        return ArmFault(faults[0]["code"], f"{faults[0]['cause']}; {words}")
+
     def wait(self, job: str) -> Job:
-        """Wait until a job has ended."""
-        while (seen := self.job(job)).live:
+        """Wait until a job has ended, or its arm is held until a person confirms that it is supported (`held`)."""
+        while (seen := self.job(job)).live and not seen.held:
             time.sleep(_LOOK)
         return seen
 
@@ -240,6 +197,17 @@ class RemoteArm:
         """List the faults that nobody has acknowledged (`FaultAnswer`)."""
         found: list[dict[str, Any]] = self.client.get(f"{self._path}/faults")
         return found
+
+    def supported(self, *, confirm: str) -> None:
+        """Confirm that the arm, which is held after a stop, is supported or home; it is then let down.
+
+        Args:
+            confirm: the arm's name, as a person has typed it who sees it.
+
+        Raises:
+            MotionRefused: the name is not the arm's.
+        """
+        self.client.post(f"{self._path}/supported", {"confirm": confirm})
 
     def acknowledge(self, code: str) -> None:
         """Acknowledge a fault by its name."""
@@ -287,12 +255,21 @@ class RemoteArm:
 
 
 class RemoteMotion:
-    """A motion that was asked for; a `with` block renews its lease, and waits for its end."""
+    """A motion that was asked for; a `with` block renews its lease, and waits for its end.
+
+    The block raises what kept the motion from its end: `ArmFault` after a fault, `MotionRefused` where nothing moved (a
+    preflight that did not pass, for example), `Stopped` after a stop that another one asked for, else the error of the
+    command. `ended` is there all the same. An exception of the block's own goes on as it is.
+
+    An arm without brakes that was stopped is held until a person confirms that it is supported. The block does not wait
+    for that, and nothing that becomes of this program lets the arm go: `ended.held` tells of it.
+    """
 
     def __init__(self, client: IdentClient, begun: Job) -> None:
         """Take a job that the daemon has queued; its lease lasts two seconds from now."""
         self.client, self.id, self.uncertainty = client, begun.id, dict[str, Any]()
         self._ended: Job | None = None
+        self._cancelled = False
         self._leaving = threading.Event()
         self._thread = threading.Thread(target=self._keep, name=f"lease of {begun.id}", daemon=True)
 
@@ -308,8 +285,10 @@ class RemoteMotion:
         return self._ended
 
     def live(self) -> Iterator[LiveSample]:
-        """Yield samples while the run is recorded, until it ends; `uncertainty` has the deviations so far."""
+        """Yield samples of a run until it ends, or its arm is held; `uncertainty` has the deviations so far."""
         for kind, _, value in self.client.stream(f"{_API}/jobs/{self.id}/live"):
+            if kind == "job" and value["job"].get("held"):
+                return
             if kind == "doubt":
                 self.uncertainty = value
             elif kind == "samples":
@@ -318,7 +297,8 @@ class RemoteMotion:
                     yield LiveSample(at, joints, *rows)
 
     def cancel(self) -> None:
-        """Bring the arm to a controlled stop; the job then says what happened."""
+        """Bring the arm to a controlled stop; the job then says what happened, and the block raises nothing for it."""
+        self._cancelled = True
         self.client.post(f"{_API}/jobs/{self.id}/cancel")
 
     def __enter__(self) -> Self:
@@ -329,15 +309,28 @@ class RemoteMotion:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Wait for the end, the lease renewed; after an exception the arm is stopped first."""
+        """Wait for the end, the lease renewed; after an exception the arm is stopped first.
+
+        Raises:
+            IdentError: as the class says.
+            ArmError: the daemon cannot be reached any more.
+        """
         try:
             if kind is not None:
                 with suppress(UsageError):  # it has ended by itself
                     self.cancel()
             self._ended = self.client.wait(self.id)
+        except ArmError as gone:
+            raise ArmError(
+                f"{gone}. A daemon that ends brings its arms to rest first, and without a renewed lease the arm stops "
+                f"by itself. How the motion ended is told by the job {self.id}, once the daemon is there again"
+            ) from None
         finally:
             self._leaving.set()
             self._thread.join()
+        own = self._cancelled and (self._ended.state == "cancelled" or self._ended.held)
+        if kind is None and self._ended.state != "done" and not own:
+            raise self.client.failure(self._ended)
 
     def _keep(self) -> None:
         while not self._leaving.wait(_RENEWED):
@@ -352,7 +345,9 @@ class RemoteMotion:
 def _job(document: Mapping[str, Any]) -> Job:
     progress = document.get("progress") or {}
     known = {name: document[name] for name in ("id", "kind", "arm", "state", "run", "detail")}
-    return Job(**known, phase=progress.get("phase"), document=MappingProxyType(dict(document)))
+    return Job(
+        **known, phase=progress.get("phase"), held=bool(document.get("held")), document=MappingProxyType(dict(document))
+    )
 
 
 def _listed(what: str, arm: str | None) -> str:

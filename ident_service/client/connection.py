@@ -3,26 +3,31 @@
 from __future__ import annotations
 
 import json
+import re
 import ssl
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Any, Final, Self
 from urllib.parse import urlsplit
 
 import httpx
 
+from ident_service import errors
 from ident_service.errors import (
-    AlreadyThere,
+    AccessRefused,
     ArmError,
+    ArmFault,
     ConfigError,
     Dependent,
-    DriverError,
+    DiskFull,
     IdentError,
     InUse,
-    ModelError,
-    MotionRefused,
-    ParameterError,
+    InvalidRequest,
+    Problem,
     RecordingError,
+    SolverError,
+    Unavailable,
     UnknownId,
     UsageError,
 )
@@ -30,11 +35,17 @@ from ident_service.errors import (
 _PATIENCE = 30.0  # s for one answer
 _MOST = 64 * 2**20  # bytes of one answer
 NOTHING: Final[Mapping[str, Any]] = MappingProxyType({})
-_KINDS: Final[dict[str, type[IdentError]]] = {
-    kind.__name__: kind for kind in (UsageError, UnknownId, AlreadyThere, MotionRefused, ParameterError, ArmError)
+_OF_HTTP: Final[dict[str, type[IdentError]]] = {
+    **dict.fromkeys(("Unauthorized", "Forbidden", "TooManyRequests", "WrongHost", "WrongOrigin"), AccessRefused),
+    **dict.fromkeys(("BadRequest", "MethodNotAllowed", "TooLarge"), InvalidRequest),
+    "NotFound": UnknownId,
+    **dict.fromkeys(("Busy", "ServiceUnavailable"), Unavailable),
+    "InsufficientStorage": DiskFull,
+    "InternalError": IdentError,
+    "Interrupted": IdentError,
 }
-
-_OF_JOBS: Final[dict[str, type[IdentError]]] = {kind.__name__: kind for kind in (ModelError, InUse, DriverError)}
+"""What refuses a request before it reaches anything that has an error of its own, by the kind that it is told with."""
+_PLACE: Final = re.compile(r"(?P<path>.+?):(?P<line>\d+):(?P<column>\d+): (?P<message>.*)", re.DOTALL)
 
 
 class Connection:
@@ -196,6 +207,8 @@ class Connection:
         # httpx has no class of its own for this.
         unknown = "CERTIFICATE_VERIFY_FAILED" in str(error)
         hint = "; SSL_CERT_FILE=FILE.pem names the authority that signed the daemon's certificate" if unknown else ""
+        if isinstance(error, httpx.ConnectError) and "refused" in str(error):
+            hint = "; nobody listens there: the daemon (`ident serve`) has ended, or listens elsewhere"
         return ArmError(f"{self.url}: cannot be reached: {error or type(error).__name__}{hint}")
 
     def _document(self, status: int, content: bytes) -> Any:
@@ -208,28 +221,56 @@ class Connection:
         return document
 
 
-def job_error(kind: str, message: str) -> IdentError:
-    """Return the error with which a job's command ended; `IdentError` itself where it had none.
+def error_of(kind: str, message: str, dependents: Sequence[Mapping[str, Any]] = ()) -> IdentError:
+    """Return the error that a daemon, or the command of a job, tells of; `IdentError` itself for one without a name.
 
     Args:
         kind: name of the error.
         message: its words.
+        dependents: of `InUse`.
     """
+    if kind == InUse.__name__:
+        return InUse(message, [Dependent(**one) for one in dependents])
+    if kind == ConfigError.__name__:
+        return ConfigError(list(_problems(message)))
     if kind == RecordingError.__name__:
         path, _, words = message.partition(": ")
         return RecordingError(path, words)
-    kinds: dict[str, type[IdentError]] = {ConfigError.__name__: UsageError, **_KINDS, **_OF_JOBS}
-    return kinds.get(kind, IdentError)(message)
+    if kind == ArmFault.__name__:
+        code, _, words = message.partition(": ")
+        return ArmFault(code, words)
+    if kind == SolverError.__name__:
+        problem, _, status = message.partition(": the solver stopped with status ")
+        return SolverError(problem, status)
+    found = _OF_HTTP.get(kind) or getattr(errors, kind, None)
+    if not (isinstance(found, type) and issubclass(found, IdentError)):
+        found = IdentError
+    return found(message)
+
+
+def _problems(message: str) -> Iterator[Problem]:
+    """Read what `ConfigError` writes: a line for each mistake, the place first."""
+    rest: list[str] = []
+    for line in message.splitlines():
+        if _PLACE.fullmatch(line) or not rest:
+            yield from _problem(rest)
+            rest = [line]
+        else:  # words of several lines
+            rest.append(line)
+    yield from _problem(rest)
+
+
+def _problem(lines: Sequence[str]) -> Iterator[Problem]:
+    if found := _PLACE.fullmatch("\n".join(lines)):
+        yield Problem(Path(found["path"]), int(found["line"]), int(found["column"]), found["message"])
+    elif lines:
+        yield Problem(Path("description"), 1, 1, "\n".join(lines))
 
 
 def _error(url: str, status: int, document: Any) -> IdentError:
     said = document.get("error", {}) if isinstance(document, dict) else {}
     kind, message = str(said.get("kind", "")), str(said.get("message", f"answered {status}"))
-    if kind == InUse.__name__:
-        return InUse(message, [Dependent(**one) for one in said.get("dependents") or ()])
-    if kind == ConfigError.__name__:
-        return UsageError(message)
-    if kind == RecordingError.__name__ or kind not in _KINDS:
-        kinds: dict[int, type[IdentError]] = {401: UsageError, 403: UsageError, 404: UnknownId, 422: UsageError}
-        return kinds.get(status, ArmError)(f"{url}: {message}")
-    return _KINDS[kind](message)
+    if not kind:
+        return ArmError(f"{url}: answered {status}; is it the daemon?")
+    refused = kind in _OF_HTTP  # of which nothing says yet whose words they are
+    return error_of(kind, f"{url}: {message}" if refused else message, said.get("dependents") or ())

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Final
 
 from ident_service.client.connection import Connection
-from ident_service.errors import AlreadyThere, ArmError, UsageError
+from ident_service.errors import AlreadyThere, ArmError, IdentError, Unavailable, UsageError
 
 _UPLOADS: Final = "/api/v1/uploads"
 _PIECE: Final = 4 * 2**20  # bytes
@@ -35,7 +35,7 @@ def upload(connection: Connection, arm: str, file: Path, columns: str, tell: Cal
                 path = f"{_UPLOADS}/{seen['id']}/complete"
                 seen = connection.ask("POST", path, {}, patience=_CHECKING)
     except OSError as error:
-        if isinstance(error, ArmError):
+        if isinstance(error, IdentError):
             raise
         raise UsageError(f"{file}: cannot be read: {error.strerror or error}") from None
     tell(1.0)
@@ -55,7 +55,11 @@ def _send(connection: Connection, stream: BinaryIO, seen: dict[str, Any], tell: 
                 stream.seek(seen["received"])
             piece = stream.read(_PIECE)
             seen = connection.ask("PATCH", path, piece, {"Upload-Offset": str(seen["received"])})
-        except (ArmError, AlreadyThere):  # the line broke, or the daemon is busy, with the last piece perhaps
+        except (
+            ArmError,
+            AlreadyThere,
+            Unavailable,
+        ):  # the line broke, or the daemon is busy, with the last piece perhaps
             failed += 1
             if failed == _TRIES:
                 raise

@@ -349,7 +349,8 @@ class ArmConfig(GrownSection):
 
     format: Literal["ident-arm"]
     version: Literal[1]
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+    # As long as an address of the API, and a folder with a time before it, may be.
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
     description: str = ""
     kinematics: Kinematics
     gravity: Vector3 = (0.0, 0.0, -9.81)

@@ -9,9 +9,12 @@ Boundary: files; the memory of faults within a run is `latch.py`.
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -91,24 +94,50 @@ class FaultFile:
         Raises:
             UsageError: the file was damaged by somebody, or cannot be written.
         """
-        rows = self._rows()
-        if all(row.code != code for row in rows):
-            self._write((*rows, Remembered(code, cause, time.time())))
+        with self._alone():
+            rows = self._rows()
+            if all(row.code != code for row in rows):
+                self._write((*rows, Remembered(code, cause, time.time())))
 
     def acknowledge(self, code: str) -> str:
         """Forget a fault; returns its cause.
 
         Raises:
-            UsageError: no fault of this name is latched, or a file was damaged by somebody.
+            UsageError: no fault of this name is latched, or a file was damaged by somebody; or the arm is still held
+                after it, whereupon it would be latched again.
         """
+        with self._alone():
+            return self._acknowledged(code)
+
+    def _acknowledged(self, code: str) -> str:
         faults = self.latched()
         if code not in faults:
             known = ", ".join(faults) or "none"
             raise UsageError(f"{self._arm}: no fault {code!r} is latched (latched: {known})")
+        if in_use(self._controls):
+            raise UsageError(
+                f"{self._arm}: a process still has the arm; see it stopped and supported (`ident stop`, `ident "
+                "supported`), then acknowledge"
+            )
         self._write(tuple(row for row in self._rows() if row.code != code))
         if code == UNFINISHED:
             self.ended()
         return faults[code]
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Let one process at a time read the faults and write them."""
+        try:
+            self._faults.parent.mkdir(parents=True, exist_ok=True)
+            fd = os.open(self._faults.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        except OSError as error:
+            raise UsageError(f"{self._faults}: cannot be written: {error.strerror}") from None
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX)
+            yield
+        finally:
+            fcntl.flock(fd, fcntl.LOCK_UN)  # a process that is being started has the open folder, too
+            os.close(fd)
 
     def _remembered(self, *, moving: bool) -> tuple[Remembered, ...]:
         rows = self._rows()

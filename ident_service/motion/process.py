@@ -31,6 +31,7 @@ from ident_service.motion.control_file import ControlFile
 from ident_service.motion.ending import write_ending
 from ident_service.motion.factory import make_arm
 from ident_service.motion.fault_file import CONTROLS, FaultFile
+from ident_service.motion.faults import Severity
 from ident_service.motion.histogram import Histogram
 from ident_service.motion.latch import Latch
 from ident_service.motion.lifeline import Lifeline
@@ -71,8 +72,10 @@ class TimedSink:
         return self._sink.put(cycle)
 
     def event(self, stamp_ns: int, level: int, message: str) -> bool:
-        """Record one line of the story; a state, and what is done with a held arm, is told to the parent too."""
-        if message in _STATES:
+        """Record one line of the story; states, faults, and what is done with a held arm are told to the parent too."""
+        if level >= Severity.ERROR:
+            say({"fault": message})  # which is latched at the end, and an arm without brakes may be held until then
+        elif message in _STATES:
             say({"state": message})
         elif message in (WAITS, LOWERS):
             say({"held": message})

@@ -186,6 +186,25 @@ def accepted_runs(db: Database) -> set[str]:
     return {row["run"] for row in db.rows("SELECT DISTINCT run FROM acceptances")}
 
 
+def accepted_recordings(state: Path) -> set[str]:
+    """SHA-256 of the recordings that any accepted set was identified from, or judged on.
+
+    Raises:
+        ParameterError: a set is not what was accepted, so that what it needs is not known.
+    """
+    found, place = set[str](), state / "arms"
+    for arm in sorted(place.iterdir()) if place.is_dir() else ():
+        for act in acceptances(state, arm.name):
+            if act.number != act.origin:
+                continue
+            folder = _folder(state, arm.name, act.number)
+            _require_as_accepted(folder, act)
+            content = json.loads((folder / PARAMETERS).read_text(encoding="utf-8"))
+            named = (*content.get("provenance", {}).get("recordings", ()), *content.get("validation", ()))
+            found |= {str(one["sha256"]) for one in named if isinstance(one, dict) and "sha256" in one}
+    return found
+
+
 def _noted(note: str) -> str:
     note = note.strip()
     if not note:

@@ -12,6 +12,12 @@ def arm_folder(state: Path, arm: str) -> Path:
     return state / "arms" / arm
 
 
+def known_arms(state: Path) -> list[str]:
+    """Names of the arms that a state folder remembers something of."""
+    place = state / "arms"
+    return sorted(path.name for path in place.iterdir() if not path.name.startswith(".")) if place.is_dir() else []
+
+
 def control_path(state: Path, arm: str) -> Path:
     """The arm's control file (`motion/control_file.py`)."""
     return arm_folder(state, arm) / CONTROLS

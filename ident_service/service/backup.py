@@ -39,7 +39,7 @@ from ident_service.motion.fault_file import CONTROLS
 from ident_service.service.jobs.reach import moving_arms
 from ident_service.service.registry.audit import note
 from ident_service.service.registry.database import FILE, Database
-from ident_service.service.registry.tokens import TOKEN_FILE
+from ident_service.service.registry.tokens import TOKEN_FILE, revoke_first_tokens
 from ident_service.service.state_folder import LOCK, RESTORING, URL_FILE, require_whole, single_instance
 
 FORMAT: Final = "ident-backup"
@@ -145,6 +145,7 @@ def restore(file: Path, state: Path, who: str, *, replace: bool = False) -> Back
             with Database(staging) as db:
                 if not db.sound():
                     raise UsageError(f"{file}: its registry is damaged; use another backup")
+                revoke_first_tokens(db, who)  # whose file stays behind; the next start makes another one
                 note(db, who, "restored", "state folder", created=head["created"], software=head["software"])
             replaced = _exchange(state, staging)
         except OSError as error:

@@ -1,14 +1,16 @@
 """The state folder is its owner's alone, and one daemon's at a time.
 
 Whoever can enter it can read who did what, and can hold a byte of SQLite's write-ahead log that every write waits for.
+What another user writes into it, root included, its owner's daemon could not open afterwards.
 """
 
 from __future__ import annotations
 
 import fcntl
 import os
+import pwd
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
@@ -28,15 +30,70 @@ def keep_private(state: Path) -> None:
         state: the folder, there or not yet.
 
     Raises:
-        UsageError: others can enter it; the remedy is named.
+        UsageError: others can enter it, or it is somebody else's; the remedy is named.
     """
     os.umask(0o077)
+    if (refusal := shut_out(state, writing=True)) is not None:
+        raise UsageError(refusal)
     path = state.resolve()
     if not path.is_dir():
         return
     # Who is kept out above it cannot enter it either.
     if all(place.stat().st_mode & _OTHERS_ENTER for place in (path, *path.parents)):
         raise UsageError(f"{state}: others can enter it, and read or block what is in it; close it: chmod 700 {path}")
+
+
+def shut_out(state: Path, *, writing: bool = False) -> str | None:
+    """Say why a state folder is not for this process's user, with the remedy; None where it is, or is not there yet.
+
+    Args:
+        state: the folder.
+        writing: whether files are to be made there, which are their maker's: root's would shut the owner out.
+    """
+    try:
+        owner = state.stat().st_uid
+    except PermissionError:
+        return f"{state}: cannot be entered by {_user(os.geteuid())}; call `ident` as the user whose folder it is"
+    except OSError:
+        return None
+    own = owner == os.geteuid()
+    may = os.access(state, os.R_OK | os.W_OK | os.X_OK, effective_ids=True)
+    if own or (may and not (writing and os.geteuid() == 0)):
+        return None
+    return (
+        f"{state}: belongs to the user {_user(owner)}, not to {_user(os.geteuid())}, whose files they could not open; "
+        f"call it as that user: sudo -u {_sudo_user(owner)} IDENT_STATE={state.absolute()} ident ..."
+    )
+
+
+def leave_to_owner(state: Path, path: Path) -> None:
+    """Give what root has made in somebody else's state folder to its owner; for acts that are refused to nobody.
+
+    Args:
+        state: the state folder.
+        path: a file or folder in it, given away with the folders between the two.
+    """
+    if os.geteuid() != 0:
+        return
+    with suppress(OSError, ValueError):  # the act itself is done
+        found = state.stat()
+        parts = path.relative_to(state).parts
+        for count in range(1, len(parts) + 1):
+            place = state.joinpath(*parts[:count])
+            if place.lstat().st_uid != found.st_uid:
+                os.chown(place, found.st_uid, found.st_gid, follow_symlinks=False)
+
+
+def _user(number: int) -> str:
+    try:
+        return pwd.getpwuid(number).pw_name
+    except KeyError:
+        return str(number)
+
+
+def _sudo_user(number: int) -> str:
+    name = _user(number)
+    return f"'#{number}'" if name == str(number) else name
 
 
 def require_whole(state: Path) -> None:

@@ -7,8 +7,9 @@ STATE/runs/RUN/                  a whole one: NAME, upload.json, arm.json, colum
 ```
 
 The id is a hash of what was announced: whoever announces the same again goes on, after a restart, too. A whole one is a
-run of the kind `recording`, so whatever takes a recording of a run takes it. Boundary: nothing here looks into a
-recording; that is done by the process of a job.
+run of the kind `recording`, so whatever takes a recording of a run takes it. A columns file is held against the arm
+before anything is sent, and a CSV's header against both as soon as it has arrived. Boundary: nothing here looks further
+into a recording; that is done by the process of a job.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ from ident_service.service.registry.audit import note
 from ident_service.service.registry.database import Database
 from ident_service.service.registry.motions import new_id
 from ident_service.service.registry.runs import COLUMNS, RUNS, UPLOAD, index_run
+from ident_service.service.upload_columns import LONGEST_HEADER, first_line, format_of
 
 UPLOADS: Final = ".uploads"  # hidden: backups leave out what is half there
 MOST_BYTES: Final = 4 * 2**30  # of a recording
@@ -45,6 +47,7 @@ MOST_COLUMNS: Final = 2**16
 KEPT_FREE: Final = 2**30  # bytes of the disk that a motion's own recording may need meanwhile
 HALF_SECONDS: Final = 24 * 3600.0  # after its last piece
 _DATA, _ARM = "data", "arm.json"
+_JUDGED = "judged"  # is there once the header has been found good
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,119}")
 _DOCUMENTS = (".json", ".yaml", ".partial")  # endings of what else may stand in the folder of a run
 
@@ -109,16 +112,20 @@ def begin_upload(db: Database, state: Path, announced: Announced) -> Upload:
 
     Raises:
         UnknownId: no such arm.
-        UsageError: a name that no recording can have, or too many uploads are under way.
+        UsageError: a name that no recording can have, a columns file that is not of this arm, or too many uploads are
+            under way.
+        ConfigError: mistakes in the columns file.
         NoRoom: the disk has no room for it.
     """
     name = announced.name
     if not _NAME.fullmatch(name) or name.endswith(_DOCUMENTS):
         raise UsageError(f"{name!r}: a recording has a plain name that does not end in {', '.join(_DOCUMENTS)}")
-    known_arm(db, state, announced.arm)
+    arm = known_arm(db, state, announced.arm)
     if (run := _same(db, state, announced)) is not None:
         return Upload(announced.id, announced, announced.bytes, run)
     folder = state / UPLOADS / announced.id
+    if announced.columns:
+        format_of(announced.columns, announced.name, arm.config)
     # Without data, a disk was full when it was completed.
     if not all((folder / name).is_file() for name in (UPLOAD, _DATA)):
         others = uploads(state)
@@ -132,6 +139,35 @@ def begin_upload(db: Database, state: Path, announced: Announced) -> Upload:
             (folder / _DATA).touch(0o600)
             write_atomically(folder / UPLOAD, json.dumps(asdict(announced)))
     return known_upload(state, announced.id)
+
+
+def require_header(db: Database, state: Path, upload: str) -> None:
+    """Refuse a CSV whose header has not the columns that were announced, once its first line has arrived.
+
+    Args:
+        db: the registry.
+        state: the state folder.
+        upload: id.
+
+    Raises:
+        UnknownId: no such upload, or its arm is gone.
+        RecordingError: all that is wrong with the header; the upload is deleted, for its columns cannot be changed.
+    """
+    from ident_service.record.csv_header import parse_header
+
+    seen, folder = known_upload(state, upload), state / UPLOADS / upload
+    announced = seen.announced
+    if not announced.columns or (folder / _JUDGED).exists() or ".csv" not in announced.name.lower():
+        return
+    with _known(upload):
+        line = first_line(folder / _DATA, packed=announced.name.endswith(".gz"))
+    if not line.endswith(b"\n") and len(line) < LONGEST_HEADER and seen.received < announced.bytes:
+        return  # it has not all arrived
+    form = format_of(announced.columns, announced.name, known_arm(db, state, announced.arm).config)
+    with _deleted_if_wrong(folder):
+        parse_header(Path(announced.name), line.decode("utf-8-sig", "replace").rstrip("\r\n"), form.columns)
+    with _known(upload):
+        (folder / _JUDGED).touch(0o600)
 
 
 def known_upload(state: Path, upload: str) -> Upload:
@@ -180,7 +216,7 @@ class Piece:
             )
         try:
             fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            self._size = os.fstat(self._fd).st_size
+            self._begin = self._size = os.fstat(self._fd).st_size
             if offset != self._size:
                 raise AlreadyThere(f"{upload}: the next piece begins at byte {self._size}, not at {offset}")
         except BlockingIOError:
@@ -194,7 +230,7 @@ class Piece:
         """Append bytes.
 
         Raises:
-            UsageError: they are more than were announced; nothing of `data` is kept.
+            UsageError: they are more than were announced; `withdraw` is to follow.
             OSError: the disk is full, or does not take them.
         """
         if self._size + len(data) > self._most:
@@ -204,6 +240,11 @@ class Piece:
             written = os.write(self._fd, view)
             view, self._size = view[written:], self._size + written
 
+    def withdraw(self) -> None:
+        """Take back what was written of this piece: it is refused, and so none of it is kept."""
+        os.ftruncate(self._fd, self._begin)
+        self._size = self._begin
+
     def __enter__(self) -> Self:
         """Nothing more to do."""
         return self
@@ -212,6 +253,8 @@ class Piece:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Let the upload go."""
+        # The lock is of the open file, which a process that is being started has, too, until it runs its program.
+        fcntl.flock(self._fd, fcntl.LOCK_UN)
         os.close(self._fd)
 
 

@@ -179,6 +179,7 @@ class _Watch:
         self._tell, self._stop_requested, self._finish_requested = tell, stop_requested, finish_requested
         self._controls: ControlFile | None = None
         self._asked = self._finishing = False
+        self._fault = ""
         self.holding = False
 
     def hear(self, until: float = float("inf")) -> bool:
@@ -234,9 +235,20 @@ class _Watch:
         self.ending.error = said.get("error", self.ending.error)
         if "state" in said:
             self._tell(said["state"])
+        if "fault" in said:
+            self._fault = self._fault or said["fault"]
+            self._tell(f"fault: {said['fault']}")
         if "held" in said:
             self.holding = True
+            self._latch()
             self._tell(said["held"])
+
+    def _latch(self) -> None:
+        """Let everybody know the fault of an arm that is held: its own process latches it when somebody supports it."""
+        code, _, cause = self._fault.partition(": ")
+        if code:
+            with suppress(UsageError):  # a full disk, perhaps; it is latched at the end
+                FaultFile(self._path.parent).latch(code, cause)
 
 
 @contextmanager

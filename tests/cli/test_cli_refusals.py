@@ -300,3 +300,34 @@ def test_a_stop_on_request_is_no_success_and_nothing_moves_again(place: Path, cy
         simulate(config, place / "run", stop_requested=lambda: next(asked, True), tell=told.append)
     assert told[-1].startswith(f"{motion} motion: ")
     assert left_over(place) == before
+
+
+@pytest.mark.parametrize("verb", ["base", "simulate", "check", "preview"])
+def test_a_broken_urdf_has_a_place(place: Path, ident: Ident, verb: str) -> None:
+    arm = place / "arm.yaml"
+    arm.write_text("format: ident-arm\nversion: 1\nname: broken\nkinematics: {urdf: broken.urdf}\n")
+    (place / "broken.urdf").write_text("<robot name='a'><link name='b'/>")
+    words = (verb, arm)
+    assert ident(*words).code == 2
+    refused(place, ident, words, 2, f"{arm}:4:1: kinematics: broken.urdf: not a URDF that can be read")
+
+
+def test_a_motion_that_does_not_fit_is_named(place: Path, quick: Commissioned, ident: Ident) -> None:
+    motion = place / "tuesday.json"
+    motion.write_text((quick.folder / "validation.excitation.json").read_text().replace('"sha256": "', '"sha256": "0'))
+    for words in (("preview", quick.arm, motion), ("simulate", quick.arm, "--motion", motion)):
+        ended = ident(*words)
+        assert ended.code == 3, ended
+        assert str(motion) in ended.err
+        assert str(motion) in json.dumps(ident(*words, "--json").json)
+
+
+def test_a_stop_of_an_unknown_arm_names_those_that_are_remembered(state: Path, ident: Ident) -> None:
+    (state / "arms" / "mine").mkdir(parents=True)
+    state.chmod(0o700)
+    for words in (("stop", "yours"), ("pause", "yours")):
+        ended = ident(*words)
+        assert ended.code == 2
+        assert "planar2" in ended.err  # shipped
+        assert f"arms that {state} remembers: mine" in ended.err
+    assert ident("stop", "mine").code == 0

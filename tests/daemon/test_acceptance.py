@@ -15,6 +15,7 @@ from ident_service.results.manifest import MANIFEST, write_manifest
 from ident_service.service.acceptance import accept, acceptances, rollback, settle
 from ident_service.service.import_run import import_run
 from ident_service.service.jobs.commands import accepted_description
+from ident_service.service.registry import jobs as rows
 from ident_service.service.registry.database import Database
 from ident_service.service.registry.runs import (
     index_run,
@@ -200,3 +201,51 @@ def test_only_recordings_that_nobody_accepted_are_let_go(db: Database, state: Pa
     assert all(one["deleted"] and len(one["sha256"]) == 64 for one in recordings(db, gone[0].run))
     assert (state / "runs" / gone[0].run / "parameters.json").is_file()
     assert "identification.mcap" not in run_files(db, state, gone[0].run)
+
+
+def test_recordings_behind_an_accepted_set_of_another_run_stay(db: Database, state: Path, folder: Path) -> None:
+    # As over the API: each recording is a run, and the identification another one.
+    identified = folder.rename(folder.with_name("20260101T000000Z-quick"))
+    named = json.loads((identified / "parameters.json").read_text())
+    wanted = {one["name"] for one in (*named["provenance"]["recordings"],)}
+    judged = {Path(one["recording"]).name for one in named["validation"]}
+    assert wanted == {"identification.mcap"}
+    assert judged == {"validation.mcap"}
+    for number, name in enumerate(("identification.mcap", "validation.mcap", "other.mcap")):
+        recorded = folder.with_name(f"2025010{number + 1}T000000Z-quick")
+        recorded.mkdir()
+        shutil.copyfile(identified / "arm.json", recorded / "arm.json")
+        if name != "other.mcap":
+            shutil.copyfile(identified / name, recorded / name)
+        else:
+            (recorded / name).write_bytes((identified / "validation.mcap").read_bytes()[:-1])
+        write_manifest(recorded)
+        import_run(db, state, recorded, "me")
+    for name in ("identification.mcap", "validation.mcap"):
+        (identified / name).unlink()
+    write_manifest(identified)
+    import_run(db, state, identified, "me")
+    assert {one.run[:8] for one in expendable(db, state, 0)} == {"20250101", "20250102", "20250103"}
+    accept(db, state, state / "runs" / identified.name, "kept for ever", "me")
+    assert [one.run[:8] for one in let_go(db, state, 0, "me")] == ["20250103"]
+    # An earlier set stays one that can be rolled back to.
+    document = json.loads((identified / "parameters.json").read_text())
+    document["provenance"]["recordings"] = document["validation"] = []
+    (identified / "parameters.json").write_text(json.dumps(document))
+    write_manifest(identified)
+    accept(db, state, identified, "from elsewhere", "me")
+    assert expendable(db, state, 0) == []
+    gone = "20250103T000000Z-quick"
+    with pytest.raises(UnknownId, match=r"was deleted on \d{4}-\d\d-\d\d to make room \(`ident prune`\)"):
+        run_file(db, state, gone, "other.mcap")
+    with pytest.raises(UnknownId, match="manifest names them"):
+        run_file(db, state, gone, "never.mcap")
+
+
+def test_recordings_that_a_job_reads_stay(db: Database, state: Path, folder: Path) -> None:
+    import_run(db, state, folder, "me")
+    asked = {"kind": "identify", "recordings": [{"run": folder.name}]}
+    job = rows.add_job(db, "identify-1", "identify", "quick", asked, [], "me", motion=False, run="another")
+    assert expendable(db, state, 0) == []
+    rows.ended(db, job["id"], "done", "", 0)
+    assert {one.run for one in expendable(db, state, 0)} == {folder.name}

@@ -28,7 +28,7 @@ from ident_service.service.arm_state import control_path
 from ident_service.service.backup import back_up, restore
 from ident_service.service.registry.audit import note, trail
 from ident_service.service.registry.database import FILE, Database
-from ident_service.service.registry.tokens import access, add_token
+from ident_service.service.registry.tokens import Access, access, add_token, first_token
 from ident_service.service.state_folder import RESTORING, single_instance
 
 RUN = "runs/20261101T080000-quick"
@@ -361,3 +361,18 @@ def test_a_verb_leaves_nothing_in_the_log(tmp_path: Path, daemon: Asked) -> None
         note(db, "me", "did", "x")
     with closing(sqlite3.connect(f"file:{state / FILE}?mode=ro&immutable=1", uri=True)) as copy:
         assert copy.execute("SELECT COUNT(*) FROM audit WHERE what = 'did'").fetchone() == (1,)
+
+
+def test_the_owners_old_token_counts_no_more_after_a_restore(tmp_path: Path) -> None:
+    state, back = tmp_path / "state", tmp_path / "back"
+    with Database(state) as db:
+        old = first_token(db, state).read_text().strip()
+        ann = add_token(db, "ann", "operator", "test")
+    back_up(state, tmp_path / "a.tar")
+    restore(tmp_path / "a.tar", back, "me")
+    with Database(back) as db:
+        new = first_token(db, back).read_text().strip()
+        assert access(db, old) is None
+        assert access(db, new) == Access("owner-2", "operator")
+        assert access(db, ann) == Access("ann", "operator")
+        assert [line["about"] for line in trail(db) if line["what"] == "token revoked"] == ["owner"]

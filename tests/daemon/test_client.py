@@ -2,23 +2,48 @@
 
 from __future__ import annotations
 
+import re
+import signal
 import socket
 import threading
 from collections.abc import Iterator
+from http import HTTPStatus
 from pathlib import Path
 
 import pytest
 from daemon.conftest import checked_before, patient_text, quick_text
 from daemon.served import daemon_process
+from daemon.verbs_bench import unstable_text
 
+from ident_service import errors
 from ident_service.client import IdentClient
-from ident_service.errors import AlreadyThere, ArmError, MotionRefused, RecordingError, UnknownId, UsageError
+from ident_service.client.connection import error_of
+from ident_service.errors import (
+    AccessRefused,
+    AlreadyThere,
+    AnotherDrive,
+    ArmError,
+    ArmFault,
+    ConfigError,
+    DiskFull,
+    IdentError,
+    ModelError,
+    MotionRefused,
+    PersonNeeded,
+    Problem,
+    RecordingError,
+    SolverError,
+    Stopped,
+    UnknownId,
+    UsageError,
+)
 from ident_service.motion.control_file import in_use
 from ident_service.service.arm_state import control_path
 from ident_service.service.registry.audit import note
 from ident_service.service.registry.database import Database
 
 pytestmark = pytest.mark.slow
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -54,18 +79,20 @@ def test_errors_are_of_one_tree(client: IdentClient) -> None:
         client.job("../runs")
     with pytest.raises(AlreadyThere, match="quick"):
         client.add_arm(quick_text(periods=8))
-    with pytest.raises(UsageError, match=r"arm.yaml:\d+:\d+"):
+    with pytest.raises(ConfigError, match=r"arm.yaml:\d+:\d+") as mistakes:
         client.add_arm(quick_text("third").replace("terms:", "termz:"))
+    assert mistakes.value.problems[0].path.name == "arm.yaml"
+    assert mistakes.value.problems[0].line > 1
     with pytest.raises(MotionRefused, match="typed"):
         client.arm("quick").run(confirm="quack")
-    with IdentClient(client.url, "ident_no") as nobody, pytest.raises(UsageError, match="token that counts"):
+    with IdentClient(client.url, "ident_no") as nobody, pytest.raises(AccessRefused, match="token that counts"):
         nobody.arms()
     with pytest.raises(UsageError, match="https only"):
         IdentClient("http://robot.example:8470", "x")
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
         url = f"http://127.0.0.1:{closed.getsockname()[1]}"
-        with IdentClient(url) as nobody, pytest.raises(ArmError, match="cannot be reached"):
+        with IdentClient(url) as nobody, pytest.raises(ArmError, match=r"cannot be reached.* has ended"):
             nobody.stop()
 
 
@@ -118,10 +145,96 @@ def test_an_exception_stops_the_arm(client: IdentClient, state: Path) -> None:
 
 @pytest.mark.timeout(300)
 def test_a_stop_elsewhere_ends_the_block(client: IdentClient) -> None:
-    with client.arm("patient").run(confirm="patient") as job:
-        live = job.live()
-        next(live)
-        threading.Timer(0.5, client.stop).start()
-        assert sum(1 for _ in live) > 5
+    with pytest.raises(Stopped, match=r"asked for a stop \(job \S+-run-"):  # noqa: PT012, SIM117 - at the block's end
+        with client.arm("patient").run(confirm="patient") as job:
+            live = job.live()
+            next(live)
+            threading.Timer(0.5, client.stop).start()
+            assert sum(1 for _ in live) > 5
     assert job.ended.state == "cancelled"
     assert "stop" in job.ended.detail
+
+
+@pytest.mark.timeout(300)
+def test_a_stop_of_ones_own_is_no_error(client: IdentClient) -> None:
+    with client.arm("patient").run(confirm="patient") as job:
+        next(job.live())
+        job.cancel()
+    assert job.ended.state == "cancelled"
+
+
+def test_a_motion_that_is_refused_raises_at_the_end_of_its_block(client: IdentClient) -> None:
+    with pytest.raises(MotionRefused, match="not checked yet"), client.arm("planar2").run(confirm="planar2") as job:
+        pass
+    assert job.ended.state == "refused"
+    client.add_arm(unstable_text().replace("name: quick", "name: unstable"))
+    with (
+        pytest.raises(MotionRefused, match=r"stability: .*\(job \S+-check-"),
+        client.arm("unstable").check(confirm="unstable") as check,
+    ):
+        pass
+    assert check.ended.state == "refused"
+
+
+@pytest.mark.timeout(300)
+def test_a_motion_that_ends_in_a_fault_raises_it(client: IdentClient, state: Path) -> None:
+    text = patient_text("faulty").replace("driver:\n", "driver:\n  faults: [{kind: nan_position, at: 100}]\n", 1)
+    assert "faults" in text
+    checked_before(state, text)
+    client.add_arm(text)
+    with pytest.raises(ArmFault) as caught, client.arm("faulty").run(confirm="faulty") as job:
+        pass
+    assert job.ended.state == "faulted"
+    assert caught.value.code in [fault["code"] for fault in client.arm("faulty").faults()]
+
+
+@pytest.mark.timeout(300)
+def test_a_daemon_that_ends_says_what_becomes_of_the_motion(tmp_path: Path) -> None:
+    state = tmp_path / "state"
+    checked_before(state, patient_text())
+    with daemon_process(state) as (process, client):
+        client.add_arm(patient_text())
+        with (  # noqa: PT012 - it is raised at the end of the block of the motion
+            pytest.raises(ArmError, match=r"A daemon that ends brings its arms to rest first.*job \S+-run-"),
+            client.arm("quick").run(confirm="quick") as job,
+        ):
+            next(job.live())
+            process.send_signal(signal.SIGTERM)
+            process.wait(60)
+    assert not in_use(control_path(state, "quick"))
+
+
+def test_every_kind_that_the_api_tells_is_an_error_of_the_tree() -> None:
+    source = "".join(path.read_text() for path in (ROOT / "ident_service" / "service" / "api").glob("*.py"))
+    told = set(re.findall(r"""(?:\d{3}, |: \()"([A-Z][a-z]+[A-Za-z]*)",""", source))
+    told |= {
+        HTTPStatus(int(code)).phrase.title().replace(" ", "") for code in re.findall(r"HTTPException\((\d+)", source)
+    }
+    told |= {"NotFound", "MethodNotAllowed", "TooLarge"} - {"RequestEntityTooLarge", "ContentTooLarge"}
+    assert told >= {"InvalidRequest", "RegistryBusy", "DiskFull", "WrongHost", "Busy", "Unauthorized", "InternalError"}
+    page = (ROOT / "docs" / "programming.md").read_text()
+    for kind in told:
+        error = error_of(kind, "words")
+        assert isinstance(error, IdentError)
+        assert type(error) is not IdentError or kind == "InternalError", kind
+        assert hasattr(errors, kind) or f"`{kind}`" in page, kind
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ConfigError([Problem(Path("arm.yaml"), 3, 7, "a: b\nand more"), Problem(Path("x.eds"), 1, 1, "c")]),
+        RecordingError("a.csv", "line 3: torn"),
+        SolverError("weights", "infeasible"),
+        ArmFault("late_cycle", "a cycle came late"),
+        PersonNeeded("look"),
+        AnotherDrive("7"),
+        ModelError("no"),
+        DiskFull("no room"),
+    ],
+)
+def test_an_error_that_is_told_is_the_one_that_was_raised(error: IdentError) -> None:
+    again = error_of(type(error).__name__, str(error))
+    assert type(again) is type(error)
+    assert str(again) == str(error)
+    assert vars(again) == vars(error)

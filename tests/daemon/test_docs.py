@@ -24,6 +24,15 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGES = ("service.md", "programming.md")
 
 
+BENCH = "format: ident-arm\nversion: 1\nname: bench\nkinematics: {urdf: bench.urdf}\n"
+BENCH_URDF = (
+    '<robot name="bench"><link name="base"/><link name="beam"><inertial><mass value="1"/>'
+    '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+    '<joint name="axis" type="revolute"><parent link="base"/><child link="beam"/><axis xyz="0 0 1"/>'
+    '<limit lower="-1" upper="1" effort="10" velocity="2"/></joint></robot>'
+)
+
+
 def text(page: str) -> str:
     return (ROOT / "docs" / page).read_text(encoding="utf-8")
 
@@ -39,6 +48,9 @@ def commands() -> Iterator[list[str]]:
             words = shlex.split(line, comments=True)
             while words and re.fullmatch(r"[A-Z_]+=.*", words[0]):
                 words.pop(0)
+            if words[:3] == ["sudo", "-u", "ident"]:
+                words = words[4:]
+                words[0] = Path(words[0]).name
             if words[:1] == ["ident"]:
                 yield words[1:]
             elif words[:2] == ["podman", "run"]:
@@ -80,12 +92,14 @@ def test_the_programs_run(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "monday.csv").write_bytes(table.read_bytes())
     (tmp_path / "columns.yaml").write_text(COLUMNS)
+    (tmp_path / "bench.yaml").write_text(BENCH)
+    (tmp_path / "bench.urdf").write_text(BENCH_URDF)
     body = json.dumps({"type": "arm.due", "timestamp": "2026-11-01T06:00:00Z", "data": {"id": 1, "arm": "planar2"}})
     secret, now = "whsec_" + base64.b64encode(b"0123456789abcdef").decode(), datetime.now(UTC)
     headers = {"webhook-id": "msg_1", "webhook-timestamp": str(int(now.timestamp()))}
     headers["webhook-signature"] = Webhook(secret).sign("msg_1", now, body)
     programs = blocks("programming.md", "python")
-    assert len(programs) == 5
+    assert len(programs) == 6
     with daemon_process(state) as (_, client):
         client.add_arm(quick_text())
         token = (state / "token").read_text().strip()
@@ -99,6 +113,7 @@ def test_the_programs_run(
     assert kinds == ["identify", "identify", "run", "check", "simulate"]
     said = capsys.readouterr().out
     assert "done " in said
+    assert "bench ['axis']" in said
     assert "20200101T000000Z-nothing" in said
     assert "job ended" in said
     assert "arm.due planar2" in said

@@ -164,3 +164,19 @@ def test_nobody_watches_without_a_token_and_the_stream_ends_with_the_service(sta
         assert (answer.status_code, answer.text[:7]) == (200, "retry: ")
         assert daemon.get("/api/v1/events", headers={"Last-Event-ID": "x"}).status_code == 422
         assert daemon.get("/api/v1/events", headers={"Authorization": ""}).status_code == 401
+
+
+@pytest.mark.slow
+def test_an_address_may_say_where_to_go_on_and_the_header_counts_first(state: Path) -> None:
+    with daemon_process(state) as (_, client):
+
+        def first(query: str, headers: dict[str, str]) -> int | None:
+            return next(client.stream(f"/api/v1/events{query}", headers))[1]
+
+        now = first("", {})
+        assert now is not None
+        assert now > 0  # the owner's token was added
+        assert first("?after=0", {}) == 0
+        assert first("?after=0", {"Last-Event-ID": "1"}) == 1
+        told = client.stream("/api/v1/events?after=0")
+        assert [next(told)[1] for _ in range(2)] == [0, 1]

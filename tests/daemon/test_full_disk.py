@@ -6,8 +6,10 @@ import errno
 import logging
 import os
 import sqlite3
+import subprocess
 import threading
 import time
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
 from pathlib import Path
@@ -15,11 +17,17 @@ from typing import Any
 
 import httpx
 import pytest
-from daemon.conftest import Asked
+from daemon.conftest import Asked, checked_before, patient_text, serving
+from daemon.served import daemon_process
 
+from ident_service.cli import main
+from ident_service.errors import ArmError, ArmFault, UsageError
+from ident_service.motion.control_file import ControlFile
+from ident_service.service.arm_state import control_path
+from ident_service.service.jobs.reach import held_arm
 from ident_service.service.registry import jobs as rows
-from ident_service.service.registry.audit import note
-from ident_service.service.registry.database import FILE, Database, RegistryBusy
+from ident_service.service.registry.audit import note, trail
+from ident_service.service.registry.database import FILE, Database
 
 
 @pytest.mark.slow
@@ -84,8 +92,9 @@ def test_who_waits_behind_a_writer_waits_no_longer_than_it(tmp_path: Path) -> No
 
         kept = thread.submit(keep)
         begun.wait(30.0)
-        with pytest.raises(RegistryBusy):
+        with pytest.raises(sqlite3.OperationalError, match="too long") as caught:
             db.write("INSERT INTO a VALUES (1)")
+        assert caught.value.sqlite_errorcode == sqlite3.SQLITE_BUSY
         ending.set()
         kept.result()
         db.write("INSERT INTO a VALUES (1)")
@@ -118,3 +127,160 @@ def test_a_full_disk_has_no_room(
         answer = short_of(daemon, caplog, "/api/v1/arms", {"description": "extends: planar2\nname: other\n"})
     assert (answer.status_code, answer.json()["error"]["kind"]) == (507, "DiskFull")
     assert daemon.post("/api/v1/arms", {"description": "extends: planar2\nname: other\n"}).status_code == 201
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Iterator[Path]:
+    """Mount a disk of 16 megabytes."""
+    folder = tmp_path / "small"
+    folder.mkdir(mode=0o700)
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=16m,mode=700", "none", str(folder)], check=False)
+    if mounted.returncode != 0:
+        pytest.skip("a disk can be mounted here by nobody")
+    yield folder
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+def fill(folder: Path) -> Path:
+    """Fill a disk to its last byte."""
+    path = folder / "filling"
+    with suppress(OSError), path.open("wb", buffering=0) as stream:
+        while True:
+            stream.write(bytes(4096))
+    return path
+
+
+_TOKEN = ("token", "add", "bob", "--role", "viewer")
+_WRITING = (_TOKEN, ("prune", "--keep", "1"), ("schedule", "add", "planar2", "--maintenance"), ("token", "list"))
+
+
+def test_a_verb_at_a_full_disk_says_so(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    state = small / "state"
+    assert main([*_TOKEN[:2], "ann", *_TOKEN[3:], "--state", str(state)]) == 0
+    with ControlFile.take(control_path(state, "planar2"), None) as mover:
+        filling = fill(small)
+        assert main(["stop", "planar2", "--state", str(state)]) == 0
+        assert mover.stop
+        assert "not entered in the audit trail" in capsys.readouterr().err
+    for words in (*_WRITING[:3], ("check", "planar2", "--confirm", "planar2")):
+        capsys.readouterr()
+        assert main([*words, "--state", str(state)]) == 1, words
+        said = capsys.readouterr().err
+        assert "full" in said or "No space left" in said
+        assert "damaged" not in said
+        assert "Traceback" not in said
+    filling.unlink()
+    assert main([*_TOKEN, "--state", str(state)]) == 0
+
+
+def test_a_verb_at_a_registry_that_is_kept_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state = tmp_path / "state"
+    assert main([*_TOKEN[:2], "ann", *_TOKEN[3:], "--state", str(state)]) == 0
+    monkeypatch.setitem(Database.__init__.__kwdefaults__, "busy", 0.05)
+    with closing(sqlite3.connect(state / FILE)) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        for words in _WRITING:
+            capsys.readouterr()
+            assert main([*words, "--state", str(state)]) == 1, words
+            said = capsys.readouterr().err
+            assert "another process keeps the registry" in said
+            assert "damaged" not in said
+    assert main([*_TOKEN, "--state", str(state)]) == 0
+
+
+def test_a_registry_is_damaged_where_its_bytes_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / FILE).write_bytes(b"not a database" * 1000)
+    assert main([*_TOKEN, "--state", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert "is damaged" in said
+    assert "ident restore FILE --replace" in said
+
+
+def test_a_stop_that_the_registry_does_not_take_is_entered_later(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ident_service.cli.keeping._PATIENCE", 0.05)
+    state = tmp_path / "state"
+    with serving(state) as daemon, closing(sqlite3.connect(state / FILE)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        before = time.time()
+        assert main(["stop", "--state", str(state)]) == 0
+        after = time.time()
+        assert "follows" in capsys.readouterr().err
+        assert "stop" not in [line["what"] for line in trail(daemon.service.db)]
+        other.execute("ROLLBACK")
+        until = time.monotonic() + 30.0
+        while not (found := [line for line in trail(daemon.service.db) if line["what"] == "stop"]):
+            assert time.monotonic() < until
+            time.sleep(0.05)
+    assert len(found) == 1
+    assert before <= found[0]["at"] <= after
+    assert found[0]["who"].startswith("terminal:")
+
+
+def held_text() -> str:
+    """The arm `quick` without brakes, with motions that outlast a test."""
+    text = patient_text().replace("control: {rate: 250}", "control: {rate: 250, after_stop: hold}")
+    assert "hold" in text
+    return text
+
+
+def wait_for(found: Callable[[], Any]) -> Any:
+    until = time.monotonic() + 60.0
+    while not (value := found()):
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    return value
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_disk_that_fills_while_an_arm_without_brakes_moves_is_told_while_it_is_held(small: Path) -> None:
+    state = small / "state"
+    checked_before(state, held_text())
+    with daemon_process(state) as (_, client):
+        client.add_arm(held_text())
+        filled = list[Path]()
+        with (  # noqa: PT012 - it is raised at the end of the block of the motion
+            pytest.raises(ArmError, match="held until a person confirms that it is supported"),
+            client.arm("quick").run(confirm="quick") as job,
+        ):
+            for _ in job.live():
+                if not filled:
+                    filled.append(fill(small))
+        assert job.ended.held
+        assert client.job(job.id).state == "running"
+        assert held_arm(state, "quick")
+        filled[0].unlink()
+        client.arm("quick").supported(confirm="quick")
+        wait_for(lambda: not client.job(job.id).live)
+        assert client.job(job.id).state == "faulted"
+        assert [fault["code"] for fault in client.arm("quick").faults()] == ["recorder_behind"]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_fault_of_an_arm_that_is_held_is_told_before_it_is_supported(
+    state: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    late = "driver:\n  faults: [{kind: late_cycle, at: 100, duration: 1, size: 0.006}]\n"
+    text = held_text().replace("driver:\n", late, 1)
+    checked_before(state, text)
+    with daemon_process(state) as (_, client):
+        client.add_arm(text)
+        with (
+            pytest.raises(ArmFault, match="held until a person confirms") as caught,
+            client.arm("quick").run(confirm="quick"),
+        ):
+            pass
+        assert [fault["code"] for fault in client.arm("quick").faults()] == [caught.value.code]
+        # It is acknowledged once the arm is let down; before, it would be latched again.
+        with pytest.raises(UsageError, match="ident supported"):
+            client.arm("quick").acknowledge(caught.value.code)
+        job = next(client.jobs())
+        assert main(["supported", "quick", "--confirm", "quick", "--state", str(state)]) == 0
+        wait_for(lambda: not client.job(job.id).live)
+        client.arm("quick").acknowledge(caught.value.code)
+        assert client.arm("quick").faults() == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -138,3 +139,25 @@ def test_a_name_that_is_taken_is_replaced_where_that_is_asked_for(daemon: Asked)
     assert post(quick_text("planar2"), replace=True).json()["source"] == "uploaded"
     refusal(daemon.post("/api/v1/descriptions/check", {"description": quick_text(), "replace": True}), 422)
     assert len([line for line in trail(daemon.service.db) if line["what"] == "arm added"]) == 5
+
+
+def test_a_name_that_no_address_can_have_is_refused_with_its_place(daemon: Asked) -> None:
+    assert daemon.post("/api/v1/arms", {"description": quick_text("a" * 64)}).status_code == 201
+    assert daemon.get(f"/api/v1/arms/{'a' * 64}").status_code == 200
+    for length in (65, 300):
+        answer = daemon.post("/api/v1/arms", {"description": quick_text("a" * length)})
+        assert answer.status_code == 422
+        assert re.match(r"arm.yaml:\d+:\d+: name: ", answer.json()["error"]["message"])
+        assert str(daemon.service.state) not in answer.text
+
+
+def test_a_motion_of_another_number_of_joints_is_not_taken(daemon: Asked) -> None:
+    head = {"format": "ident-excitation", "version": 1, "name": "three", "arm": {"sha256": "a"}, "kind": "postures"}
+    three = head | {"points": [[0.0, 0.0, 0.0], [0.1, 0.1, 0.1]], "times": [1.0], "dwell": 1.0}
+    answer = daemon.post("/api/v1/motions", {"arm": "planar2", "motion": json.dumps(three)})
+    assert answer.status_code == 400, answer.text
+    assert "a motion of 3 joints, but planar2 has 2" in answer.json()["error"]["message"]
+    assert daemon.get("/api/v1/motions").json() == []
+    two = three | {"points": [[0.0, 0.0], [0.1, 0.1]]}
+    answer = daemon.post("/api/v1/motions", {"arm": "planar2", "motion": json.dumps(two)})
+    assert answer.status_code == 201, answer.text

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import shutil
+import sqlite3
 import stat
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
@@ -20,7 +22,9 @@ from ident_service.motion.control_file import ControlFile
 from ident_service.service.api.serve import serve
 from ident_service.service.api.settings import Settings
 from ident_service.service.arm_state import control_path
+from ident_service.service.registry.audit import trail
 from ident_service.service.registry.database import FILE, Database
+from ident_service.service.registry.tokens import add_token
 
 
 @pytest.fixture(autouse=True)
@@ -117,3 +121,109 @@ def test_what_a_daemon_and_its_jobs_write_is_its_owners_alone(entered: Path) -> 
         assert now["state"] == "done"
         assert (entered / "runs" / now["run"] / "parameters.json").is_file()
         assert readable(entered) == []
+
+
+NOBODY = 65534
+as_root = pytest.mark.skipif(os.geteuid() != 0, reason="root alone can write into another user's folder")
+
+
+@contextmanager
+def being(user: int) -> Iterator[None]:
+    """Act with the rights of another user."""
+    os.setegid(user)
+    os.seteuid(user)
+    try:
+        yield
+    finally:
+        os.seteuid(0)
+        os.setegid(0)
+
+
+@pytest.fixture
+def anothers(entered: Path) -> Path:
+    """The state folder of another user, as that user's daemon has made it, with an arm that has moved."""
+    entered.parent.chmod(0o777)
+    with being(NOBODY), Database(entered) as db:
+        add_token(db, "ann", "viewer", "test")
+        (entered / "arms" / "planar2").mkdir(parents=True, mode=0o700)
+    return entered
+
+
+def owners(folder: Path) -> set[int]:
+    """Numbers of the users whose a folder and what is in it are."""
+    return {path.lstat().st_uid for path in (folder, *folder.rglob("*"))}
+
+
+@as_root
+def test_root_leaves_nothing_in_the_folder_of_another_user(
+    anothers: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Database(tmp_path / "mine") as db:
+        db.write("UPDATE tokens SET revoked = 1")
+    assert main(["backup", str(tmp_path / "backup.tar"), "--state", str(tmp_path / "mine")]) == 0
+    before = sorted(anothers.rglob("*"))
+    keeping = (
+        ("restore", str(tmp_path / "backup.tar"), "--replace"),
+        ("accept", str(tmp_path), "--note", "good"),
+        ("prune", "--keep", "1", "--yes"),
+        ("import", str(tmp_path)),
+    )
+    for words in (*VERBS, *keeping):
+        capsys.readouterr()
+        assert main([*words, "--state", str(anothers)]) == 2, words
+        assert f"sudo -u nobody IDENT_STATE={anothers} ident" in capsys.readouterr().err, words
+    assert sorted(anothers.rglob("*")) == before
+    with being(NOBODY):
+        assert main([*VERBS[0][:2], "bob", *VERBS[0][3:], "--state", str(anothers)]) == 0
+
+
+@as_root
+@pytest.mark.parametrize("arm", [[], ["planar2"]])
+def test_a_stop_by_root_stops_and_leaves_the_owner_what_it_writes(anothers: Path, arm: list[str]) -> None:
+    with closing(sqlite3.connect(anothers / FILE)) as other:
+        other.execute("BEGIN IMMEDIATE")  # so that the line of the audit trail waits as a file, too
+        assert main(["stop", *arm, "--state", str(anothers)]) == 0
+    assert control_path(anothers, "planar2").is_file()
+    assert len(list((anothers / "audit.waiting").iterdir())) == 1
+    assert owners(anothers) == {NOBODY}
+    assert main(["stop", *arm, "--state", str(anothers)]) == 0
+    assert owners(anothers) == {NOBODY}
+    with being(NOBODY), Database(anothers) as db:
+        assert [line["what"] for line in trail(db)[:2]] == ["stop", "stop"]
+        with ControlFile.take(control_path(anothers, "planar2"), None):
+            pass
+
+
+@as_root
+def test_the_closed_folder_of_another_user_is_told_in_words(
+    anothers: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reaching = (("stop",), ("stop", "planar2"), ("pause", "planar2"), ("jobs", "list"))
+    verbs = (VERBS[0], ("ack", "planar2", "late_cycle"), ("prune", "--keep", "1"), *reaching)
+    for words in verbs:  # what they import may lie where root alone can read
+        main([*words, "--state", str(tmp_path / "mine")])
+    for state in (anothers, anothers / "below"):
+        for words in verbs:
+            capsys.readouterr()
+            with being(4242):
+                assert main([*words, "--state", str(state)]) == 2, words
+            said = capsys.readouterr().err
+            assert "as the user whose folder it is" in said or f"sudo -u nobody IDENT_STATE={state}" in said, words
+            if words[0] == "stop":
+                assert "nothing was stopped" in said
+                assert "ident stop --server URL" in said
+
+
+@as_root
+@pytest.mark.slow
+def test_whoever_cannot_read_the_token_may_stop_a_daemon_of_this_machine(
+    entered: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    entered.mkdir(mode=0o700)
+    with daemon_process(entered) as (_, client):
+        words = ["--server", client.url, "--state", str(entered)]
+        assert main(["stop", *words]) == 0
+        with being(NOBODY):
+            assert main(["stop", *words]) == 0
+            assert main(["jobs", "list", *words]) == 2
+        assert "token" in capsys.readouterr().err

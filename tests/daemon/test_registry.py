@@ -7,10 +7,12 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from ident_service.errors import UnknownId, UsageError
+from ident_service.service.jobs.outcome import Said, outcome
 from ident_service.service.registry import jobs
 from ident_service.service.registry.audit import note, trail
 from ident_service.service.registry.database import FILE, Database
@@ -183,3 +185,25 @@ def test_a_token_file_is_not_read_through_a_link(tmp_path: Path) -> None:
     (tmp_path / TOKEN_FILE).symlink_to(tmp_path / "elsewhere")
     with pytest.raises(UsageError, match="cannot be read"):
         read_token(tmp_path / TOKEN_FILE)
+
+
+def test_a_refusal_says_why_in_the_jobs_own_line() -> None:
+    def detail(**answer: Any) -> str:
+        found = outcome(Said({"exit_code": 3, **answer}), 3, "")
+        assert found.state == "refused"
+        return found.detail
+
+    failed = {"code": "gravity", "verdict": "failed", "reason": "elbow: 9 N m more", "remedy": "Look at the load."}
+    person = {"code": "watchdog", "verdict": "needs_person", "reason": "nobody answered", "remedy": ""}
+    good = {"code": "noise", "verdict": "passed", "reason": "", "remedy": ""}
+    assert detail(ticket={"checks": [good, failed, person]}) == (
+        "gravity: elbow: 9 N m more (Look at the load.); watchdog: nobody answered"
+    )
+    assert detail(feasible=True, unusable=["the data pull against the mass of link 2"]) == (
+        "the data pull against the mass of link 2"
+    )
+    assert detail(feasible=False, unusable=[]) == "no real body can have these parameters"
+    assert detail(objections=["too fast"], error=None) == "too fast"
+    assert detail(error={"kind": "MotionRefused", "message": "not checked yet"}, objections=["x"]) == "not checked yet"
+    for odd in ({"ticket": 3}, {"ticket": {"checks": 3}}, {"ticket": {"checks": [3]}}, {"unusable": "x"}):
+        assert detail(**odd) == ""

@@ -7,6 +7,7 @@ import json
 import os
 import pty
 import re
+import shlex
 import shutil
 import termios
 import time
@@ -27,6 +28,7 @@ from ident_service.cli.remote_words import lines_of
 from ident_service.cli.words import Parser
 from ident_service.client import IdentClient
 from ident_service.errors import ArmError
+from ident_service.service.arm_state import fault_file
 
 RUN = "20260101T000000Z-quick"
 SINGULAR = "20260103T000000Z-quick"
@@ -286,3 +288,60 @@ def test_a_rehearsal_elsewhere_ends_with_the_key_here(
         assert client.get("/api/v1/jobs?most=1")[0]["state"] == "done"
     os.close(master)
     os.close(slave)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_person_elsewhere_reads_what_one_at_the_machine_does(
+    state: Path, commissioned: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with daemon_process(state) as (_, client):
+        server = ["--server", client.url, "--state", str(state)]
+        client.add_arm(quick_text())
+        client.add_arm(unstable_text().replace("name: quick", "name: unstable"))
+        assert main(["check", "unstable", "--confirm", "unstable", *server]) == 3
+        said = capsys.readouterr().out
+        assert "FAILED     gains are stable at this rate and delay" in said  # the table
+        assert "-> Lower kp and kd" in said
+        job = next(client.jobs())
+        assert job.detail.startswith("stability: ")
+        assert main(["jobs", "show", job.id, *server]) == 0
+        assert "FAILED     gains are stable" in capsys.readouterr().out
+        # The commands that are named can be given as they stand.
+        fault_file(state, "quick").latch("late_cycle", "a cycle came late")
+        assert main(["recover", "quick", *server]) == 3
+        said = capsys.readouterr().out
+        assert str(state) not in said
+        commands = [shlex.split(one)[1:] for one in re.findall(r"`(ident [^`]+)`", said)]
+        assert ["ack", "quick", "late_cycle", *server[:2]] in commands
+        for words in commands:
+            assert parser().parse_args(words).arm == "quick"
+        assert main([*next(one for one in commands if one[0] == "ack"), "--state", str(state)]) == 0
+        assert main(["recover", "quick", *server]) == 0
+        assert client.answer(next(client.jobs()).id)["steps"] == ["`ident check quick` for the next motion."]
+
+
+@pytest.mark.slow
+def test_what_is_no_file_here_is_told_so_and_files_of_a_description_are_sent(
+    state: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with daemon_process(state) as (_, client):
+        server = ["--server", client.url, "--state", str(state)]
+        for words in (
+            ["identify", "monday.csv", "--arm", "planar2"],
+            ["identify", "runs/monday.csv", "--arm", "planar2"],
+            ["preview", "planar2", "monday.json"],
+            ["run", "planar2", str(tmp_path / "monday.json"), "--confirm", "planar2"],
+        ):
+            assert main([*words, *server]) == 2
+            assert re.search(r"monday.\w+: no such file here, and the daemon at http", capsys.readouterr().err)
+        body = on_a_bus()
+        (tmp_path / "arm.yaml").write_text(body["description"])
+        (tmp_path / "puck.eds").write_text(body["files"]["puck.eds"])
+        assert main(["config", "check", str(tmp_path / "arm.yaml"), *server]) == 0
+        broken = "format: ident-arm\nversion: 1\nname: broken\nkinematics: {urdf: broken.urdf}\n"
+        (tmp_path / "arm.yaml").write_text(broken)
+        (tmp_path / "broken.urdf").write_text("<robot name='a'><link name='b'/>")
+        capsys.readouterr()
+        assert main(["config", "check", str(tmp_path / "arm.yaml"), *server]) == 2
+        assert "arm.yaml:4:1: kinematics: broken.urdf: not a URDF" in capsys.readouterr().err

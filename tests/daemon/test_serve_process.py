@@ -166,6 +166,34 @@ def test_what_would_be_open_is_not_served(
     assert not (state / "token").exists()
 
 
+def test_tls_that_cannot_be_spoken_is_said_before_anything_begins(
+    state: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def made(name: str, *more: str) -> tuple[Path, Path]:
+        key, pem = tmp_path / f"{name}.key", tmp_path / f"{name}.pem"
+        words = ("openssl", "req", "-x509", "-newkey", "ed25519", "-days", "2", "-subj", "/CN=localhost")
+        subprocess.run(
+            [*words, "-keyout", str(key), "-out", str(pem), *(more or ("-nodes",))], check=True, capture_output=True
+        )
+        return pem, key
+
+    pem, key = made("good")
+    _, other = made("other")
+    _, locked = made("locked", "-passout", "pass:secret")
+    words = tmp_path / "words.pem"
+    words.write_text("no certificate\n")
+    for cert, own, reason in (
+        (words, key, "both PEM"),
+        (pem, words, "both PEM"),
+        (pem, other, "the key is not that of the certificate"),
+        (pem, locked, "the key is encrypted"),
+    ):
+        code, document = ident(capsys, "serve", "--tls-cert", cert, "--tls-key", own, "--state", state)
+        assert code == 2
+        assert reason in document["error"]["message"]
+    assert not state.exists()
+
+
 @pytest.mark.parametrize(
     "url",
     ["http://robot.example:8470", "ftp://127.0.0.1", "127.0.0.1:8470", "http://u@localhost", "http://127.0.0.1:99999"],

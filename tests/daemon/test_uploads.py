@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import errno
+import gzip
 import hashlib
 import json
 import os
+import re
 import signal
 import socket
+import tempfile
 import time
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from daemon.conftest import Asked, quick_text
 from daemon.served import daemon_process
+from helpers.forks import fork
 
 from ident_service.cli import main
 from ident_service.client import IdentClient
@@ -78,7 +83,7 @@ def test_a_recording_arrives_in_pieces_and_is_a_run_when_it_is_whole(daemon: Ask
     assert daemon.get("/api/v1/uploads").json() == []
     # What is there is not sent again.
     assert daemon.post("/api/v1/uploads", announced(content)).json()["run"] == run
-    assert daemon.post("/api/v1/uploads", announced(content, columns="x")).json()["run"] is None
+    assert daemon.post("/api/v1/uploads", announced(content, columns=COLUMNS)).json()["run"] is None
 
 
 def test_what_is_not_what_was_announced_is_not_kept(daemon: Asked) -> None:
@@ -164,10 +169,87 @@ def test_a_piece_has_eight_megabytes_and_one_writer(daemon: Asked) -> None:
     upload = daemon.post("/api/v1/uploads", announced(b"", bytes=2 * most)).json()["id"]
     assert sent(daemon, upload, 0, bytes(most)).json()["received"] == most
     assert sent(daemon, upload, most, bytes(most + 1)).status_code == 413
-    seen = daemon.get(f"/api/v1/uploads/{upload}").json()["received"]
-    with uploads.Piece(daemon.service.state, upload, seen):
-        refused = sent(daemon, upload, seen, b"x")
+    assert daemon.get(f"/api/v1/uploads/{upload}").json()["received"] == most
+    with uploads.Piece(daemon.service.state, upload, most):
+        refused = sent(daemon, upload, most, b"x")
         assert (refused.status_code, "another piece" in refused.text) == (409, True)
+
+
+def test_of_a_refused_piece_nothing_is_kept(daemon: Asked) -> None:
+    upload = daemon.post("/api/v1/uploads", announced(b"0123456789")).json()["id"]
+    assert sent(daemon, upload, 0, b"0123").json()["received"] == 4
+
+    async def chunks() -> AsyncIterator[bytes]:
+        yield b"4567"
+        yield b"89 and more"
+
+    refused = daemon.ask("PATCH", f"/api/v1/uploads/{upload}", content=chunks(), headers={"Upload-Offset": "4"})
+    assert (refused.status_code, "more were sent" in refused.text) == (400, True)
+    assert daemon.get(f"/api/v1/uploads/{upload}").json()["received"] == 4
+    assert sent(daemon, upload, 4, b"456789").json()["received"] == 10
+
+
+@pytest.mark.parametrize(
+    ("columns", "status", "said"),
+    [
+        ("columns: {t: t", 422, r"^columns.yaml:2:1: "),
+        (COLUMNS.replace("mNm", "parsec"), 422, "unit 'parsec' is not known"),
+        (COLUMNS.replace("q1: a", "q1: {column: a, unit: mm}"), 400, "shoulder turns"),
+        (COLUMNS.replace("  q2: b\n", "").replace("  tau2: v\n", ""), 400, "1 joints, but the arm has 2"),
+        (COLUMNS + "rate: 100\n", 400, "rate is of all recordings"),
+    ],
+)
+def test_columns_are_judged_before_anything_is_sent(daemon: Asked, columns: str, status: int, said: str) -> None:
+    answer = daemon.post("/api/v1/uploads", announced(b"x", columns=columns))
+    assert answer.status_code == status, answer.text
+    message = answer.json()["error"]["message"]
+    assert re.search(said, message), message
+    assert tempfile.gettempdir() not in message
+    assert not (daemon.service.state / ".uploads").exists()
+
+
+@pytest.mark.parametrize("name", ["mine.csv", "mine.csv.gz"])
+def test_a_header_is_judged_as_soon_as_it_has_arrived(daemon: Asked, name: str) -> None:
+    def pieces(header: str) -> list[bytes]:
+        rows = "".join(f"{1000 * n},{n % 7},{n % 5},{n % 3},{n % 11}\n" for n in range(20_000))
+        content = f"{header}\n{rows}".encode()
+        content = gzip.compress(content) if name.endswith("gz") else content
+        return [content[:5], content[5:20_000], content[20_000:]]
+
+    for header, good in (("stamp,a,b,u,v", True), ("stamp,a,b,u,w", False)):
+        first, second, last = pieces(header)
+        begun = announced(first + second + last, columns=COLUMNS, name=name)
+        upload = daemon.post("/api/v1/uploads", begun).json()["id"]
+        assert sent(daemon, upload, 0, first).status_code == 200
+        answer = sent(daemon, upload, 5, second)
+        assert answer.status_code == (200 if good else 422), answer.text
+        if good:
+            assert sent(daemon, upload, 20_000, last).status_code == 200
+            assert daemon.post(f"/api/v1/uploads/{upload}/complete").status_code == 201
+        else:
+            assert answer.json()["error"]["kind"] == "RecordingError"
+            assert "no column 'v' for tau2" in answer.json()["error"]["message"]
+            assert daemon.get(f"/api/v1/uploads/{upload}").status_code == 404
+            assert list((daemon.service.state / ".uploads").iterdir()) == []
+
+
+def test_a_process_that_is_started_meanwhile_does_not_keep_an_upload(daemon: Asked) -> None:
+    state, upload = daemon.service.state, daemon.post("/api/v1/uploads", announced(b"mine")).json()["id"]
+    begun, ending = os.pipe(), os.pipe()
+    with uploads.Piece(state, upload, 0) as piece:
+        if (child := fork()) == 0:  # as a job's process is, before it runs its program
+            os.write(begun[1], b"x")
+            os.close(ending[1])
+            os.read(ending[0], 1)
+            os._exit(0)
+        os.read(begun[0], 1)
+        piece.write(b"mi")
+    try:
+        assert sent(daemon, upload, 2, b"ne").status_code == 200
+        assert daemon.post(f"/api/v1/uploads/{upload}/complete").status_code == 201
+    finally:
+        os.close(ending[1])
+        os.waitpid(child, 0)
 
 
 def test_half_uploads_go_after_a_day(daemon: Asked) -> None:

@@ -114,7 +114,11 @@ class ProgressAnswer(BaseModel):
 
 
 class JobAnswer(BaseModel):
-    """A job; `run` is the id of the run, motion or export that it makes or is about."""
+    """A job; `run` is the id of the run, motion or export that it makes or is about.
+
+    `held` says that its motion has stopped, and that the arm, which has no brakes, is held until a person confirms that
+    it is supported; until then the job runs.
+    """
 
     number: int
     id: str
@@ -131,6 +135,7 @@ class JobAnswer(BaseModel):
     exit_code: int | None
     detail: str
     progress: ProgressAnswer | None
+    held: bool = False
 
 
 class JobResult(BaseModel):

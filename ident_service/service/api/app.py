@@ -47,6 +47,7 @@ from ident_service.service.metrics import Metrics
 from ident_service.service.news import Watch
 from ident_service.service.pages.routes import PAGES
 from ident_service.service.registry.arms import know_shipped
+from ident_service.service.registry.audit import enter_waiting
 from ident_service.service.registry.database import Database
 from ident_service.service.registry.runs import rebuild_runs
 from ident_service.service.registry.tokens import first_token
@@ -143,6 +144,7 @@ async def _refresh(service: Service) -> None:
                 clean = time.monotonic() + _CLEAN
                 for upload in await run_in_threadpool(delete_half_uploads, service.state):
                     _LOG.info("an upload was left alone for a day and is deleted", extra={"upload": upload})
+            await run_in_threadpool(enter_waiting, service.db, service.state)
             await run_in_threadpool(service.gate.refresh)
             await run_in_threadpool(service.db.rest)
         except (sqlite3.Error, OSError) as error:

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.config.source import MOST_BYTES
 from ident_service.errors import MotionRefused
+from ident_service.model.arm_model import arm_model
 from ident_service.motion.control_file import mover
 from ident_service.service.acceptance import LONGEST_NOTE, accept, acceptances, rollback
 from ident_service.service.api.answers import (
@@ -196,8 +197,9 @@ def list_motions(
 @router.post("/motions", status_code=201)
 def add_motion(service: Serving, who: Operator, body: MotionUpload) -> MotionAnswer:
     """Upload a motion that was designed elsewhere; preflight judges it like any other."""
-    name = known.known_arm(service.db, service.state, body.arm).name
-    return MotionAnswer(**motions.add_motion(service.db, service.state, name, body.motion, who.name))
+    arm = known.known_arm(service.db, service.state, body.arm)
+    joints = arm_model(arm.config).chain.joints
+    return MotionAnswer(**motions.add_motion(service.db, service.state, arm.name, body.motion, who.name, joints))
 
 
 @router.get("/motions/{motion}")
@@ -215,7 +217,7 @@ def _arm(service: Service, arm: str) -> ArmAnswer:
         source="shipped" if found.source == "shipped" else "uploaded",
         description=config.description,
         sha256=config.sha256,
-        joints=list(config.joints) or list(config.kinematics.dh.joints if config.kinematics.dh else ()),
+        joints=list(config.joints) or list(arm_model(config).chain.names),
         simulated=isinstance(config.driver, SimulatedDriver),
         unattended_motion=config.unattended_motion,
         resources=list(known.resources(config)),

@@ -38,12 +38,19 @@ LastEvent = Annotated[
         description="the last `id` that was seen; everything that has happened since is told first",
     ),
 ]
+After = Annotated[int | None, Query(ge=0, lt=2**62, description="the same, for whoever cannot send that header")]
 Samples = Annotated[bool, Query(description="also `samples` and `doubt` of runs that are recorded")]
 
 
 @router.get("/events", response_class=StreamingResponse, responses=_STREAM)
 async def watch_all(
-    service: Serving, _: Viewer, told: Told, request: Request, last_event_id: LastEvent = None, samples: Samples = False
+    service: Serving,
+    _: Viewer,
+    told: Told,
+    request: Request,
+    last_event_id: LastEvent = None,
+    after: After = None,
+    samples: Samples = False,
 ) -> StreamingResponse:
     """Watch all arms and jobs by server-sent events.
 
@@ -52,7 +59,8 @@ async def watch_all(
     with its `job`.
     """
     watch: Watch = request.app.state.watch
-    seen = await run_in_threadpool(watch.begin, last_event_id)
+    # The header counts first: a browser that comes again sends it with the address of the first time.
+    seen = await run_in_threadpool(watch.begin, after if last_event_id is None else last_event_id)
     live = request.app.state.live if samples else None
     return StreamingResponse(told(_events(service, watch, seen, live)), media_type="text/event-stream")
 

@@ -6,9 +6,10 @@ import asyncio
 import hashlib
 import json
 import sqlite3
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
+from types import MappingProxyType
 from typing import Annotated, Any, Final, Literal
 
 from fastapi import APIRouter, Header, HTTPException, Query, Response
@@ -24,12 +25,14 @@ from ident_service.service.api.paging import PAGES, BeforeNumber, Most, Page
 from ident_service.service.jobs.asked import MOVES, ArmName, Asked, Id
 from ident_service.service.jobs.commands import JOBS
 from ident_service.service.jobs.outcome import said
+from ident_service.service.jobs.reach import held_arm
 from ident_service.service.registry import jobs as rows
 from ident_service.service.registry.database import Row
 from ident_service.service.registry.tokens import Access
 
 router = APIRouter(prefix="/api/v1", tags=["jobs"], responses=failures(404, 409))
 MOST_LOG: Final = 2**20
+NOTHING: Final[Mapping[str, str]] = MappingProxyType({})
 _EVENTS = 0.2  # s between looks at a job that is watched
 _BREATH = 10.0  # s without news, after which a comment shows that the line is up
 # Its own threads: whatever else is busy, a stop is not.
@@ -159,7 +162,7 @@ def get_result(service: Serving, _: Viewer, job: Id) -> JobResult:
     """Read what the command of a job answered."""
     row = rows.known_job(service.db, job)
     answer = said(service.state / JOBS / row["id"]).answer
-    return JobResult(job=row["id"], answer=without_paths(answer, str(service.state)))
+    return JobResult(job=row["id"], answer=_named(answer, service, row))
 
 
 @router.get("/jobs/{job}/events", response_class=StreamingResponse, responses=_STREAM)
@@ -209,19 +212,34 @@ def answer_of(service: Service, row: Row) -> JobAnswer:
     """A job as it is answered: without the words of its command, which name places of this machine."""
     found = service.engine.progress(row)
     shown = {key: value for key, value in row.items() if key in JobAnswer.model_fields}
-    shown["detail"] = without_paths(row["detail"], str(service.state))
-    progress = None if found is None else without_paths(asdict(found), str(service.state))
-    return JobAnswer(**{**shown, "progress": progress})
+    shown["detail"] = _named(row["detail"], service, row)
+    progress = None if found is None else _named(asdict(found), service, row)
+    held = bool(row["motion"]) and row["state"] == "running" and held_arm(service.state, str(row["arm"]))
+    return JobAnswer(**{**shown, "progress": progress, "held": held})
 
 
-def without_paths(value: Any, state: str) -> Any:
-    """Values in which places below the state folder are told relative to it."""
+def _named(value: Any, service: Service, row: Row) -> Any:
+    """Values of a job as others may read them: its arm by name, in commands too, and no places of this machine."""
+    described = {word: row["arm"] for word in row["words"] if word.startswith("/") and word.endswith(".yaml")}
+    return without_paths(value, str(service.state), described if row["arm"] is not None else {})
+
+
+def without_paths(value: Any, state: str, named: Mapping[str, str] = NOTHING) -> Any:
+    """Values in which places below the state folder are told relative to it.
+
+    Args:
+        value: JSON values.
+        state: the folder.
+        named: what other places are called.
+    """
     if isinstance(value, str):
+        for place, name in named.items():
+            value = value.replace(place, name)
         return value.replace(f"{state}/", "")
     if isinstance(value, list):
-        return [without_paths(part, state) for part in value]
+        return [without_paths(part, state, named) for part in value]
     if isinstance(value, dict):
-        return {key: without_paths(part, state) for key, part in value.items()}
+        return {key: without_paths(part, state, named) for key, part in value.items()}
     return value
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import logging
 import sqlite3
 from dataclasses import asdict
@@ -18,17 +17,20 @@ from ident_service.errors import (
     AlreadyThere,
     ArmError,
     ConfigError,
+    DiskFull,
     IdentError,
     InUse,
     ModelError,
     MotionRefused,
     ParameterError,
     RecordingError,
+    RegistryBusy,
+    Unavailable,
     UnknownId,
     UsageError,
 )
 from ident_service.service.api.answers import Failure
-from ident_service.service.registry.database import RegistryBusy
+from ident_service.service.registry.database import FILE, shortage
 
 _STATUS: Final[tuple[tuple[type[IdentError], int], ...]] = (
     (UnknownId, 404),
@@ -40,8 +42,11 @@ _STATUS: Final[tuple[tuple[type[IdentError], int], ...]] = (
     (ParameterError, 422),
     (RecordingError, 422),
     (MotionRefused, 409),
+    (DiskFull, 507),
+    (Unavailable, 503),
     (ArmError, 409),
 )
+_KINDS: Final = {413: "TooLarge"}  # whose phrase is another one in each version of Python
 _LOG = logging.getLogger("ident.http")
 _WORDS: Final = {
     400: "The request cannot be meant.",
@@ -82,7 +87,7 @@ def answer_mistakes(app: FastAPI) -> None:
     """Turn every error into that shape."""
 
     async def _resources(request: Request, error: Exception) -> JSONResponse:
-        if (short := _short_of(error)) is None:
+        if (short := _short_of(request, error)) is None:
             raise error  # a mistake of ours: the last handler tells it
         status, kind, words, headers = short
         _LOG.error("%s: %s", words, error, extra={"path": request.url.path})
@@ -93,8 +98,9 @@ def answer_mistakes(app: FastAPI) -> None:
 
     @app.exception_handler(IdentError)
     async def _ident(request: Request, error: IdentError) -> JSONResponse:
-        if isinstance(error.__context__, OSError | sqlite3.Error) and _short_of(error.__context__) is not None:
-            return await _resources(request, error.__context__)
+        for cause in (error, error.__context__):
+            if isinstance(cause, OSError | sqlite3.Error | Unavailable) and _short_of(request, cause) is not None:
+                return await _resources(request, cause)
         status = status_of(error)
         if status == HTTPStatus.INTERNAL_SERVER_ERROR:
             _LOG.error("an answer failed", exc_info=error)
@@ -108,7 +114,7 @@ def answer_mistakes(app: FastAPI) -> None:
 
     @app.exception_handler(HTTPException)
     async def _http(_: Request, error: HTTPException) -> JSONResponse:
-        kind = HTTPStatus(error.status_code).phrase.title().replace(" ", "").replace("-", "")
+        kind = _KINDS.get(error.status_code) or HTTPStatus(error.status_code).phrase.title().replace(" ", "")
         return _answer(error.status_code, kind, str(error.detail), dict(error.headers or {}))
 
     @app.exception_handler(Exception)
@@ -117,12 +123,14 @@ def answer_mistakes(app: FastAPI) -> None:
         return _answer(500, "InternalError", "the service failed; its log says how")
 
 
-def _short_of(error: BaseException) -> tuple[int, str, str, dict[str, str]] | None:
+def _short_of(request: Request, error: Exception) -> tuple[int, str, str, dict[str, str]] | None:
     """Tell what the machine, or the registry, is short of; None where an error says something else."""
-    code = getattr(error, "sqlite_errorcode", 0) & 0xFF  # of the extended codes, the primary one
-    if isinstance(error, RegistryBusy) or code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
+    found = error
+    if not isinstance(error, Unavailable):
+        found = shortage(request.app.state.service.state / FILE, error) or error
+    if isinstance(found, RegistryBusy):
         return 503, "RegistryBusy", "another process keeps the registry; ask again", {"Retry-After": "2"}
-    if code == sqlite3.SQLITE_FULL or getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT):
+    if isinstance(found, DiskFull):
         return 507, "DiskFull", "the disk of the state folder is full; make room, then ask again", {}
     return None
 

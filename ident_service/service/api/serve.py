@@ -7,6 +7,7 @@ import gc
 import logging
 import signal
 import socket
+import ssl
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -40,8 +41,10 @@ def serve(settings: Settings, tell: Callable[[str], None] = lambda _: None) -> N
         tell: called with the address, when it answers.
 
     Raises:
-        UsageError: another service has the state folder, others can enter it, or the address cannot be had.
+        UsageError: another service has the state folder, others can enter it, the address cannot be had, or TLS cannot
+            be spoken with its certificate and key.
     """
+    _require_tls(settings)
     keep_private(settings.state)
     book = Connections(most_connections())
     with single_instance(settings.state), _listening(settings, book) as listening:
@@ -145,6 +148,41 @@ async def _make_routes(app: FastAPI) -> None:
     scope = {"type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": "POST", "scheme": "http"}
     place = {"path": "/nothing", "raw_path": b"/nothing", "query_string": b"", "root_path": "", "headers": []}
     await app.router({**scope, **place}, receive, send)
+
+
+def _require_tls(settings: Settings) -> None:
+    """Refuse a certificate or a key with which nobody could be answered.
+
+    Raises:
+        UsageError: a file cannot be read, is no PEM, or the key is another certificate's, or encrypted.
+    """
+    if settings.tls_cert is None or settings.tls_key is None:
+        return
+    for path in (settings.tls_cert, settings.tls_key):
+        try:
+            path.read_bytes()
+        except OSError as error:
+            raise UsageError(f"{path}: cannot be read: {error.strerror}; the daemon's user needs it") from None
+    asked = list[bool]()
+
+    def password() -> str:
+        asked.append(True)
+        return ""
+
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    try:
+        # Without a word of ours, OpenSSL would ask the terminal for one.
+        context.load_cert_chain(settings.tls_cert, settings.tls_key, password)
+    except (ssl.SSLError, ValueError, OSError) as error:
+        why = "the key is encrypted; give one without a password" if asked else _tls_words(error)
+        raise UsageError(f"{settings.tls_cert}, {settings.tls_key}: TLS cannot be spoken with these: {why}") from None
+
+
+def _tls_words(error: Exception) -> str:
+    reason = getattr(error, "reason", None)
+    if reason == "KEY_VALUES_MISMATCH":
+        return "the key is not that of the certificate"
+    return f"--tls-cert takes a certificate chain and --tls-key its key, both PEM ({reason or error})"
 
 
 @contextmanager

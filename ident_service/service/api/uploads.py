@@ -9,6 +9,7 @@ from fastapi.concurrency import run_in_threadpool
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.requests import ClientDisconnect
 
+from ident_service.errors import IdentError
 from ident_service.service import uploads
 from ident_service.service.api.asking import Operator, Serving, Viewer
 from ident_service.service.api.mistakes import failures
@@ -74,13 +75,17 @@ def get_upload(service: Serving, _: Viewer, upload: Id) -> UploadAnswer:
 
 @router.patch("/uploads/{upload}", responses=failures(404, 409), openapi_extra=_PIECE)
 async def add_piece(request: Request, service: Serving, _: Operator, upload: Id, upload_offset: Offset) -> UploadAnswer:
-    """Send the next piece of a recording, 8 MiB at most; what has arrived of a torn piece stays."""
+    """Send the next piece of a recording, 8 MiB at most; what has come of a torn piece stays, of a refused one not."""
     with await run_in_threadpool(uploads.Piece, service.state, upload, upload_offset) as piece:
         try:
             async for data in request.stream():
                 await run_in_threadpool(piece.write, data)
         except ClientDisconnect:
             raise HTTPException(400, "the piece broke off; go on after what has arrived of it") from None
+        except (IdentError, HTTPException):  # more bytes than were announced, or than a piece may have
+            await run_in_threadpool(piece.withdraw)
+            raise
+    await run_in_threadpool(uploads.require_header, service.db, service.state, upload)
     return _answer(await run_in_threadpool(uploads.known_upload, service.state, upload))
 
 

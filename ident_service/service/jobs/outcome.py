@@ -6,6 +6,7 @@ Boundary: files in, a state and words out.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -18,6 +19,7 @@ _MOST = 32 * 2**20
 _LAST = 64 * 1024
 _STATES: Final = {0: "done", 3: "refused", 4: "faulted"}
 STOPPED: Final = "stopped"
+_REFUSING: Final = ("failed", "needs_person")  # verdicts of a preflight's check (`motion/preflight/check.py`)
 
 
 @dataclass(frozen=True)
@@ -129,8 +131,24 @@ def lateness_of(folder: Path) -> Any:
 
 
 def _message(answer: dict[str, Any]) -> str:
+    """Say why a command ended so: in the words of its error, or by what its answer objects to."""
     error = answer.get("error")
-    return str(error.get("message", "")) if isinstance(error, dict) else ""
+    return str(error.get("message", "")) if isinstance(error, dict) else "; ".join(_objections(answer))
+
+
+def _objections(answer: dict[str, Any]) -> Iterator[str]:
+    ticket = answer.get("ticket")
+    checks = ticket.get("checks") if isinstance(ticket, dict) else None
+    for check in checks if isinstance(checks, list) else ():
+        if isinstance(check, dict) and check.get("verdict") in _REFUSING:
+            yield f"{check.get('code')}: {check.get('reason')}" + (
+                f" ({remedy})" if (remedy := check.get("remedy")) else ""
+            )
+    for key in ("unusable", "objections"):
+        said = answer.get(key)
+        yield from map(str, said if isinstance(said, list) else ())
+    if answer.get("feasible") is False:
+        yield "no real body can have these parameters"
 
 
 def _report(answer: dict[str, Any]) -> dict[str, Any]:

@@ -44,6 +44,15 @@ def confirm_support(state: Path, arm: str) -> bool:
     return bool(_reach(state, arm, _asking(ControlFile.confirm_support)))
 
 
+def held_arm(state: Path, arm: str) -> bool:
+    """Tell whether an arm without brakes is held after a stop until a person confirms that it is supported."""
+    try:
+        with ControlFile.reach(control_path(state, arm)) as controls:
+            return controls.waiting
+    except UsageError:  # nobody moves or holds it
+        return False
+
+
 def moving_arms(state: Path) -> list[str]:
     """Names of the arms that anybody moves."""
     return _reach(state, None, mover)

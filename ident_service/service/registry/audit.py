@@ -1,19 +1,28 @@
-"""Who did what, and when: rows that are added and never changed (a trigger of the database keeps that)."""
+"""Who did what, and when: rows that are added and never changed (a trigger of the database keeps that).
+
+What was done at a terminal while the registry was kept waits as a file below `STATE/audit.waiting`. The daemon enters
+it, or the next act at a terminal, with the time of the act.
+"""
 
 from __future__ import annotations
 
 import json
 import logging
+import secrets
 import sqlite3
 import threading
 import time
 from collections import deque
+from pathlib import Path
 from typing import Any, Final
 
+from ident_service.record.files import write_atomically
 from ident_service.service.registry.database import Database, Row
+from ident_service.service.state_folder import leave_to_owner
 
 _AGAIN: Final = 1.0  # s between tries to enter what the registry has no room for
 _MOST_WAITING: Final = 10_000
+_WAITING: Final = "audit.waiting"
 LOG = logging.getLogger("ident.audit")
 _Line = tuple[float, str, str, str, str]
 
@@ -29,6 +38,42 @@ def note(db: Database, who: str, what: str, about: str, **detail: Any) -> None:
         detail: JSON values.
     """
     _enter(db, _line(who, what, about, detail))
+
+
+def note_later(state: Path, who: str, what: str, about: str, **detail: Any) -> None:
+    """Leave one line, with the time of now, for whoever can write the registry next; as `note`.
+
+    Args:
+        state: the state folder.
+        who: as for `note`.
+        what: as for `note`.
+        about: as for `note`.
+        detail: as for `note`.
+
+    Raises:
+        OSError, UsageError: it cannot be written either.
+    """
+    path = state / _WAITING / f"{time.time_ns()}-{secrets.token_hex(4)}.json"
+    path.parent.mkdir(mode=0o700, exist_ok=True)
+    write_atomically(path, json.dumps(_line(who, what, about, detail)))
+    leave_to_owner(state, path)
+
+
+def enter_waiting(db: Database, state: Path) -> None:
+    """Enter the lines that `note_later` has left; each once, whoever is killed meanwhile."""
+    place = state / _WAITING
+    for path in sorted(place.glob("*.json")) if place.is_dir() else ():
+        try:
+            at, *words = json.loads(path.read_text(encoding="utf-8"))
+            who, what, about, detail = map(str, words)
+            line = (float(at), who, what, about, detail)
+        except (OSError, ValueError, TypeError) as error:  # another process was first, or somebody's file
+            LOG.warning("%s: not entered: %s", path, error)
+            continue
+        with db.transaction():
+            if db.row("SELECT 1 FROM audit WHERE (at, who, what, about) = (?, ?, ?, ?)", *line[:4]) is None:
+                _enter(db, line)
+        path.unlink(missing_ok=True)
 
 
 class AuditQueue:

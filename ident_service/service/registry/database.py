@@ -7,6 +7,7 @@ One connection writes and another one reads: who reads does not wait for who wri
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 import re
@@ -19,7 +20,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
-from ident_service.errors import UsageError
+from ident_service.errors import DiskFull, IdentError, RegistryBusy, UsageError
 from ident_service.service.registry.migrations import MIGRATIONS
 from ident_service.service.state_folder import require_whole
 
@@ -29,8 +30,47 @@ _IDLE = 2.0  # s
 Row = Mapping[str, Any]
 
 
-class RegistryBusy(sqlite3.OperationalError):
-    """Other threads have written for so long that a write does not wait any longer."""
+_WANTED = 2**16  # bytes; SQLite's shared index of its log takes half of them, and calls their lack an input error
+
+
+def registry_error(path: Path, error: Exception) -> IdentError:
+    """Return what an error of SQLite, or of the registry's disk, means to whoever asked.
+
+    Args:
+        path: the registry's file.
+        error: as it was raised, by SQLite or the operating system.
+    """
+    if (short := shortage(path, error)) is not None:
+        return short
+    code = _primary(error)
+    if code in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
+        return UsageError(f"{path}: is damaged ({error}); put a backup back: `ident restore FILE --replace`")
+    return UsageError(f"{path}: cannot be used: {error}; see who owns it, or give another state folder")
+
+
+def shortage(path: Path, error: BaseException) -> RegistryBusy | DiskFull | None:
+    """Return what is short for a while where an error says so; None where it says something else.
+
+    Args:
+        path: the registry's file.
+        error: an error of SQLite or of the operating system.
+    """
+    code = _primary(error)
+    if code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
+        return RegistryBusy(f"{path}: another process keeps the registry; nothing is lost, ask again when it is done")
+    full = code == sqlite3.SQLITE_FULL or getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
+    if code in (sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN) and not full:
+        with suppress(OSError):
+            disk = os.statvfs(path.parent)
+            full = disk.f_bavail * disk.f_frsize < _WANTED or 0 == disk.f_favail < disk.f_files
+    if full:
+        return DiskFull(f"{path.parent}: its disk is full; make room, then ask again")
+    return None
+
+
+def _primary(error: BaseException) -> int:
+    """Return the primary code of SQLite's extended ones; 0 for no error of SQLite."""
+    return int(getattr(error, "sqlite_errorcode", None) or 0) & 0xFF
 
 
 class Database:
@@ -46,6 +86,8 @@ class Database:
 
         Raises:
             UsageError: it cannot be made, is damaged, or was written by newer software; or a restore broke off.
+            RegistryBusy: another process keeps it.
+            DiskFull: there is no room for it.
         """
         require_whole(state)
         self._path, self._lock, self._read_lock = state / FILE, threading.RLock(), threading.Lock()
@@ -58,7 +100,7 @@ class Database:
             self._connection = self._connect(busy)
             self._reader = self._connect(busy)
         except (OSError, sqlite3.Error) as error:
-            raise UsageError(f"{self._path}: cannot be opened: {error}; give another state folder") from None
+            raise registry_error(self._path, error) from None
         try:
             for pragma in ("journal_mode = WAL", "synchronous = FULL", "foreign_keys = ON"):
                 self._connection.execute(f"PRAGMA {pragma}")
@@ -70,8 +112,8 @@ class Database:
                     self._path.with_name(self._path.name + ending).chmod(0o600)
         except sqlite3.Error as error:
             self.close()
-            raise UsageError(f"{self._path}: {error}; the file is damaged or in use, put a copy of it back") from None
-        except UsageError:
+            raise registry_error(self._path, error) from None
+        except IdentError:
             self.close()
             raise
 
@@ -100,7 +142,9 @@ class Database:
         """All that is written in the block, or nothing of it; blocks within blocks are one."""
         # Who waits behind one that waits for another process waits no longer than that one.
         if not self._lock.acquire(timeout=self._busy + 1.0):
-            raise RegistryBusy("the registry is being written")
+            busy = sqlite3.OperationalError("other threads have written for too long")
+            busy.sqlite_errorcode, busy.sqlite_errorname = sqlite3.SQLITE_BUSY, "SQLITE_BUSY"
+            raise busy
         try:
             if self._writer is not None:
                 yield

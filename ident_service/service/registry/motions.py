@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from ident_service.errors import UnknownId
+from ident_service.errors import UnknownId, UsageError
 from ident_service.excitation.excitation import excitation_from_json, read_excitation
 from ident_service.results.files import appearing_folder, write_atomically
 from ident_service.results.manifest import file_sha256
@@ -39,13 +39,23 @@ def index_motion(db: Database, state: Path, motion: str, arm: str, by: str) -> N
     )
 
 
-def add_motion(db: Database, state: Path, arm: str, text: str, by: str) -> Row:
+def add_motion(db: Database, state: Path, arm: str, text: str, by: str, joints: int) -> Row:
     """Take an uploaded motion.
 
+    Args:
+        db: the registry.
+        state: the state folder.
+        arm: name of the arm that it is for.
+        text: content of the motion's file.
+        by: who.
+        joints: how many the arm has.
+
     Raises:
-        UsageError: not a motion; the message says what is wrong with it.
+        UsageError: not a motion, or one of an arm with another number of joints; the message says what is wrong.
     """
-    excitation_from_json(text)
+    found = excitation_from_json(text).path.joints
+    if found != joints:
+        raise UsageError(f"a motion of {found} joints, but {arm} has {joints}; upload one that was designed for it")
     motion = new_id(arm)
     with appearing_folder(state / MOTIONS / motion) as folder:
         write_atomically(folder / MOTION_FILE, text)

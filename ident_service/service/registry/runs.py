@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import time
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
@@ -153,6 +154,13 @@ def run_file(db: Database, state: Path, run: str, name: str) -> Path:
         UnknownId: no such run, or no such file in it.
     """
     if name not in run_files(db, state, run):
+        gone = db.row("SELECT deleted FROM recordings WHERE run = ? AND name = ? AND deleted > 0", run, name)
+        if gone is not None:
+            when = datetime.fromtimestamp(gone["deleted"], UTC).strftime("%Y-%m-%d")
+            raise UnknownId(
+                f"the recording {name} of the run {run} was deleted on {when} to make room (`ident prune`); what was "
+                "identified from it stays, and another recording is needed for more"
+            )
         raise UnknownId(f"the run {run} has no file {name!r}; its manifest names them")
     return run_folder(db, state, run) / name
 

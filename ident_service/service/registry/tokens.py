@@ -151,6 +151,15 @@ def first_token(db: Database, state: Path) -> Path:
     return path
 
 
+def revoke_first_tokens(db: Database, by: str) -> None:
+    """Let no token count any more that `first_token` made, for a registry that comes into another place or time."""
+    for row in db.rows(
+        "SELECT name FROM tokens WHERE revoked IS NULL AND name IN "
+        "(SELECT about FROM audit WHERE who = 'service' AND what = 'token added')"
+    ):
+        revoke_token(db, row["name"], by)
+
+
 def read_token(path: Path) -> str | None:
     """The token in a file; None without one.
 
