@@ -1,4 +1,4 @@
-"""Computed torque with a proportional and derivative loop (5.2.1, eq. 76, figure 3), and damping alone.
+"""Compute joint torques: computed torque with proportional-derivative feedback (5.2.1, eq. 76, figure 3), and damping.
 
     alpha = ddq_r + K_d (dq_r - dq) + K_p (q_r - q)          tau = M(q) alpha + c(q, dq) + g(q) + f(dq_r)
 
@@ -24,7 +24,7 @@ from ident_service.motion.reference import Setpoint
 
 
 class ComputedTorque:
-    """The control law and its velocity filter.
+    """Compute the control law and filter the velocity for it.
 
     Attributes:
         position: of the last update [rad or m], shape (joints,), predicted where it was not measured.
@@ -45,7 +45,7 @@ class ComputedTorque:
         position: Vector,
         friction: FrictionFeedforward | None = None,
     ) -> None:
-        """Begin at rest.
+        """Start with the arm at rest.
 
         Args:
             dynamics: the prior model.
@@ -67,7 +67,7 @@ class ComputedTorque:
         self.correction = self.answer = self.feedforward = self._none
 
     def torque(self, position: Vector, valid: Flags, reference: Setpoint, elapsed: float | None = None) -> Vector:
-        """One update.
+        """Return the computed torque for the next cycle; updates the velocity filter.
 
         Args:
             position: measured [rad or m], shape (joints,).
@@ -96,7 +96,7 @@ class ComputedTorque:
         elapsed: float | None = None,
         back: Vector | float = 0.0,
     ) -> Vector:
-        """One update without a reference.
+        """Return the torque that damps motion and compensates gravity, without a position reference.
 
         Args:
             position: as for `torque`.
@@ -118,7 +118,7 @@ class ComputedTorque:
         return torque
 
     def _filtered(self, position: Vector, valid: Flags, elapsed: float | None) -> Vector:
-        """Update the velocity; the position, with predictions where it was not measured."""
+        """Update the velocity filter and return the position, predicted where it was not measured."""
         seconds = self._period if elapsed is None else elapsed
         gain = self._gain if seconds == self._period else _gain(self._cutoff, seconds)
         if not valid.all():

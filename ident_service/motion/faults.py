@@ -1,4 +1,4 @@
-"""What can be wrong while an arm moves, and what is done about it: one table, after FIELDBUS.md 5.2.
+"""Define every fault of a moving arm and the reaction to it, in one table after FIELDBUS.md 5.2.
 
 Reactions, from mild to severe; a motion only ever goes from a milder one to a more severe one.
 
@@ -21,8 +21,6 @@ A run that ends in DONE stands where it stood, supported, before it began; its t
 Where this table differs from FIELDBUS.md 5.2: a frozen encoder takes the torque (decision 0008); beyond a position
 limit the stop is controlled as long as the arm is no further out than a following error, because these limits are
 ours and lie inside the hardware's; faults of the program and of single axes quick-stop instead of dropping the arm.
-
-Boundary: data, and what counts warnings; who finds a fault is `guard.py`, `deadlines.py` and `loop.py`.
 """
 
 from __future__ import annotations
@@ -40,7 +38,7 @@ WINDOW = 100  # cycles over which warnings are counted (libfranka's success rate
 
 
 class Reaction(IntEnum):
-    """What a fault leads to, from mild to severe."""
+    """Name the reactions to a fault, from mild to severe."""
 
     WARN = 0
     CONTROLLED_STOP = 1
@@ -50,12 +48,12 @@ class Reaction(IntEnum):
 
     @property
     def stop_kind(self) -> StopKind:
-        """How torque ends, at once or at last."""
+        """Return how the drives end torque under this reaction, immediately or after lowering or holding."""
         return StopKind.TORQUE_OFF if self is Reaction.TORQUE_OFF else StopKind.QUICK_STOP
 
 
 class Severity(IntEnum):
-    """How bad it is, as levels of rcl_interfaces/msg/Log."""
+    """Name the severities of faults, as levels of rcl_interfaces/msg/Log."""
 
     WARNING = 30
     ERROR = 40
@@ -64,7 +62,7 @@ class Severity(IntEnum):
 
 @dataclass(frozen=True)
 class Rule:
-    """One row of the table.
+    """Represent one row of the fault table.
 
     Attributes:
         reaction: to the fault.
@@ -82,7 +80,7 @@ class Rule:
 
     @property
     def severity(self) -> Severity:
-        """How bad it is."""
+        """Return the severity that follows from the reaction."""
         if self.reaction is Reaction.WARN:
             return Severity.WARNING
         return Severity.FATAL if self.reaction >= Reaction.QUICK_STOP else Severity.ERROR
@@ -151,7 +149,7 @@ FAULTS: dict[str, Rule] = {
 
 @dataclass(frozen=True)
 class Fault:
-    """Something that must not be, found in one cycle.
+    """Represent a fault found in one cycle.
 
     Attributes:
         code: its name in the table.
@@ -165,12 +163,12 @@ class Fault:
 
     @property
     def severity(self) -> Severity:
-        """How bad it is."""
+        """Return the severity of the fault, from the table."""
         return FAULTS[self.code].severity
 
 
 class Findings:
-    """Makes faults, and makes too many warnings into one.
+    """Create faults from the table, and turn repeated warnings into a fault.
 
     Attributes:
         cycle: number of the present cycle, for whoever counts cycles to advance.
@@ -183,7 +181,7 @@ class Findings:
         self._recent: dict[str, deque[int]] = {}
 
     def found(self, code: str, what: str) -> Fault:
-        """A fault of the table, or what a warning becomes when it is found too often.
+        """Return a fault of the table, or the fault that a warning becomes when it is found too often.
 
         Args:
             code: in the table.

@@ -1,4 +1,4 @@
-"""Whether a run keeps clear of the arm itself and of its surroundings: the motion, the ways to and from it, the stops.
+"""Check that a run keeps clear of the arm itself and of its surroundings: the motion, ways to and from it, stops.
 
 Motion and ways are proven for all time (`excitation/clearance.py`); stops are looked at where they begin every 50 ms,
 and must only not touch: a stop is short, rare, and better than what it was asked for.
@@ -34,12 +34,12 @@ _ROUNDING = 1e-6  # m, more than what coal's distances are wrong by
 
 @dataclass(frozen=True)
 class Nearest:
-    """Where something comes nearest.
+    """Represent the smallest distance found on a motion.
 
     Attributes:
-        distance: [m]; infinite where there is nothing to touch.
-        pair: whose it is, or None.
-        time: when [s].
+      distance: [m]; infinite where there is nothing to touch.
+      pair: names of the two bodies, or None.
+      time: at which the distance is smallest [s].
     """
 
     distance: float
@@ -48,10 +48,10 @@ class Nearest:
 
 
 class Surroundings:
-    """What a way that is found while the arm is energised must keep clear of."""
+    """Check that references which are found while the arm is energised keep clear of the surroundings."""
 
     def __init__(self, model: ArmModel, limits: MotionLimits) -> None:
-        """Take an arm.
+        """Prepare the collision model of an arm.
 
         Args:
             model: with its geometry and surroundings; without any, every way is clear.
@@ -65,7 +65,7 @@ class Surroundings:
         self._limits = limits
 
     def require_clear(self, way: Reference, limits: MotionLimits) -> Generator[None, None, None]:
-        """Prove that a way keeps clear and that no stop out of it touches, a bearable part of a cycle at a time.
+        """Prove that a way keeps clear and that no stop out of it touches, in slices short enough for a control cycle.
 
         Where the arm stands nearer to something than the clearance, as after a stop, half of that distance is kept.
 
@@ -111,7 +111,7 @@ class Surroundings:
 def stops_touching(
     collision: CollisionModel, way: Reference, limits: MotionLimits
 ) -> Generator[None, None, str | None]:
-    """The stop out of a way that would touch something, in words, or None, a bearable part of a cycle at a time."""
+    """Return a stop out of a way that would touch something, in words, or None; in slices, like `require_clear`."""
     for time in np.arange(0.0, way.duration, _BEGINS).tolist():
         reference = stop(way.at(time), limits)
         yield
@@ -140,7 +140,7 @@ def way_clearance(collision: CollisionModel, reference: Reference, limits: Motio
 
 
 def stop_clearance(path: Path, limits: MotionLimits, model: ArmModel) -> Nearest:
-    """The smallest distance on stops out of a motion, bodies replaced by capsules around them."""
+    """Return the smallest distance on stops out of a motion, bodies replaced by capsules around them."""
     capsules = CapsuleModel(model)
     nearest = Nearest(float("inf"), None, 0.0)
     if not capsules.pairs:
@@ -158,7 +158,7 @@ def stop_clearance(path: Path, limits: MotionLimits, model: ArmModel) -> Nearest
 
 
 def touching_stop(path: Path, limits: MotionLimits, model: ArmModel) -> str | None:
-    """The stop out of a motion that would touch something, in words; None where none does."""
+    """Describe the stop out of a motion that would touch something; None where none does."""
     nearest = stop_clearance(path, limits, model)
     if nearest.distance > 0.0:
         return None

@@ -1,4 +1,4 @@
-"""Jerk-limited ways from one moving state to another: the approach, the return, the way back onto a motion.
+"""Plan jerk-limited trajectories from one moving state to another: approach, return, the way back onto a motion.
 
 Every way is a ruckig trajectory within the arm's velocity, acceleration and jerk; ruckig is imported nowhere else.
 """
@@ -22,7 +22,7 @@ _EXTENT_STEP = 1e-3  # s; a turning point lies at most acceleration * step^2 / 8
 
 
 class RuckigReference:
-    """A jerk-limited trajectory."""
+    """Represent a jerk-limited trajectory computed by ruckig."""
 
     def __init__(self, parameters: ruckig.InputParameter) -> None:
         self._trajectory = ruckig.Trajectory(parameters.degrees_of_freedom)
@@ -35,16 +35,16 @@ class RuckigReference:
         self.duration = float(self._trajectory.duration)
 
     def at(self, time: float) -> Setpoint:
-        """Setpoint at `time` [s]."""
+        """Return the setpoint at `time` [s]."""
         position, velocity, acceleration = self._trajectory.at_time(min(time, self.duration))[:3]
         return Setpoint(np.array(position), np.array(velocity), np.array(acceleration))
 
     def extent(self) -> tuple[Vector, Vector]:
-        """Lowest and highest position on the way, each of shape (joints,), but for what happens between two points."""
+        """Return the lowest and highest position on the way, each of shape (joints,), sampled every `_EXTENT_STEP`."""
         return at_once(self.extent_in_slices())
 
     def extent_in_slices(self) -> Generator[None, None, tuple[Vector, Vector]]:
-        """As `extent`, a bearable part of a control cycle at a time."""
+        """Compute `extent` in slices short enough for a control cycle; the generator returns both positions."""
         # The position_extrema of ruckig itself miss turning points (pantor/ruckig#215), here by more than 0.1 rad.
         times = np.linspace(0.0, self.duration, 2 + int(self.duration / _EXTENT_STEP)).tolist()
         at_time = self._trajectory.at_time
@@ -61,9 +61,9 @@ _CALM = 0.5  # of the limits, on the way to a motion and back
 
 
 def calm_way(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference:
-    """The way to a motion or back from it: within half of the velocity and acceleration limits where its ends allow.
+    """Plan the way to a motion or back, within half of the velocity and acceleration limits where its ends allow.
 
-    A way at the full limits leaves nothing for what the model does not know, and nobody waits for its last second.
+    A way at the full limits leaves no margin for errors of the model, and nobody waits for its last second.
 
     Raises:
         MotionRefused: as `way`.
@@ -72,7 +72,7 @@ def calm_way(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigRefe
 
 
 def calm_way_in_slices(start: Setpoint, end: Setpoint, limits: MotionLimits) -> Generator[None, None, RuckigReference]:
-    """As `calm_way`, a bearable part of a control cycle at a time; the generator returns the way.
+    """Plan as `calm_way` does, in slices short enough for a control cycle; the generator returns the trajectory.
 
     Raises:
         MotionRefused: as `way`, from any of its steps.
@@ -88,7 +88,7 @@ def calm_way_in_slices(start: Setpoint, end: Setpoint, limits: MotionLimits) -> 
 
 
 def way(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference:
-    """From one moving or resting state to another, all joints arriving together.
+    """Plan a trajectory from one moving or resting state to another, all joints arriving together.
 
     Raises:
         MotionRefused: no such way exists within the limits, or it would leave the position limits.
@@ -97,7 +97,7 @@ def way(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference
 
 
 def way_in_slices(start: Setpoint, end: Setpoint, limits: MotionLimits) -> Generator[None, None, RuckigReference]:
-    """As `way`, a bearable part of a control cycle at a time; the generator returns the way.
+    """Plan as `way` does, in slices short enough for a control cycle; the generator returns the trajectory.
 
     Raises:
         MotionRefused: as `way`, from any of its steps.
@@ -127,7 +127,7 @@ def way_in_slices(start: Setpoint, end: Setpoint, limits: MotionLimits) -> Gener
 
 
 def at_once(slices: Generator[None, None, _Result]) -> _Result:
-    """What a generator returns."""
+    """Run a generator to its end and return its result."""
     while True:
         try:
             next(slices)

@@ -1,4 +1,4 @@
-"""Direction and scale of every joint, by a small jerk-limited motion there and back, one joint at a time.
+"""Check direction and scale of every joint, by a small jerk-limited motion there and back, one joint at a time.
 
 Two numbers per joint. How it follows: the displacement measured from dwell to dwell against the one asked for. And how
 it answers torque: measured acceleration against the one that the model expects of the torque that acted,
@@ -6,7 +6,6 @@ it answers torque: measured acceleration against the one that the model expects 
 the answer to torque shows it, as it shows a wrong gear ratio, squared. A joint whose sign is wrong runs away from its
 reference, until the guard ends that at twice the amplitude; what it did on the way says whether the sign was why.
 
-Boundary: the motions and the judgement; the loop is `session.py`.
 """
 
 from __future__ import annotations
@@ -60,7 +59,7 @@ SIGN_REMEDY = (
 
 @dataclass(frozen=True)
 class Stroke:
-    """A small motion of one joint from where it stands and back.
+    """Represent a small test motion of one joint from where it stands and back.
 
     Attributes:
         joint: index.
@@ -75,11 +74,11 @@ class Stroke:
 
     @property
     def duration(self) -> float:
-        """Both ways and the dwells [s]."""
+        """Return the duration of both ways and the dwells [s]."""
         return self.there.duration + self.back.duration + 3.0 * DWELL
 
     def at(self, time: float) -> Setpoint:
-        """Setpoint at `time` [s]."""
+        """Return the setpoint at `time` [s]."""
         time -= DWELL
         if time < self.there.duration + DWELL:
             return self.there.at(max(time, 0.0))
@@ -88,12 +87,12 @@ class Stroke:
 
 @dataclass(frozen=True)
 class Answer:
-    """What a joint did.
+    """Represent the response of one joint to its test motion.
 
     Attributes:
-        follows: measured against commanded displacement; not a number where it was not moved.
-        answers: measured against expected acceleration, likewise.
-        doubt: its standard deviation.
+        follows: measured over commanded displacement; NaN where the joint was not moved.
+            answers: measured over expected acceleration; NaN likewise.
+            doubt: standard deviation of `answers`.
     """
 
     follows: float
@@ -102,7 +101,7 @@ class Answer:
 
 
 def strokes(session: Session, model: ArmModel, limits: MotionLimits, only: int | None = None) -> list[Stroke]:
-    """A small motion for every joint, or for one, by number.
+    """Plan a small test motion for every joint, or for one, by number.
 
     Raises:
         MotionRefused: a joint has no room within its position limits or its surroundings.
@@ -125,10 +124,10 @@ def strokes(session: Session, model: ArmModel, limits: MotionLimits, only: int |
 
 
 def follow_stroke(session: Session, stroke: Stroke) -> tuple[Rows, Rows]:
-    """Move one joint there and back, to learn its friction, and once more.
+    """Move one joint there and back three times: twice to learn its friction, the second time shaken, and once more.
 
     Returns:
-        What happened the last time, and the time before, when the joint was shaken on its way (`delay.py`).
+        The cycles of the last time, and of the time before, when the joint was shaken on its way (`delay.py`).
 
     Raises:
         ArmFault, DriverError: from the loop.
@@ -142,13 +141,13 @@ def follow_stroke(session: Session, stroke: Stroke) -> tuple[Rows, Rows]:
 
 
 def answer(trace: Trace, stroke: Stroke, session: Session) -> Answer:
-    """Judge a stroke that the loop could follow to its end."""
+    """Evaluate a test motion that the loop could follow to its end."""
     answers, doubt = _answer_to_torque(trace, stroke.joint, session)
     return Answer(_displaced(trace, stroke) / stroke.amplitude, answers, doubt)
 
 
 def _answer_to_torque(trace: Trace, joint: int, session: Session) -> tuple[float, float]:
-    """Measured against expected acceleration, and its standard deviation; no numbers where it hardly moved."""
+    """Return measured over expected acceleration and its standard deviation; NaN where the joint hardly moved."""
     nothing = float("nan"), float("nan")
     rate = trace.rate[:, joint]
     window = max(5, 2 * round(0.5 * _WINDOW / trace.period) + 1)
@@ -168,7 +167,7 @@ def _answer_to_torque(trace: Trace, joint: int, session: Session) -> tuple[float
 
 
 def _displaced(trace: Trace, stroke: Stroke) -> float:
-    """Mean way there and back, from dwell to dwell [rad or m]."""
+    """Return the mean displacement there and back, from dwell to dwell [rad or m]."""
     ends = (DWELL, stroke.there.duration + 2.0 * DWELL, stroke.duration)
     last = max(1, round(_SETTLED / trace.period))
     rows = [round(end / trace.period) for end in ends]
@@ -177,7 +176,7 @@ def _displaced(trace: Trace, stroke: Stroke) -> float:
 
 
 def went_against(trace: Trace, joint: int, session: Session) -> bool:
-    """Whether the joint that has gone astray went against its own torque, since it last stood.
+    """Return whether the joint that left its reference accelerated against its own torque, since it last stood.
 
     Friction holds it until the torque is large enough, and is constant afterwards, so that only what comes after it has
     begun to move counts, with a constant torque taken out.
@@ -197,7 +196,7 @@ def went_against(trace: Trace, joint: int, session: Session) -> bool:
 
 
 def wrong_signs(trace: Trace, session: Session) -> list[int]:
-    """Joints whose sign explains how a loop ended at the guard.
+    """Return the joints whose wrong sign explains how the guard ended a loop.
 
     Measured displacements against the twice integrated accelerations that the model expects, constant torques that the
     model does not know (gravity's for example) taken out on both sides. Joints are coupled, so that one wrong sign
@@ -245,7 +244,7 @@ def wrong_signs(trace: Trace, session: Session) -> list[int]:
 
 
 def sign_failure(joints: Sequence[int], model: ArmModel, why: str) -> Check:
-    """The direction check of an arm with joints that went the wrong way."""
+    """Return the failed direction check of an arm with joints that went the wrong way."""
     names = ", ".join(model.chain.names[joint] for joint in joints)
     return failed("direction", f"{names}: seems to move against its torque ({why})", SIGN_REMEDY)
 
@@ -253,7 +252,7 @@ def sign_failure(joints: Sequence[int], model: ArmModel, why: str) -> Check:
 def direction_check(
     answers: Sequence[Answer], model: ArmModel, session: Session, delays: Sequence[Delay] = ()
 ) -> Check:
-    """Judge all strokes of a session, and the delays that were measured on them."""
+    """Judge all test motions of a session, and the delays that were measured on them."""
     names, ones = model.chain.names, ("",) * model.chain.joints
     nothing = np.zeros(len(names))
     follows = np.array([one.follows for one in answers])
@@ -314,7 +313,7 @@ def _free_stroke(
 
 
 def expected_way(trace: Trace, session: Session, sign: Vector | float = 1.0) -> Vector:
-    """How far the model expects the torque that acted, times `sign`, to have moved the arm, shape (cycles, joints)."""
+    """Return the displacement that the model expects of the torque times `sign` [rad or m], (cycles, joints)."""
     acceleration = np.linalg.solve(session.inertia, (sign * (trace.torque - session.gravity)).T).T
     start = np.zeros((1, acceleration.shape[1]))
     speed = np.vstack([start, np.cumsum(acceleration, axis=0)[:-1]]) * trace.period
@@ -323,7 +322,7 @@ def expected_way(trace: Trace, session: Session, sign: Vector | float = 1.0) -> 
 
 
 def _fitted(columns: Vector, values: Vector, correlated: float) -> tuple[float, float]:
-    """The first coefficient of a least-squares fit and its standard deviation.
+    """Return the first coefficient of a least-squares fit and its standard deviation.
 
     Args:
         columns: shape (samples, unknowns).

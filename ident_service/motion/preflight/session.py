@@ -1,4 +1,4 @@
-"""The part of preflight with torque: a closed loop that may go next to nowhere.
+"""Run the part of preflight with torque: a control loop that may move the arm by next to nothing.
 
 The arm has just been seen at rest without torque, so it is supported where it stands. The loop is that of a run, but
 its guard stops it `FARTHEST` from where it should be, at a crawl, and its torque is kept to a band around the model's
@@ -41,7 +41,7 @@ Rows = Sequence[tuple[Sample, Setpoint]]
 
 @dataclass(frozen=True)
 class Trace:
-    """What happened, as arrays of one row per period from the first cycle's stamp on.
+    """Hold the cycles of a loop as arrays, one row per period from the first cycle's stamp on.
 
     In a period in which no cycle came, because the machine was late, positions and references are between those around
     it, and the torque before it acted on.
@@ -62,7 +62,7 @@ class Trace:
 
 
 def trace_of(rows: Rows, period: float) -> Trace:
-    """Cycles with their references, the earliest first, as a trace.
+    """Return cycles with their references, the earliest first, as a trace.
 
     Args:
         rows: at least one; stamps rise.
@@ -85,7 +85,7 @@ def trace_of(rows: Rows, period: float) -> Trace:
 
 
 class Session:
-    """A guarded loop on an open arm at rest.
+    """Run a guarded loop on an open arm at rest.
 
     Attributes:
         home: where the arm stood [rad or m], shape (joints,).
@@ -107,7 +107,7 @@ class Session:
         home: Vector,
         friction: ExpectedFriction,
     ) -> None:
-        """Prepare; nothing is sent.
+        """Prepare the loop; nothing is sent.
 
         Args:
             arm: open, at rest, not enabled.
@@ -149,7 +149,7 @@ class Session:
         self._stiffness = limits.kp * np.diag(self.mass)
 
     def energise(self) -> None:
-        """Enable; the first cycle of `follow` sends the torque that holds the arm.
+        """Enable the arm; the first cycle of `follow` sends the torque that holds it.
 
         Raises:
             DriverError: the drives refuse.
@@ -171,7 +171,7 @@ class Session:
             shaking: amplitude [N m or N], shape (joints,), and frequency [Hz] of a sinusoidal torque on top.
 
         Returns:
-            What happened, for `trace_of`.
+            The cycles with their references, for `trace_of`.
 
         Raises:
             ArmFault: the guard or a drive found something that is more than a warning; `trace` tells the story.
@@ -198,7 +198,7 @@ class Session:
 
     @property
     def torque(self) -> Vector:
-        """The torque that is sent next [N m or N], shape (joints,)."""
+        """Return the torque that is sent next [N m or N], shape (joints,)."""
         return self._torque
 
     def lead_in_silence(self, sample: Sample, setpoint: Setpoint, given_up: Flags, *, sends: bool) -> None:
@@ -234,7 +234,7 @@ class Session:
         self._torque = self._limited(self._torque)
 
     def trace(self) -> Trace:
-        """The cycles of the last `follow`, also of one that a fault ended."""
+        """Return the cycles of the last `follow` as a trace, also of one that a fault ended."""
         return trace_of(self._rows, self.period)
 
     def release(self) -> None:
@@ -249,7 +249,7 @@ class Session:
         self._arm.stop(StopKind.TORQUE_OFF)
 
     def _led(self, sample: Sample, setpoint: Setpoint, given_up: Flags) -> Vector:
-        """The control law's torque for a sample that the guard has judged [N m or N], shape (joints,)."""
+        """Judge a sample by the guard and return the control law's torque for it [N m or N], shape (joints,)."""
         since, control = self._since(sample.stamp_ns, sample.stamp_doubt_ns), self._control
         velocity, correction = (np.where(given_up, 0.0, of) for of in (control.velocity, control.correction))
         known = self._since.known
@@ -259,7 +259,7 @@ class Session:
         return control.torque(sample.position, usable, setpoint, since if known else 0.0)
 
     def _against_friction(self, setpoint: Setpoint, learning: float) -> Vector:
-        """Torque that moving joints need besides the model's, learned from how they lag [N m or N], shape (joints,)."""
+        """Return the friction torque of moving joints, learned from their lag [N m or N], shape (joints,)."""
         rate = setpoint.velocity
         direction = np.where(np.abs(rate) > _CREEP, np.sign(rate), 0.0)
         lag = (setpoint.position - self._control.position) * direction
