@@ -69,8 +69,8 @@ class Guard:
             position: where it stands [rad or m], shape (joints,).
             revolute: which joints turn, for the units in the sentences; all when None.
             contact: pairs of solids that may not touch; None for no collision check.
-            owed: estimates how far joints that stand still would have moved; without it, only hard pushes and full speed
-            reveal frozen encoders.
+            owed: estimates how far joints that stand still would have moved; without it, only hard pushes and full
+            motion reveal frozen encoders.
             max_age: cycles without an axis' feedback before it counts as gone (`ArmDescription.lost_cycles`).
         """
         joints = len(position)
@@ -128,7 +128,7 @@ class Guard:
             reference: where the arm should be at its stamp.
             velocity: filtered velocity before this sample [rad/s or m/s], shape (joints,).
             correction: of the torque before this sample, what the errors added to it [N m or N], shape (joints,).
-            answer: the feedback acceleration in it [rad/s^2 or m/s^2], shape (joints,); `owed` is not updated when None.
+            answer: the feedback acceleration in it [rad/s^2 or m/s^2], shape (joints,); without, `owed` is not updated.
             elapsed: since the sample before [s]; one period when None.
             known: whether `elapsed` is the true time; if not, it is the longest that it may be.
             feedforward: friction in the torque before this sample [N m or N], shape (joints,), which pushes a joint

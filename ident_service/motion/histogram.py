@@ -31,7 +31,7 @@ class Histogram:
         self._counts[int(self._edges.searchsorted(time_ns, side="left"))] += 1
 
     def below_us(self, share: float) -> float:
-        """Return the bin edge [us] that `share` of all times do not exceed; the longest time if that is the last bin."""
+        """Return the bin edge [us] that `share` of all times do not exceed; the longest time if in the last bin."""
         if self.count == 0:
             return 0.0
         seen = 0

@@ -47,7 +47,7 @@ class Plan(Protocol):
         """Return the limits of this run; MotionRefused where none may begin at this position [rad or m], (joints,)."""
 
     def legs(self, model: ArmModel, start: Vector, limits: MotionLimits) -> Sequence[Leg]:
-        """Return the references from `start` [rad or m], (joints,), in order; MotionRefused where they lead too near."""
+        """Return the references from `start` [rad or m], (joints,), in order; MotionRefused if they lead too near."""
 
 
 @dataclass(frozen=True)

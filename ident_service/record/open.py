@@ -1,4 +1,4 @@
-"""Opens a recording by what is in the file, whatever it is called."""
+"""Open a recording by what is in the file, whatever its name."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def open_recording(
 
 
 def _with_torque(recording: McapRecording, torque: Literal["measured", "commanded"] | None) -> Recording:
-    """A recording of ours with the torque that is asked for."""
+    """Return a recording of this package with the torque that is asked for."""
     if torque == "commanded":
         return recording
     measured = MeasuredRecording(recording)

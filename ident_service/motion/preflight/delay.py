@@ -42,7 +42,7 @@ class Delay:
 
 
 def dither(session: Session, limits_torque: Vector, joint: int) -> Vector:
-    """Return the amplitude of the sinusoidal torque on one joint [N m or N], shape (joints,); zero in too slow a loop."""
+    """Return the amplitude of a sinusoidal torque on one joint [N m or N], (joints,); zero in too slow a loop."""
     if FREQUENCY * session.period > 1.0 / _LEAST_SAMPLES:
         return np.zeros(len(limits_torque))
     size = min(_TORQUE * limits_torque[joint], _SPEED * session.inertia[joint, joint] * 2.0 * np.pi * FREQUENCY)
@@ -93,7 +93,7 @@ def delay_of(trace: Trace, expected: Vector, joint: int) -> Delay | None:
 def delay_measures(delays: Sequence[Delay], model: ArmModel, period: float) -> list[Measure]:
     """Compare the delay of all joints together with the configured one (`identification.delay`).
 
-    Each joint's own delay is told, too. Nothing is judged where all together do not know the delay to `_SURE` of a cycle.
+    Each joint's own delay is told, too. Nothing is judged where all together do not know it to `_SURE` of a cycle.
     """
     if not delays:
         return []

@@ -1,4 +1,4 @@
-"""Check what is known before an arm is opened: its description, the motion made for it, what is proven of the motion."""
+"""Check what is known before an arm is opened: its description, the motion made for it, what is proven of that."""
 
 from __future__ import annotations
 
