@@ -1,4 +1,4 @@
-"""Which family a drive belongs to: the data files beside this module, and those of an arm's description before them."""
+"""Determine a drive's family, from the data files beside this module and from the arm's description, which comes first."""
 
 from __future__ import annotations
 

@@ -1,9 +1,7 @@
-"""Who is on the buses of an arm: heartbeats overheard, then SDO uploads from every node number there is; nothing else.
+"""Scan the buses of an arm for nodes: heartbeats, then SDO uploads from every node number; nothing else is sent.
 
-No NMT command, no write: a scan changes nothing. It takes the buses for itself, and asks nobody while another host
-streams, whose frames it would delay.
-
-Boundary: what nodes say. Whether they are the configured ones is the service's to judge.
+No NMT command, no write: a scan changes nothing. It takes the buses for itself, and asks no node while another host
+streams, whose frames it would delay. Whether the nodes are the configured ones is judged elsewhere.
 """
 
 from __future__ import annotations
@@ -38,7 +36,7 @@ _SDO_BYTES = 8
 
 @dataclass
 class FoundNode:
-    """What one node says of itself; None for what it does not have.
+    """Describe one node by its heartbeat and uploads; None for what it does not have.
 
     Attributes:
         bus: number of its bus, from 0.
@@ -72,12 +70,12 @@ class FoundNode:
 
     @property
     def is_drive(self) -> bool:
-        """Whether it says that it is a drive of CiA 402."""
+        """Return whether the node says that it is a drive of CiA 402."""
         return self.device_type is not None and self.device_type & 0xFFFF == DRIVE_PROFILE
 
 
 def scan(config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_links) -> list[FoundNode]:
-    """Everybody who is heard or answers, by bus and node number.
+    """Return every node that is heard or answers, by bus and node number.
 
     Args:
         config: with a CANopen driver.
@@ -94,7 +92,7 @@ def scan(config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_l
 def asking(
     config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_links
 ) -> Iterator[tuple[CanopenDriver, list[Link], Overheard]]:
-    """Have the buses for oneself, to ask on; who is heard in a second has been heard then.
+    """Open the buses of an arm exclusively, to ask nodes on them, after a second of listening for heartbeats.
 
     Args:
         config: with a CANopen driver.
@@ -153,12 +151,12 @@ def _found(driver: CanopenDriver, links: list[Link], heard: Overheard) -> list[F
 
 
 def hearing(heard: Overheard, bus: int) -> Callable[[Frame], None]:
-    """Return what takes the frames of a bus that are no answers."""
+    """Return the function that takes the frames of a bus that are not answers."""
     return lambda frame: heard.take(bus, frame)
 
 
 def _read(node: FoundNode, objects: Objects) -> None:
-    """What a node says of itself; one that falls silent in the middle keeps what it has said."""
+    """Read identity, names and errors of a node; one that falls silent in the middle keeps what was read."""
 
     def tried(read: Callable[[], T]) -> T | None:
         try:

@@ -63,15 +63,15 @@ class MotorLimits:
 
 @dataclass(frozen=True)
 class Setup:
-    """One drive's part of the configuration.
+    """Hold one drive's part of the configuration.
 
     Attributes:
-        drive: its section.
+        drive: its section of the description.
         profile: of its bus.
-        reactions: to what it finds by itself.
+        reactions: to faults that the drive finds by itself.
         quick_stop: 605Ah, in place of what `reactions` leaves open.
-        motor: what the joints' limits mean for it.
-        can: what it can.
+        motor: the joints' limits converted to this motor.
+        can: its capabilities.
     """
 
     drive: CanopenDrive
@@ -84,7 +84,7 @@ class Setup:
 
     @property
     def torque(self) -> TorquePath:
-        """Return how its torques are streamed."""
+        """Return the way in which its torques are streamed."""
         assert self.can.torque is not None  # noqa: S101 - else it has been refused
         return self.can.torque
 
@@ -94,13 +94,13 @@ class Setup:
         return torque_limit_counts(self.drive.max_torque, self.drive.rated_torque)
 
     def watchdog(self) -> list[Write]:
-        """Return what sets a watchdog of the maker's."""
+        """Return the downloads that set a watchdog of the maker's."""
         if (own := self.drive.watchdog_entry) is None:
             return []
         return [Write(Entry(own.index, own.sub, Kind[own.type.upper()], "watchdog of the drive's maker"), own.value)]
 
     def options(self) -> list[Write]:
-        """Return the reactions, for drives that let them be chosen."""
+        """Return the downloads of the reactions, for drives that let them be chosen."""
         return [
             Write(od.QUICK_STOP_OPTION, self.quick_stop),
             Write(od.FAULT_OPTION, self.reactions.fault),
@@ -108,7 +108,7 @@ class Setup:
         ]
 
     def hints(self) -> list[Write]:
-        """Return the cycle and the position limits, for drives that want to know them.
+        """Return the downloads of the cycle and the position limits, for drives that want to know them.
 
         They protect nothing: drives in torque mode give torque beyond the position limits.
         """
@@ -138,7 +138,7 @@ class Setup:
 
 
 def motor_limits(config: ArmConfig, found: Coordinates) -> list[MotorLimits]:
-    """Return what the limits of an arm's joints mean for each of its motors.
+    """Convert the limits of an arm's joints to each of its motors.
 
     Args:
         config: with a CANopen driver and a transmission.
@@ -155,14 +155,14 @@ def motor_limits(config: ArmConfig, found: Coordinates) -> list[MotorLimits]:
 
 
 def watchdogs_of(driver: CanopenDriver, names: Sequence[str]) -> tuple[Watchdog, ...]:
-    """Return what the watchdog of each drive watches; `names` are what people call the drives."""
+    """Return the watchdog of each drive; `names` are what people call the drives."""
     found, of_torque = zip(names, driver.drives, strict=True), ("rpdo_timer", "vendor")
     seconds = driver.watchdog_seconds
     return tuple(Watchdog(name, one.watchdog, seconds(one), one.watchdog in of_torque) for name, one in found)
 
 
 def differences(found: Mapping[str, int], wanted: DriveIdentity) -> list[str]:
-    """What of an identity (1018h), by the keys of `IDENTITY`, is another than the configuration wants; in words."""
+    """Describe how an identity (1018h), by the keys of `IDENTITY`, differs from the configured one; empty if it fits."""
     return [
         f"{name} is {found[name]:08X}h instead of {value:08X}h" if name in found else f"{name} is not told"
         for name, value in wanted.model_dump(exclude_none=True).items()
@@ -171,7 +171,7 @@ def differences(found: Mapping[str, int], wanted: DriveIdentity) -> list[str]:
 
 
 def quick_stop_option(config: ArmConfig) -> int:
-    """Return what 605Ah is set to: as described, else to stay in quick stop where the arm has no brakes."""
+    """Return the value for 605Ah: as described, else to stay in quick stop where the arm has no brakes."""
     assert isinstance(config.driver, CanopenDriver)  # noqa: S101 - of an arm of CANopen drives
     described = config.driver.reactions.quick_stop
     if described is not None:
@@ -180,7 +180,7 @@ def quick_stop_option(config: ArmConfig) -> int:
 
 
 def identify(objects: Objects, wanted: DriveIdentity) -> str:
-    """Ask a drive who it is.
+    """Read the identity of a drive and compare it with the wanted one.
 
     Returns:
         `node 3: vendor 0000019Eh, product ..., revision ..., serial ..., firmware ...`.
@@ -209,10 +209,10 @@ def identify(objects: Objects, wanted: DriveIdentity) -> str:
 
 
 def configure(objects: Objects, setup: Setup) -> int:
-    """Make a pre-operational drive speak the profile and protect itself; what it has already is not written.
+    """Configure a pre-operational drive for the profile and its own protection; what it has already is not written.
 
     Returns:
-        What 6060h is, which is sent with every control word.
+        The mode of operation (6060h), which is sent with every control word.
 
     Raises:
         DriverError: it lacks, refuses or forgets something; the message names the entry and says why.
@@ -242,7 +242,7 @@ def configure(objects: Objects, setup: Setup) -> int:
 
 
 def _timing(objects: Objects, setup: Setup) -> None:
-    """Have SYNC be without counter and window; 1019h is only written while 1006h is 0 (CiA 301, 7.5.2.22)."""
+    """Configure SYNC without counter and window; 1019h is only written while 1006h is 0 (CiA 301, 7.5.2.22)."""
     for write in setup.profile.identifiers(setup.drive.node):
         objects.ensure_if_there(write)
     counter = Write(od.SYNC_OVERFLOW, 0)
@@ -290,9 +290,9 @@ def _mode_entry(text: str) -> Entry:
 
 
 def released(objects: Objects, zeros: Zeros | None, number: int, restarted: Callable[[], bool]) -> Iterator[None]:
-    """Let a drive that is off forget that a host will be missed; one that is not shall miss it, and stop.
+    """Disable the supervision of the host in a drive that is off; one that is not shall miss the host, and stop.
 
-    It comes in steps of a few frames each, for cycles between them. What a drive vouches for (`zero.py`) it vouches for
+    It comes in steps of a few frames each, for cycles between them. A zero that the drive has confirmed (`zero.py`) it confirms
     afterwards too, and nothing else: one that restarted in the session has lost its zero.
 
     Args:
@@ -319,7 +319,7 @@ def released(objects: Objects, zeros: Zeros | None, number: int, restarted: Call
 
 
 def _encoder(objects: Objects, drive: CanopenDrive) -> None:
-    """Compare the described counts of a motor turn with those that the drive's own scaling says, where it has them.
+    """Compare the described counts of a motor turn with the drive's own scaling, where it has one.
 
     A drive with a gear ratio of its own (6091h) tells positions in another unit. Some give the lines of an encoder, of
     which each has four counts.
@@ -338,7 +338,7 @@ def _encoder(objects: Objects, drive: CanopenDrive) -> None:
 
 
 def _rated_torque(objects: Objects, setup: Setup) -> None:
-    """Set what a thousandth is of where the family lets it be set, or make sure that it is so where it does not."""
+    """Set the rated torque where the family lets it be set, or check that the drive's own is the described one."""
     unit, rated = setup.can.family.unit, setup.drive.rated_torque
     if unit is None or unit.rated is None or not unit.writable:
         return  # compared already
@@ -359,7 +359,7 @@ def _rated_torque(objects: Objects, setup: Setup) -> None:
 
 
 def _max_speed(objects: Objects, setup: Setup) -> None:
-    """Set the motor's largest speed, or make sure that the drive's own leaves the joints their velocities.
+    """Set the motor's largest speed, or check that the drive's own leaves the joints their velocities.
 
     Above it a drive takes its torque back, in the middle of a motion.
     """
@@ -380,7 +380,7 @@ def _max_speed(objects: Objects, setup: Setup) -> None:
 
 
 def _deceleration(objects: Objects, setup: Setup) -> None:
-    """Set the deceleration of quick stops (6085h), where a drive has one; it may have a better one of its own."""
+    """Set the deceleration of quick stops (6085h), where a drive has it; a sufficient one of the drive's own may stay."""
     if setup.motor.deceleration is None:
         return
     wanted = Write(od.QUICK_STOP_DECELERATION, setup.motor.deceleration)

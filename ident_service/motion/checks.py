@@ -37,8 +37,8 @@ class Check:
     """Represent the comparison of one quantity with its threshold, for all joints.
 
     Attributes:
-      code: of the fault that a violation would be.
-      hit: where the threshold is violated, shape (joints,) or (names,).
+        code: of the fault that a violation would be.
+        hit: where the threshold is violated, shape (joints,) or (names,).
         what: the sentence's middle; `{}` stands for numbers, `{u}` for the position's unit, `{f}` for the torque's.
         numbers: one array, shaped like `hit`, for each `{}`.
         names: of what `hit` is about, the joints when None.

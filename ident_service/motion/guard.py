@@ -70,7 +70,7 @@ class Guard:
             revolute: which joints turn, for the units in the sentences; all when None.
             contact: pairs of solids that may not touch; None for no collision check.
             owed: estimates how far joints that stand still would have moved; without it, only hard pushes and full
-            motion reveal frozen encoders.
+                motion reveal frozen encoders.
             max_age: cycles without an axis' feedback before it counts as gone (`ArmDescription.lost_cycles`).
         """
         joints = len(position)

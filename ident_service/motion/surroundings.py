@@ -37,9 +37,9 @@ class Nearest:
     """Represent the smallest distance found on a motion.
 
     Attributes:
-      distance: [m]; infinite where there is nothing to touch.
-      pair: names of the two bodies, or None.
-      time: at which the distance is smallest [s].
+        distance: [m]; infinite where there is nothing to touch.
+        pair: names of the two bodies, or None.
+        time: at which the distance is smallest [s].
     """
 
     distance: float

@@ -91,8 +91,8 @@ class Answer:
 
     Attributes:
         follows: measured over commanded displacement; NaN where the joint was not moved.
-            answers: measured over expected acceleration; NaN likewise.
-            doubt: standard deviation of `answers`.
+        answers: measured over expected acceleration; NaN likewise.
+        doubt: standard deviation of `answers`.
     """
 
     follows: float
