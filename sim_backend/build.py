@@ -1,6 +1,6 @@
-"""From a configuration with a simulated driver to what stands beyond the bus.
+"""Build the simulated machine beyond the bus from a configuration with a simulated driver.
 
-Boundary: construction only. Missing pieces get values here: home where none is given, infinite torque limits, and the
+Missing values are set here: home where none is given, infinite torque limits, and the
 braking of idle drives and of drives that are off.
 """
 
@@ -29,7 +29,7 @@ _HOLDING = 1e3
 
 
 def build_machine(config: ArmConfig, faults: Sequence[Fault] = ()) -> Machine:
-    """The machine a configuration describes, at its home position and at rest.
+    """Build the machine that a configuration describes, at its home position and at rest.
 
     Args:
         config: its driver's truth, or else its prior, becomes the plant.

@@ -262,7 +262,7 @@ class BusCodec:
         return taken
 
     def forget_events(self) -> None:
-        """Discard the events so far, expected or reported otherwise; a node that still disturbs the bus is reported anew."""
+        """Discard the events so far, expected or reported otherwise; nodes that still disturb the bus report anew."""
         self._events = []
         self._strangers.clear()
         self._foreign.clear()

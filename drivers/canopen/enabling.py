@@ -107,7 +107,7 @@ class Enabling:
         return words
 
     def _may_enable(self, now_ns: int) -> bool:
-        """Check that enough seed cycles have passed and no drive's next report would have to wait; the latter not for ever."""
+        """Check that seed cycles have passed and no drive's next report would be held back; the latter not for ever."""
         if self._seeded < SEEDED:
             return False
         self._ready_ns = now_ns if self._ready_ns is None else self._ready_ns

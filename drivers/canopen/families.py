@@ -1,4 +1,4 @@
-"""Determine a drive's family, from the data files beside this module and from the arm's description, which comes first."""
+"""Determine a drive's family, from the arm's description or else from the data files beside this module."""
 
 from __future__ import annotations
 

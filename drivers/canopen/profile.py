@@ -112,7 +112,10 @@ class Pdo:
     timer: int = 0
 
     def writes(self) -> list[Write]:
-        """Return the downloads that configure the PDO, in order (CiA 301, 7.5.2.36): off, no mapping, mapping, parameters, on."""
+        """Return the downloads that configure the PDO, in order: off, no mapping, mapping, type and times, on.
+
+        The order is that of CiA 301, 7.5.2.36.
+        """
         clear, *mapping = self.mapping
         return [self.off, clear, *mapping, *self.parameters, self.on]
 
@@ -256,7 +259,7 @@ class BusProfile:
         return min(max(1, round(self.status_inhibit * self.rate)), _MOST_SYNCS)
 
     def watched(self, node: int) -> list[Write]:
-        """Return the downloads that make a drive supervise its host, by heartbeat and by guarding; not by torque frames."""
+        """Return the downloads that make a drive supervise its host by heartbeat and guarding, not by torque frames."""
         own = self.heartbeat_wait if self.watchdog(node) == "heartbeat" else None  # of the others it is a second one
         wait = self.host << 16 | _whole(own or self.heartbeat_timeout, 1e-3)
         todo = [Write(od.HEARTBEAT_CONSUMER, wait)]

@@ -1,8 +1,8 @@
 """Replay a logged session to a driver, in virtual time: the logged answers of the drives are received again.
 
-What was received after the k-th SYNC of the log is received after the driver's k-th SYNC, with the same delay; what came
-before all SYNCs, with its delay from the first frame that was sent. So a driver that computes faster or slower than
-the logged one still receives every answer in its cycle.
+What was received after the k-th SYNC of the log is received after the driver's k-th SYNC, with the same delay; what
+came before all SYNCs, with its delay from the first frame that was sent. So a driver that computes faster or slower
+than the logged one still receives every answer in its cycle.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _LINE = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class LoggedFrame:
-    """Represent one frame of a log: its bus, whether the host sent it, and the frame, stamped from the log's first one on."""
+    """Represent one frame of a log: its bus, whether the host sent it, and the frame, stamped from the first one on."""
 
     bus: int
     sent: bool

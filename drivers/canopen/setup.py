@@ -1,4 +1,4 @@
-"""What every drive is told before anything moves: who it must be, what it protects by itself, which frames it speaks.
+"""Configure drives before anything moves: check their identity, their own protection, the frames they exchange.
 
 Everything is compared first, written where it differs, and read back (FIELDBUS.md 2.5; DRIVES.md 2 and 4). What a drive
 lacks of it was judged before (`capabilities.py`): what is indispensable has been refused, what may be missing is left
@@ -162,7 +162,7 @@ def watchdogs_of(driver: CanopenDriver, names: Sequence[str]) -> tuple[Watchdog,
 
 
 def differences(found: Mapping[str, int], wanted: DriveIdentity) -> list[str]:
-    """Describe how an identity (1018h), by the keys of `IDENTITY`, differs from the configured one; empty if it fits."""
+    """Describe how an identity (1018h), by the keys of `IDENTITY`, differs from the configured one; else empty."""
     return [
         f"{name} is {found[name]:08X}h instead of {value:08X}h" if name in found else f"{name} is not told"
         for name, value in wanted.model_dump(exclude_none=True).items()
@@ -292,8 +292,8 @@ def _mode_entry(text: str) -> Entry:
 def released(objects: Objects, zeros: Zeros | None, number: int, restarted: Callable[[], bool]) -> Iterator[None]:
     """Disable the supervision of the host in a drive that is off; one that is not shall miss the host, and stop.
 
-    It comes in steps of a few frames each, for cycles between them. A zero that the drive has confirmed (`zero.py`) it confirms
-    afterwards too, and nothing else: one that restarted in the session has lost its zero.
+    It comes in steps of a few frames each, for cycles between them. A zero that the drive has confirmed (`zero.py`) it
+    confirms afterwards too, and nothing else: one that restarted in the session has lost its zero.
 
     Args:
         objects: of the drive.
@@ -380,7 +380,7 @@ def _max_speed(objects: Objects, setup: Setup) -> None:
 
 
 def _deceleration(objects: Objects, setup: Setup) -> None:
-    """Set the deceleration of quick stops (6085h), where a drive has it; a sufficient one of the drive's own may stay."""
+    """Set the deceleration of quick stops (6085h), where a drive has it; a sufficient one of its own may stay."""
     if setup.motor.deceleration is None:
         return
     wanted = Write(od.QUICK_STOP_DECELERATION, setup.motor.deceleration)

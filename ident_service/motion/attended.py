@@ -75,8 +75,8 @@ def _wait_for(over: threading.Event) -> None:
 @contextmanager
 def _behind() -> Iterator[None]:
     """Run the block one priority below the threads started before, where real time was granted (`realtime.py`).
+
     Those threads have this thread's priority and core, and would not run at all until this one waits.
-    They have this thread's priority and core, and would not run at all until it waits.
     """
     policy, granted = os.sched_getscheduler(0), os.sched_getparam(0)
     lower = granted.sched_priority - 1

@@ -1,9 +1,8 @@
-"""Emulated drives on real interfaces, in real time: the work of `ident emulate`.
+"""Run emulated drives on real interfaces, in real time, for `ident emulate`.
 
 The arm behind them goes on falling or braking when the host is gone. While it runs, lines on `commands` inject faults:
 a fault as `parse_fault` has it, `clear` to end all of them, `state` to be told everything again, `quit`.
 
-Boundary: time and interfaces; the drives are `emulator.py`.
 """
 
 from __future__ import annotations
@@ -37,10 +36,10 @@ _RESTING_NS = 500_000_000
 
 @dataclass(frozen=True)
 class Emulated:
-    """What has been done.
+    """Summarise an emulation.
 
     Attributes:
-        seconds: how long.
+        seconds: its duration.
         heard: frames received.
         sent: frames sent.
         unsent: frames that an interface did not take.
@@ -76,7 +75,7 @@ def emulate(
         commands: gives the next line of commands, None while there is none; never waits.
 
     Returns:
-        What has been done.
+        The summary.
 
     Raises:
         DriverError: as `build_emulator`, an interface that cannot be had or is lost, a fault that nobody understands.
@@ -171,7 +170,7 @@ class _Run:
         return max(0, min(due) - now_ns) * 1e-9
 
     def _pass_on(self, sent: Sequence[Sent]) -> None:
-        """Send what is ready, the lowest identifiers first, as a bus would."""
+        """Send the frames that are ready, the lowest identifiers first, as a bus would."""
         now = self._clock.now_ns()
         ready = []
         for item in sent:

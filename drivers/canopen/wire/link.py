@@ -94,7 +94,7 @@ class Connection:
             raise self._failure(error) from None
 
     def take(self, until_ns: int = 0) -> list[tuple[Frame, bool]]:
-        """Return the frames of the next packet, with whether they are this end's own; empty at the time [ns, monotonic].
+        """Return the frames of the next packet, with whether they are this end's own; empty from `until_ns` on.
 
         Raises:
             BusError: the wire is gone.

@@ -6,7 +6,7 @@ kernel's queue of an interface. With a pace each frame occupies the wire for its
 
 A CAN FD frame on a wire that is classic, or with a classic controller on it, is destroyed each time: to that controller
 its bit FDF is a broken frame. Its sender goes on trying until it is off the bus.
-// 
+
 It runs on any clock; so the pace is exact in virtual time, however late its host may be.
 """
 
@@ -111,7 +111,7 @@ class Medium:
     def __init__(
         self, duration_ns: Callable[[Frame], int] | None = None, error_ns: int = 0, *, fd: bool = True
     ) -> None:
-        """Make an empty wire.
+        """Create a wire without ports.
 
         Args:
             duration_ns: how long a frame occupies the wire; None: not at all, and all that waits contends at once.
