@@ -258,7 +258,7 @@ class Buses:
         return stamp_ns
 
     def keep_alive(self) -> None:
-        """Send the host's heartbeat, when half of its period is over: one that is sent late must not be missed."""
+        """Send the host's heartbeat at half of its period, so that a late one is not missed; poll guarded drives."""
         now_ns = self.clock.now_ns()
         self._ask_guarded(now_ns)
         if now_ns >= self._heartbeat_ns and "heartbeat" not in self.withheld:

@@ -194,5 +194,5 @@ class ReplayLink:
 
 
 def _marks(number: int, frame: Frame) -> bool:
-    """Return whether this frame, the `number`-th sent one, aligns the log's time with the clock's."""
+    """Return whether this sent frame, counted from 0, aligns the log's time with the clock's."""
     return number == 0 or (frame.identifier == SYNC and not frame.extended)

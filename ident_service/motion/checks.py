@@ -97,7 +97,7 @@ def checks(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
 
 
 def _what_cannot_be_believed(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
-    """Check for faults that take the torque off: feedback that cannot be believed, drives without torque control."""
+    """Check for faults that take the torque off: feedback that is not credible, an emergency stop, a runaway."""
     sample, position, speed = seen.sample, seen.position, np.abs(seen.velocity)
     bad = sample.valid & ~np.isfinite(sample.position)
     yield Check("feedback_not_finite", bad, "position is not a number")

@@ -245,7 +245,7 @@ class Guard:
         return bool((self._depths <= 0.0).all())
 
     def _all_well(self, status: tuple[int, ...]) -> bool:
-        """Return whether no drive reports a fault or has lost its power; remembers healthy status words."""
+        """Return whether no drive has tripped or lost its power; remembers healthy status words."""
         if status != self._healthy:
             powered = np.array([bool(word & AxisStatus.POWERED) for word in status])
             if any(word & TRIPPED for word in status) or bool((self._was_powered & ~powered).any()):

@@ -45,12 +45,12 @@ class CanopenDrive:
 
     Attributes:
         objects: its object dictionary.
-            motor: that it drives.
-            emergency: its errors.
-            nmt: its state in the network.
-            power: its state as a drive.
-            sync_identifier: identifier of SYNC frames.
-            deaf: whether a defect makes it go on when its watchdogs should stop it.
+        motor: that it drives.
+        emergency: its errors.
+        nmt: its state in the network.
+        power: its state as a drive.
+        sync_identifier: identifier of SYNC frames.
+        deaf: whether a defect makes it go on when its watchdogs should stop it.
     """
 
     def __init__(

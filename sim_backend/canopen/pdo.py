@@ -4,7 +4,7 @@ Received: transmission types up to 240 act at the next SYNC, 254 and 255 at once
 again within it. Sent: type 0 at a SYNC after a change, 1 to 240 at every so many SYNCs, 254 and 255 on a change, not
 within the inhibit time, and again after the event timer.
 
-Boundary: only while the node is operational; how values lie in a frame is `mapping.py`.
+All of this happens only while the node is operational.
 """
 
 from __future__ import annotations

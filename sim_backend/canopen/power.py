@@ -4,8 +4,6 @@
 and a fault reaction by ramp, brake with shorted windings for as long as the configured deceleration would take, and on
 for up to 0.1 s until the motor is slow; this drive has no other way to slow down. After that, and without power, the
 motor coasts, unless the description says that the drive leaves the windings shorted or that the joint has a brake.
-
-Boundary: states and what the power stage does in them; torque while enabled is `torque.py`.
 """
 
 from __future__ import annotations
@@ -147,7 +145,7 @@ class PowerStage:
             self._to(target)
 
     def trip(self, *, coasting: bool = False) -> None:
-        """Enter the fault states (transitions 13, 14) by option code 605Eh, unless the power stage failed (`coasting`)."""
+        """Enter the fault states (transitions 13, 14) by option 605Eh, unless the power stage failed (`coasting`)."""
         if self.state in (*_FAULTS, PowerState.NOT_READY):
             return
         if coasting or self._node.objects.number(0x605E) == 0:

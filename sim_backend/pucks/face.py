@@ -21,7 +21,7 @@ class Traffic(Enum):
 
 
 class Face(Protocol):
-    """Define one emulated motor controller; no call goes back in time, each returns the frames that follow from it."""
+    """Define one emulated motor controller; no call goes back in time, each returns the frames that follow in order."""
 
     motor: Motor
 

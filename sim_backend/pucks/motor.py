@@ -48,11 +48,11 @@ class Defects:
         reversed: the torque acts the other way round.
         stuck: the power stage goes on doing what it does.
         torque_share: of the largest torque, which is all the power stage can make.
-            torque_fraction: of the commanded torque, which is what the power stage makes; only its measured torque shows it.
-            frozen: the encoder repeats its last reading.
-            mirrored: the encoder counts the wrong way.
+        torque_fraction: of the commanded torque, which is what the power stage makes; only measured torque shows it.
+        frozen: the encoder repeats its last reading.
+        mirrored: the encoder counts the wrong way.
         shift: counts added to the encoder's reading.
-            delay_ns: age of the encoder's reading [ns].
+        delay_ns: age of the encoder's reading [ns].
     """
 
     reversed: bool = False
