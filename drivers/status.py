@@ -33,13 +33,13 @@ class AxisEventCode(StrEnum):
     DRIVE_RESTARTED = "drive_restarted"  # it booted in the middle of a run
     DRIVE_LEFT = "drive_left"  # it left the state in which it takes torques
     TORQUE_IGNORED = "torque_ignored"  # energised, it does not follow its torque any more
-    SECOND_HOST = "second_host"  # somebody else sends what only this host may
+    SECOND_HOST = "second_host"  # another node sends what only this host may
     BUS_DEGRADED = "bus_degraded"  # so many errors that the host's controller or a drive's is in error passive
     BUS_OFF = "bus_off"  # the host's controller has left the bus
     DRIVE_WARNING = "drive_warning"
     DRIVE_NOTICE = "drive_notice"  # a drive informs of something that is no error
     TORQUE_LIMITED = "torque_limited"  # the drive gives less than it was asked for
-    STRANGE_FRAME = "strange_frame"  # of nobody, of a wrong length, or at a wrong time
+    STRANGE_FRAME = "strange_frame"  # of an unknown node, of a wrong length, or at a wrong time
 
 
 @dataclass(frozen=True, slots=True)

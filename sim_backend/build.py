@@ -21,7 +21,7 @@ from sim_backend.imperfections import Imperfections
 from sim_backend.machine import Machine
 from sim_backend.plant import Plant
 
-# Where limits do not say how strong a drive is, its shorted windings stop the joint in about this time [s].
+# Where limits do not state a drive's strength, its shorted windings stop the joint in about this time [s].
 _BRAKING_TIME = 0.1
 _BRAKING_SHARE = 0.5
 # A closed brake, times the braking: creeps by mrad/s where idle drives let the joint sink by rad/s.

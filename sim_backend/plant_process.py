@@ -41,7 +41,7 @@ PATIENCE = 60.0  # simulated seconds that an abandoned arm is given; sinking aga
 # towards its lowest place; slower than this counts as at rest. Near its highest place that may be before it sinks.
 REST_SPEED = 1e-2
 REST_TIME = 0.1  # simulated seconds that nothing may be faster
-_AT_ONCE = 100  # periods to make up for between two looks at the sockets
+_AT_ONCE = 100  # periods to catch up between two polls of the sockets
 _MOST_WAITING = 8  # connections that have not sent their Hello
 _LONGEST_FUTURE_NS = 1_000_000_000
 
@@ -112,7 +112,7 @@ class PlantProcess:
             self._strangers.remove(stranger)
             self._meet(stranger)
         if self._listener in readable:
-            with suppress(OSError):  # whoever knocked may be gone already
+            with suppress(OSError):  # the connecting process may be gone already
                 self._strangers.append(self._listener.accept()[0])
                 self._strangers[-1].setblocking(False)
             for stranger in self._strangers[:-_MOST_WAITING]:
@@ -315,7 +315,7 @@ def main() -> int:
         ]
         machine = build_machine(config, faults)
         story = PlantStory(machine, start["status"])
-    except Exception as error:  # noqa: BLE001 - whoever started this process must learn why it cannot begin
+    except Exception as error:  # noqa: BLE001 - the parent must learn why this process cannot begin
         listener.close()
         _say(f"{type(error).__name__}: {error}")
         return 1

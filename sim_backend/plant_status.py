@@ -39,12 +39,12 @@ class PlantState(IntEnum):
 
     WAITING = 0  # for its first client
     SERVING = 1  # a client is connected
-    SETTLING = 2  # nobody is; idle drives brake what moves
-    AT_REST = 3  # nobody is, and nothing moves
-    STILL_MOVING = 4  # nobody is, and it moved until the plant's patience ended
-    RAN_AWAY = 5  # nobody is, and its state is no longer finite
+    SETTLING = 2  # no client is connected; idle drives brake what moves
+    AT_REST = 3  # no client is connected, and nothing moves
+    STILL_MOVING = 4  # no client is connected, and the arm moved until the plant's patience ended
+    RAN_AWAY = 5  # no client is connected, and the state is no longer finite
     ENDED_AT_REST = 6  # as AT_REST, and the process has ended
-    ENDED_MOVING = 7  # the process has ended without
+    ENDED_MOVING = 7  # the process has ended while the arm moved
 
 
 @dataclass(frozen=True)

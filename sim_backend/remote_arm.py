@@ -78,7 +78,7 @@ class RemoteArm(Arm):
         self.clock = clock
         self.observer = observer
         self.truth: Truth | None = None
-        # The same construction tells what the plant will be, and which mistakes keep it from being.
+        # The same construction gives the plant's description, and the errors that would prevent its start.
         twin = build_machine(config, faults)
         self.faults = twin.faults
         self._description = description(twin)
@@ -112,7 +112,7 @@ class RemoteArm(Arm):
                 self._launch.end()
             self._launch = PlantLaunch(self._config, self._added, self._address, self._status)
             if not self._launch.start(lock_step=self.clock.lock_step):
-                self.end_plant()  # somebody else's was faster
+                self.end_plant()  # another process started its plant first
             if not self._enter():
                 raise DriverError("the plant process does not listen")
         self._enabled, self._cycle, self.truth = False, 0, None
@@ -220,7 +220,7 @@ class RemoteArm(Arm):
 
     def _welcome(self, sock: socket.socket) -> None:
         _, uid, _ = struct.unpack("3i", sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
-        if uid != os.getuid():  # anybody may listen on an abstract address
+        if uid != os.getuid():  # any user's process may listen on an abstract address
             raise DriverError(_REFUSALS[wire.OTHER_USER])
         reply = self._ask(wire.Hello(bytes.fromhex(self._config.sha256)), START_TIMEOUT)
         if isinstance(reply, wire.Refused):

@@ -92,7 +92,7 @@ class CanopenArm(Arm):
     def _reset_state(self) -> None:
         self._enabled = self._streaming = False
         self._stop = StopCommand()
-        self._stops = 0  # told so far
+        self._stops = 0  # stop commands so far
         self._counts = [0] * len(self._limits)
         self._acting = _frozen(np.zeros(len(self._limits)))
         self._unwrapped: list[int] | None = None
@@ -225,7 +225,7 @@ class CanopenArm(Arm):
             self._counts, _ = self._coordinates.torque_counts(wanted)
             self._acting = _frozen(self._coordinates.joint_torque(self._counts))
         self._stop.repeat(buses)
-        # Enabled, an exchange that only looks is no torque frame: drives that count them must notice.
+        # While enabled, an exchange without a torque sends no torque frame: drives that supervise them must notice.
         idle = self._stop.counts(self._counts) if self._streaming and not self._enabled else None
         stamp_ns = buses.cycle(idle if torque is None else self._counts)
         self._measured.cycle(self._counts, buses.drives)
@@ -242,7 +242,7 @@ class CanopenArm(Arm):
         self._open().withheld.add(kind)
 
     def drive_status(self) -> tuple[AxisStatus, ...]:
-        """Return what each drive last said of itself, see `Arm`."""
+        """Return the last reported status of each drive, see `Arm`."""
         return tuple(drive.axis_status for drive in self._open().drives)
 
     def stop(self, kind: StopKind) -> None:

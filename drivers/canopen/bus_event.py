@@ -26,8 +26,8 @@ class EventCode(StrEnum):
     DUPLICATE = "duplicate"
     LATE = "late"
     WRONG_LENGTH = "wrong_length"
-    STRANGER = "stranger"  # a frame of nobody who should be on this bus
-    SECOND_HOST = "second_host"  # somebody else sends what only we may
+    STRANGER = "stranger"  # a frame of no node that should be on this bus
+    SECOND_HOST = "second_host"  # another node sends what only this host may
     ERROR_PASSIVE = "error_passive"  # the host's controller
     BUS_OFF = "bus_off"  # the host's controller
     CONTROLLER = "controller"  # any other change of its state

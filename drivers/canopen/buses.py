@@ -26,7 +26,7 @@ from drivers.clock import Clock
 from ident_service.errors import DriverError
 
 RECEIVE = 0.97  # of a period, within which a position counts for its cycle (FIELDBUS.md: the last is on the wire then)
-HUSH = 0.02  # s in which the last frames of a session before ours may still be on their way
+HUSH = 0.02  # s in which the last frames of an earlier session may still be on their way
 LISTEN = 0.12  # s before we send anything; another host's heartbeat comes within it
 AWAKE = 2.0  # s within which every drive must answer
 LEAST = 0.5  # of a period, from SYNC on, that positions are waited for in any case

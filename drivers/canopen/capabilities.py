@@ -302,7 +302,7 @@ def named(text: str) -> str:
 
 
 def _streams(path: TorquePath, found: Found) -> bool:
-    """Return whether a drive has a way of streaming torques; one whose 6502h is not known may have it."""
+    """Return whether a drive supports a way of streaming torques; where 6502h is unknown, it may."""
     needed = [path.target, *([path.slope] if path.slope else []), *([path.by.entry] if path.by else [])]
     modes = found.get(od.SUPPORTED_MODES)
     supported = path.supported is None or modes is None or bool(modes >> path.supported & 1)
@@ -321,7 +321,7 @@ def _limits(limit: TorqueLimit, found: Found) -> bool:
 
 
 def _count(family: Family, found: Found, drive: CanopenDrive) -> float | None:
-    """Return the torque of one count of the target [N m]; None where nothing tells it."""
+    """Return the torque of one count of the target [N m]; None where it is unknown."""
     unit = family.unit
     if unit is None or (unit.unit == "mA" and drive.torque_constant is None):
         return None
@@ -383,7 +383,7 @@ def _watchdogs(family: Family, found: Found, drive: CanopenDrive) -> Iterator[Wa
     own = mine is not None and mine.index << 8 | mine.sub in found.there
     if own if drive.watchdog == "vendor" else theirs:
         yield "vendor"
-    if drive.watchdog == "sync_loss":  # which no standard entry tells: the description says that there is one
+    if drive.watchdog == "sync_loss":  # which no standard entry shows: the description states it
         yield "sync_loss"
     if found.has(od.HEARTBEAT_CONSUMER):
         yield "heartbeat"
@@ -392,6 +392,6 @@ def _watchdogs(family: Family, found: Found, drive: CanopenDrive) -> Iterator[Wa
 
 
 def _identifier_is_free(sheet: DataSheet | None) -> bool:
-    """Return whether the COB-ID of torque frames may be another; one that is fixed is nobody else's."""
+    """Return whether the COB-ID of torque frames can be changed; a fixed one cannot be shared with other drives."""
     entry = None if sheet is None else sheet.entries.get(od.RPDO_COB_ID.key)
     return entry is None or entry.writable

@@ -141,7 +141,7 @@ class _Packed:
     pack: Callable[..., bytes] = field(repr=False)
 
 
-# Bits of the status word that are told when they come and when they go.
+# Bits of the status word whose setting and clearing are reported as events.
 _BITS = (
     (WARNING, EventCode.DRIVE_WARNING, "warns"),
     (INTERNAL_LIMIT, EventCode.TORQUE_LIMITED, "limits its torque"),
@@ -246,7 +246,7 @@ class BusCodec:
         return self._missing == 0
 
     def silent(self, now_ns: int) -> list[int]:
-        """Return the nodes whose heartbeat has been missing for longer than configured, those never heard included."""
+        """Return the nodes whose heartbeat has been missing for longer than configured, or was never received."""
         oldest = now_ns - round(self.profile.heartbeat_timeout * 1e9)
         return [drive.node for drive in self.drives if drive.nmt is None or drive.heartbeat_ns < oldest]
 
@@ -355,7 +355,7 @@ class BusCodec:
         drive.nmt, drive.heartbeat_ns = state, frame.stamp_ns or self._now_ns
         if state == NmtState.BOOT_UP:
             drive.boots += 1
-            drive.status = None  # what it was told is forgotten; what it said before is no longer true
+            drive.status = None  # the drive has lost its configuration; its last status is no longer true
             self._tell(EventCode.BOOT_UP, drive.node, "has booted")
         elif before != state and before is not None:
             words = f"NMT state {nmt_words(state)}, was {nmt_words(before)}"

@@ -97,7 +97,7 @@ PRODUCT = Entry(0x1018, 2, Kind.U32, "product")
 REVISION = Entry(0x1018, 3, Kind.U32, "revision")
 SERIAL = Entry(0x1018, 4, Kind.U32, "serial number")
 SYNC_OVERFLOW = Entry(0x1019, 0, Kind.U8, "counter in SYNC, 0 for none")
-# A host may keep two numbers of its own here (CiA 301, "verify configuration"); ours are `zero.py`'s.
+# A host may store two numbers of its own here (CiA 301, "verify configuration"); see `zero.py`.
 STORED = Entry(0x1010, 1, Kind.U32, "what is stored when")
 ZERO_COUNTS = Entry(0x1020, 1, Kind.U32, "counts at home", "counts, as 32 bits")
 ZERO_MARK = Entry(0x1020, 2, Kind.U32, "mark of the counts at home")

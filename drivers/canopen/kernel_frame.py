@@ -1,4 +1,4 @@
-"""Convert frames to bytes: those of the kernel's CAN sockets (linux/can.h), and packets between our processes.
+"""Convert frames to bytes: those of the kernel's CAN sockets (linux/can.h), and packets between processes.
 
 `struct can_frame` has 16 bytes: identifier and flags (32 bit, native order), length, 3 bytes of padding, 8 of data.
 `struct canfd_frame` has 72: the same with a byte of flags after the length and 64 of data.
@@ -24,7 +24,7 @@ _FD: Final = struct.Struct("=IBB2x64s")
 MAX_PACKET_BYTES: Final = 8192
 MAX_PACKET_FRAMES: Final = 64  # fits with 64 bytes each
 _PACKED: Final = struct.Struct("<qIBB2x")
-_OWN_FLAG: Final = 1  # it is an echo, or was sent rather than heard
+_OWN_FLAG: Final = 1  # the frame is an echo, or was sent rather than received
 _FD_FLAG: Final = 2
 
 

@@ -1,4 +1,4 @@
-"""Convert the torque that drives measure (6077h) to the joints, and compare it with what they were told.
+"""Convert the torque that drives measure (6077h) to the joints, and compare it with the commanded torque.
 
 A drive's torque follows its command within a millisecond or two, and many drives average what they report over some
 more. So a measured torque is compared with all that the drive was told within the last `WINDOW`. Only what lies outside
@@ -29,7 +29,7 @@ class MeasuredTorque:
     """
 
     def __init__(self, coordinates: Coordinates, rate: float) -> None:
-        """Start with drives that were told no torque; `rate` is in cycles per second."""
+        """Start with drives without a commanded torque; `rate` is in cycles per second."""
         self._coordinates = coordinates
         self._told = np.zeros((max(2, round(WINDOW * rate)), len(coordinates.limit)))
         self._cycle = 0

@@ -263,7 +263,7 @@ class BusProfile:
         own = self.heartbeat_wait if self.watchdog(node) == "heartbeat" else None  # of the others it is a second one
         wait = self.host << 16 | _whole(own or self.heartbeat_timeout, 1e-3)
         todo = [Write(od.HEARTBEAT_CONSUMER, wait)]
-        if self.watchdog(node) in ("heartbeat", "node_guarding"):  # or what it does then could not be heard
+        if self.watchdog(node) in ("heartbeat", "node_guarding"):  # or its reaction could not be received
             todo.append(Write(od.ERROR_BEHAVIOUR, _STAYS_OPERATIONAL))
         if node in self.guarded:
             period, factor = self.guarding

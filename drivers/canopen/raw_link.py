@@ -31,7 +31,7 @@ _SOL_CAN_RAW = 101
 _RAW_FILTER, _RAW_ERR_FILTER, _RAW_LOOPBACK, _RAW_RECV_OWN, _RAW_FD_FRAMES = 1, 2, 3, 4, 5
 _SO_TIMESTAMPNS, _SO_RXQ_OVFL = 35, 40
 _ALL_ERRORS = 0x1FFF_FFFF
-_RECEIVE_BUFFER = 1 << 20  # some hundred frames more than the default, while nobody reads
+_RECEIVE_BUFFER = 1 << 20  # some hundred frames more than the default, while the loop does not read
 _TIMESPEC, _COUNT = struct.Struct("@ll"), struct.Struct("=I")
 _ANCILLARY = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(_COUNT.size)
 _PLAUSIBLE_NS = 10_000_000_000  # a stamp older than this, or in the future, comes from a clock that was set

@@ -28,8 +28,8 @@ from ident_service.errors import DriverError
 
 T = TypeVar("T")
 NODES = range(1, 128)
-LISTEN = 1.0  # s: longest period of a heartbeat that is heard for sure
-PATIENCE = 0.05  # s for an answer, besides the time on the wire; those who are late are asked again with `TIMEOUT`
+LISTEN = 1.0  # s: longest period of a heartbeat that is received for sure
+PATIENCE = 0.05  # s for an answer, besides the time on the wire; late nodes are asked again with `TIMEOUT`
 _HISTORY = 8  # entries of 1003h that are read
 _SDO_BYTES = 8
 
@@ -75,7 +75,7 @@ class FoundNode:
 
 
 def scan(config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_links) -> list[FoundNode]:
-    """Return every node that is heard or answers, by bus and node number.
+    """Return every node that sends heartbeats or answers, by bus and node number.
 
     Args:
         config: with a CANopen driver.

@@ -122,7 +122,7 @@ class Objects:
 
     def ensure(self, write: Write) -> None:
         """Compare an entry with a value, write it where it differs, and read it back; raises as `set`."""
-        if not optional(self.holds, write):  # setting one that is missing says so
+        if not optional(self.holds, write):  # setting a missing entry raises the error
             self.set(write)
 
     def ensure_if_there(self, write: Write) -> None:

@@ -102,7 +102,7 @@ class SessionLog:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "drivers.canopen.session_log_process"],
                 stdin=theirs.fileno(),
-                stdout=subprocess.DEVNULL,  # ours may be a pipe whose end means that we are gone
+                stdout=subprocess.DEVNULL,  # this process' own may be a pipe whose end means that this process is gone
                 start_new_session=True,
             )
         request = {"path": str(self.path.absolute()), "utc_offset_ns": clock.utc_offset_ns}

@@ -152,7 +152,7 @@ def _serve(source: socket.socket) -> int:
 
 
 def _say(source: socket.socket, answer: dict[str, object]) -> None:
-    with suppress(OSError):  # whoever asked may be gone
+    with suppress(OSError):  # the session's process may be gone
         source.send(json.dumps(answer).encode())
 
 

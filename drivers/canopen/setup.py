@@ -36,11 +36,11 @@ from ident_service.config.family import TorquePath
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import AnotherDrive, DriverError
 
-LIMIT_SLACK = 0.05  # rad or m beyond the joints' limits that the drives are told of
+LIMIT_SLACK = 0.05  # rad or m by which the drives' position limits exceed the joints'
 _FIRMWARE = 0x100A
 _COUNTS_PER_LINE = (1.0, 4.0)
 _GENTLER = 0.5  # of the wanted deceleration, that a drive's own may be: the ramp takes twice as long
-_MODE_PATIENCE, _MODE_AGAIN_NS = 5.0, 10_000_000  # s in all, ns between two looks
+_MODE_PATIENCE, _MODE_AGAIN_NS = 5.0, 10_000_000  # s in all, ns between two reads
 _ROUNDING = 1e-6
 _LETS_GO, _STAYS = 2, 6  # values of 605Ah: a ramp, then power off, or hold on
 IDENTITY = {"vendor": od.VENDOR, "product": od.PRODUCT, "revision": od.REVISION, "serial": od.SERIAL}
@@ -84,7 +84,7 @@ class Setup:
 
     @property
     def torque(self) -> TorquePath:
-        """Return the way in which its torques are streamed."""
+        """Return how torques are streamed to the drive."""
         assert self.can.torque is not None  # noqa: S101 - else it has been refused
         return self.can.torque
 
@@ -126,7 +126,7 @@ class Setup:
         return round(1e6 / self.profile.rate)
 
     def pdos(self) -> list[Pdo]:
-        """Return the PDOs that the drive shall have; without a timer it tells its status at every n-th SYNC."""
+        """Return the PDOs that the drive shall have; without a timer it reports its status at every n-th SYNC."""
         target = entry_of(self.torque.target, "target torque", "counts")
         found = []
         for pdo in self.profile.pdos(self.drive.node):
@@ -228,7 +228,7 @@ def configure(objects: Objects, setup: Setup) -> int:
     for write in setup.options():
         objects.ensure_if_there(write)
     objects.ensure(setup.profile.heartbeat(setup.drive.node))
-    # What makes it miss its host comes last: from then on somebody must be there.
+    # Supervision of the host comes last: from then on the host must be present.
     spare = (od.ERROR_BEHAVIOUR, *(() if setup.drive.watchdog == "heartbeat" else (od.HEARTBEAT_CONSUMER,)))
     for write in setup.profile.watched(setup.drive.node):
         (objects.ensure_if_there if write.entry in spare else objects.ensure)(write)
@@ -272,7 +272,7 @@ def _largest_torque(objects: Objects, setup: Setup) -> None:
 
 
 def _mode(objects: Objects, setup: Setup) -> None:
-    """Set the mode of operation, and wait until it is in effect: drives may take their time to say so."""
+    """Set the mode of operation, and wait until the drive reports it, which may take some time."""
     by, clock = setup.torque.by, objects.clock
     entry, display = (od.MODE, od.MODE_DISPLAY) if by is None else map(_mode_entry, (by.entry, by.display))
     if not objects.holds(wanted := Write(entry, setup.torque.mode)):

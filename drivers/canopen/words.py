@@ -141,7 +141,7 @@ EMERGENCIES: dict[int, str] = {
     0xFF00: "specific to the device",
 }
 
-# In quick stop the drive brakes by itself, and no torque of ours acts.
+# In quick stop the drive brakes by itself, and no torque of the host acts.
 _AXIS_STATUS: dict[DriveState, AxisStatus] = {
     DriveState.OPERATION_ENABLED: AxisStatus.POWERED,
     DriveState.QUICK_STOP: AxisStatus.IDLE,

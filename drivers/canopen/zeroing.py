@@ -21,8 +21,8 @@ from drivers.canopen.words import DriveState, drive_words, state_of
 from drivers.canopen.zero import Zeros
 from ident_service.errors import DriverError
 
-APART = 0.5  # s between two looks at a standing arm
-STILL = 0.005  # rad or m that an arm in somebody's hands may stir in between
+APART = 0.5  # s between two readings of a standing arm
+STILL = 0.005  # rad or m that an arm held by hand may move in between
 _OFF = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
 
 

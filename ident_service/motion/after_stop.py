@@ -18,7 +18,7 @@ from ident_service.model.rigid_body import InverseDynamics
 
 WEIGHS: Final = 1e-3  # of a torque limit; every drive that reaches this torque has more friction than that
 _POSTURES, _SEED = 64, 1
-# Faults after whose stop a held arm may be led home: what was wrong is neither with the arm nor with its drives.
+# Faults after whose stop a held arm may be led home: they concern neither the arm nor its drives.
 HOME_AFTER: Final = frozenset({"lease_lost", "recorder_behind", "no_way_back", "late_cycles", "controls_failed"})
 
 

@@ -39,7 +39,7 @@ def attended(arm: Arm) -> Iterator[None]:
         try:
             while not ended.is_set():
                 arm.exchange(None)
-        except Exception as error:  # noqa: BLE001 - whatever it is, nobody attends to the arm from here on
+        except Exception as error:  # noqa: BLE001 - whatever it is, no cycles are exchanged from here on
             failures.append(error)
         finally:
             over.set()

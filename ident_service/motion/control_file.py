@@ -45,7 +45,7 @@ from ident_service.motion.controls import LEASE_SECONDS, Homing
 _MAGIC, _VERSION, _SIZE = b"identctl", 1, 64
 _PID, _STOP, _PAUSE, _FINISH, _WAITING, _SUPPORTED, _RENEWED, _LENGTH, _STOPPED = 12, 16, 17, 18, 19, 20, 24, 32, 40
 _HOMING, _HOME_RENEWED = 21, 48
-_TRIES, _TRY_AGAIN = 20, 0.005  # s; who looks whether the file is in use holds it for a moment
+_TRIES, _TRY_AGAIN = 20, 0.005  # s; a process that checks whether the file is in use locks it for a moment
 
 
 class ControlFile:
@@ -231,7 +231,7 @@ class ControlFile:
         begun = self._now_ns()
         self.renew_home()
         self._memory[_STOP] = self._memory[_PAUSE] = 0
-        if self._words[_STOPPED // 8] >= begun:  # asked for by somebody else in this moment
+        if self._words[_STOPPED // 8] >= begun:  # asked for by another process in this moment
             self._memory[_STOP] = 1
         self._memory[_HOMING] = Homing.ASKED
 

@@ -122,7 +122,7 @@ class Course:
         self._begin_ns, self._way, self._paused, self._back = stamp_ns, paused, paused, None
 
     def stood(self) -> None:
-        """Enter PAUSED, when the arm has come to rest, and begin to search for the way back to the motion."""
+        """Enter PAUSED, when the arm has come to rest, and begin to search for a trajectory back to the motion."""
         self._states.enter(State.PAUSED)
         if self._paused is not None:
             self._search = self._way_out(self._paused)
@@ -137,7 +137,7 @@ class Course:
             self._back, self._search = None, self._way_out(self._paused)
 
     def _way_out(self, paused: Paused) -> Generator[None, None, Resumed | RuckigReference]:
-        """Search for the way out of a pause: straight back to the start once the run is to be finished early."""
+        """Search for a trajectory out of a pause: straight back to the start where the run is to be finished early."""
         if self._finishing and self._later and not self.not_finished:
             try:
                 return (yield from paused.leave_in_slices(self._start, self._resuming, self._surroundings))
@@ -146,7 +146,7 @@ class Course:
         return (yield from paused.resume_in_slices(self._resuming, self._surroundings))
 
     def look_for_way_back(self) -> str | None:
-        """Do one slice of the search for a way back; returns why there is none, when that turns out, else None."""
+        """Do one slice of the search for a trajectory back; returns the reason where there is none, else None."""
         if self._search is None:
             return None
         try:
@@ -163,7 +163,7 @@ class Course:
         return None
 
     def go_on(self, stamp_ns: int) -> None:
-        """Leave a pause, as soon as the way out is found."""
+        """Leave a pause, as soon as a trajectory out of it is found."""
         if self._away is not None and self._paused is not None:
             self.finished_at = self._paused.time if self._left is State.EXCITING else 0.0
             self._states.enter(State.RETURNING)
@@ -173,7 +173,7 @@ class Course:
             self._begin_ns, self._way = stamp_ns, self._back
 
     def lead_home(self, start: Vector) -> None:
-        """Begin to look for the slow, straight way home of an arm that is stopped; `look_for_way_back` goes on with it.
+        """Begin to search for a slow, straight trajectory home of a stopped arm; `look_for_way_back` continues.
 
         Args:
             start: from where [rad or m], shape (joints,).
@@ -189,7 +189,7 @@ class Course:
         self._away, self._search = None, search()
 
     def leads_home(self, stamp_ns: int) -> bool:
-        """Begin to go home as soon as the way is found; returns whether that is in this cycle."""
+        """Begin to go home as soon as a trajectory is found; returns whether that is in this cycle."""
         if self._away is None:
             return False
         self._states.enter(State.RETURNING)

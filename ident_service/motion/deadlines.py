@@ -22,7 +22,7 @@ LONGEST_STALL, SUCCESS = 0.010, 0.95  # s, or one period where that is longer
 LATE = 0.25  # periods late that a cycle may be (FIELDBUS.md: OWD counts periods above 1.25 times the nominal one)
 FOLLOWS = 1.0 / 32.0  # of the difference from the schedule that the schedule takes over, each cycle
 _MOST_UNKNOWN = 3  # cycles in a row without a velocity: two stalls, one after the other
-LONGEST_GAP = 20  # periods without a cycle, through which nobody guarded the arm (libfranka's lost packets)
+LONGEST_GAP = 20  # periods without a cycle, in which the arm is not supervised (libfranka's lost packets)
 
 
 def longest_stall(described: float | None, period: float, watchdogs: Iterable[Watchdog]) -> float:
@@ -123,7 +123,7 @@ class Deadlines:
         return self._of.known
 
     def cycle(self, stamp_ns: int, woken_ns: int, doubt_ns: int = 0) -> Fault | None:
-        """Judge the timing of a cycle.
+        """Check whether a cycle came on time, and return a fault where it came too late or too many did.
 
         Args:
             stamp_ns: of its sample [ns].

@@ -99,7 +99,7 @@ FAULTS: dict[str, Rule] = {
     "drive_warning": Rule(_WARN, "temperature, voltage or current near its limit; see the drive's manual"),
     "torque_limited": Rule(_WARN, "the drive itself gives less torque than it was asked for"),
     "strange_frame": Rule(_WARN, "a bus that is too full, a wrong node number, or another device on it"),
-    # `deadlines.py` says when it is too late, or too often; the others of a second are survived.
+    # `deadlines.py` decides when a cycle is too late, or too many are; fewer in a second are tolerated.
     "late_cycle": Rule(_WARN, "the machine was busy with something else", often=WINDOW - 1),
     # The loop can still be trusted to stop the arm.
     "repeated_warnings": Rule(_STOP, "what is bridged once must not go on"),
@@ -116,7 +116,7 @@ FAULTS: dict[str, Rule] = {
     "status_stale": Rule(_STOP, "nobody would hear of it if the drive let go; its report is lost, or the bus too full"),
     "bus_degraded": Rule(_STOP, "a bad cable, connector or termination, or a wrong bit rate"),
     "recorder_behind": Rule(_STOP, "a motion that is not recorded is worth nothing"),
-    # It can be measured, but does not do what it is told.
+    # The arm can be measured, but does not follow.
     "following_lost": Rule(_LOWER, "it is blocked, loaded, or a drive does not give its torque"),
     # The host, the bus or single axes; the other drives can brake.
     "feedback_gone": Rule(_QUICK, "an axis, its encoder or cable failed; if all: the bus, or this machine stalled"),

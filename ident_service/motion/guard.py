@@ -36,7 +36,7 @@ from ident_service.motion.reference import Setpoint
 from ident_service.motion.told import told
 
 ABSURD = 3.0  # times the torque limit: no controller here asks for that
-# Change of torque: libfranka's 1000 N m/s; on small joints, of whom that asks nothing, from none to full in 10 ms.
+# Change of torque: libfranka's 1000 N m/s; on small joints, which that would not limit, from none to full in 10 ms.
 TORQUE_RATE, TORQUE_RATE_SHARE = 1000.0, 100.0  # N m/s or N/s; times the torque limit per second
 
 
@@ -121,7 +121,7 @@ class Guard:
         *,
         known: bool = True,
     ) -> tuple[Flags, Fault | None]:
-        """Judge a sample.
+        """Check a sample against all thresholds; returns the usable positions and the most severe fault.
 
         Args:
             sample: of this cycle.
@@ -156,13 +156,13 @@ class Guard:
                 usable, fault = self._judged(sample, reference.position, velocity)
         if sample.events:
             event = told(sample.events, self._names, self.findings)
-            # Of equals, what a drive says of itself tells more than what its status word does.
+            # Of equally severe faults, a drive's event tells more than its status word.
             if event is not None and (fault is None or event.reaction >= fault.reaction):
                 fault = event
         return usable, fault
 
     def torque(self, wanted: Vector) -> tuple[Vector, Fault | None]:
-        """Judge and limit a torque; the first torque is not limited in rate, because the support gives way to it.
+        """Check and limit a torque; the first torque is not limited in rate, because the support yields to it.
 
         Args:
             wanted: by the controller [N m or N], shape (joints,).
@@ -255,7 +255,7 @@ class Guard:
         return True
 
     def _judged(self, sample: Sample, wanted: Vector, velocity: Vector) -> tuple[Flags, Fault | None]:
-        """Judge a sample that may violate a threshold, check by check."""
+        """Check a sample that may violate a threshold, threshold by threshold."""
         position = sample.position
         # If the window only grew with the age, the second reading of a wrong position would be accepted.
         expected = self._position + velocity * (self._elapsed + self._period * self._age)

@@ -87,7 +87,7 @@ class Loop:
         self._since_ns = 0  # of the hold or the lowering
         self._lowering: Lowering | None = None
         self._anchor: Anchor | None = None  # of an arm that is held for as long as it takes
-        self._waiting = self._leading = False  # for a person's word; for a way home
+        self._waiting = self._leading = False  # for a person's confirmation; for a trajectory home
         self._recorded = False  # all that is recorded of the run
         self._told: set[str] = set()
         self._rest_speed = REST_SPEED * self.limits.velocity
@@ -240,7 +240,7 @@ class Loop:
         return False
 
     def _lead_home(self, stamp_ns: int) -> None:
-        """Search for the way home of a held arm, a slice in each cycle, and take it when found."""
+        """Search for a trajectory home of a held arm, a slice in each cycle, and start it when found."""
         refusal = None
         if self.ended_by is not None and self.ended_by.code not in HOME_AFTER:
             refusal = f"it was stopped by {self.ended_by.code}; support it, and confirm that"

@@ -1,4 +1,4 @@
-"""Pause and resume a motion: a controlled stop out of it, and a jerk-limited way back onto it or away from it.
+"""Pause and resume a motion: a controlled stop, and a jerk-limited trajectory back onto the motion or away from it.
 
 The way back leads from standstill to the motion's own moving state, so that position, velocity and acceleration have
 no step anywhere.
@@ -47,7 +47,7 @@ class Paused:
         return self._stop.at(time)
 
     def resume(self, limits: MotionLimits | None = None) -> Resumed:
-        """Plan the way back onto the motion and the rest of it, to be followed once the arm stands.
+        """Plan a trajectory back onto the motion and the rest of the motion, to be followed once the arm stands.
 
         It joins the motion where it was left. Where no way leads there within the limits, it joins a little earlier and
         repeats that little; else a little later; else it begins the motion again. This takes a millisecond or few where
@@ -87,7 +87,7 @@ class Paused:
     def leave_in_slices(
         self, end: Setpoint, limits: MotionLimits, surroundings: Surroundings | None = None
     ) -> Generator[None, None, RuckigReference]:
-        """Plan the straight, reduced-speed way to another place, from rest to rest, to be followed once the arm stands.
+        """Plan a straight trajectory at reduced speed to another setpoint at rest, to be followed after the pause.
 
         Args:
             end: at rest.
@@ -104,7 +104,7 @@ class Paused:
 
 
 class Resumed:
-    """Represent a way back onto a motion, and the motion from there on.
+    """Represent a trajectory back onto a motion, and the motion from there on.
 
     Attributes:
         duration: of both [s].
@@ -121,7 +121,7 @@ class Resumed:
         self.duration = back.duration + motion.duration - joined
 
     def at(self, time: float) -> Setpoint:
-        """Return the setpoint at `time` [s] since the way back began."""
+        """Return the setpoint at `time` [s] since the trajectory back began."""
         return self._way.at(time) if time < self.back else self.motion.at(self.joined + time - self.back)
 
 

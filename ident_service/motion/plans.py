@@ -1,4 +1,4 @@
-"""Plan what a run does from where the arm stands: an excitation and back, or one way to a destination.
+"""Plan the references of a run from where the arm stands: an excitation and back, or a move to a destination.
 
 A plan is asked twice: whether it can be made at all, before the arm is opened, and for its references from where the
 arm has been measured.
@@ -34,7 +34,7 @@ class Plan(Protocol):
 
     @property
     def speed(self) -> float:
-        """Return the share of the references' own speed at which all of them are played, ways out of pauses too."""
+        """Return the share of the references' own speed at which they are played, trajectories out of pauses too."""
 
     @property
     def held(self) -> bool:
@@ -82,7 +82,7 @@ class Excite:
 
 
 class Destination(Enum):
-    """Name the destinations of a single point-to-point way."""
+    """Name the destinations of a point-to-point motion."""
 
     HOME = "home"  # the description's
     INSIDE = "inside"  # the nearest posture inside the position limits
@@ -90,7 +90,7 @@ class Destination(Enum):
 
 @dataclass(frozen=True)
 class GoTo:
-    """Plan one slow straight way in joint space from rest to rest; it may begin a little outside the position limits.
+    """Plan a slow straight motion in joint space from rest to rest; it may begin a little outside the position limits.
 
     All joints share one time profile (`way.py`), so that each moves from its start towards its end without turning
     round; the end is inside the limits, and so the way of a joint that stands outside leads inwards all the time.
@@ -111,7 +111,7 @@ class GoTo:
         return admitting(position, limits)
 
     def legs(self, model: ArmModel, start: Vector, limits: MotionLimits) -> Sequence[Leg]:
-        """Return the one way to the destination."""
+        """Return the one reference to the destination."""
         end = limits.home if self.destination is Destination.HOME else just_inside(start, limits)
         way = calm_way(rest(start), rest(end), admitting(start, limits))
         try:

@@ -71,7 +71,7 @@ class TimedSink:
         return self._sink.put(cycle)
 
     def event(self, stamp_ns: int, level: int, message: str) -> bool:
-        """Record one line of the story; a state, and what is done with a held arm, is told to the parent too."""
+        """Record one event; states, and what is done with a held arm, are reported to the parent too."""
         if message in _STATES:
             say({"state": message})
         elif message in (WAITS, LOWERS):
@@ -91,7 +91,7 @@ def main() -> int:
         signal.signal(number, signal.SIG_IGN)  # the terminal's Ctrl-C is for the parent, which asks for a stop
     line = sys.stdin.readline()
     if not line.endswith("\n"):
-        return 1  # whoever wanted to ask is gone already
+        return 1  # the parent is gone already
     request = json.loads(line)
     os.set_blocking(sys.stdout.fileno(), False)
     code, answer = _ended(request)
@@ -117,7 +117,7 @@ def _ended(request: dict[str, Any]) -> tuple[int, dict[str, Any]]:
         return 4, {"error": {"kind": "ArmFault", "code": fault.code, "message": _words(fault)}}
     except IdentError as error:
         return 1, {"error": {"kind": type(error).__name__, "message": _words(error)}}
-    except Exception as error:  # noqa: BLE001 - a mistake of ours, too, has a message besides its traceback
+    except Exception as error:  # noqa: BLE001 - a mistake of the program, too, has a message besides its traceback
         traceback.print_exc()
         return 1, {"error": {"kind": "ArmError", "message": f"the motion process failed: {error!r}"}}
 

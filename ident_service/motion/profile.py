@@ -57,7 +57,7 @@ class ToRest:
             return after(knot, self._jerk[here], time - self._begin[here])
 
     def extent(self) -> tuple[Vector, Vector]:
-        """Return the lowest and highest position on the way, exact but for rounding, shape (..., joints) each."""
+        """Return the lowest and highest position on the profile, exact but for rounding, shape (..., joints) each."""
         velocity, acceleration, jerk = self._velocity, self._acceleration, self._jerk
         with np.errstate(all="ignore"):  # a piece without a turning point has no root; its ends stand for it
             root = np.sqrt(acceleration**2 - 2.0 * jerk * velocity)

@@ -72,7 +72,7 @@ def ask(core_from_last: int = 0) -> Granted:
     cores = sorted(os.sched_getaffinity(0))
     if len(cores) > 1:
         try:
-            # The last one: interrupts and whoever started us prefer the first.
+            # The last one: interrupts and the parent process prefer the first.
             wanted = cores[-1 - core_from_last % len(cores)]
             os.sched_setaffinity(0, {wanted})
             core = wanted

@@ -149,7 +149,7 @@ class _Run:
             waiting = "; ".join(f"{fault.code} ({fault.cause})" for fault in self.latch.faults)
             raise MotionRefused(f"faults that nobody has acknowledged: {waiting}")
         loop, torque = self._prepared()
-        if self.controls.stop:  # planning takes a second or more; nobody wants to see the arm energised after a stop
+        if self.controls.stop:  # planning takes a second or more; the arm must not be energised after a stop
             raise MotionRefused("a stop was asked for before the arm was energised; nothing has moved")
         if not self.controls.lease_ok(self.arm.clock.now_ns()):
             raise MotionRefused("whoever asked for the motion is gone, or is silent; nothing has moved")

@@ -1,4 +1,4 @@
-"""Plan jerk-limited trajectories from one moving state to another: approach, return, the way back onto a motion.
+"""Plan jerk-limited trajectories from one moving state to another: approach, return, resumption of a motion.
 
 Every way is a ruckig trajectory within the arm's velocity, acceleration and jerk; ruckig is imported nowhere else.
 """
@@ -17,7 +17,7 @@ from ident_service.errors import MotionRefused
 from ident_service.motion.reference import Setpoint
 
 _Result = TypeVar("_Result")
-_SLICE = 50  # points of a way looked at in one go
+_SLICE = 50  # points of a trajectory evaluated in one slice
 _EXTENT_STEP = 1e-3  # s; a turning point lies at most acceleration * step^2 / 8 outside: 2e-6 rad at 16 rad/s^2
 
 
@@ -40,7 +40,7 @@ class RuckigReference:
         return Setpoint(np.array(position), np.array(velocity), np.array(acceleration))
 
     def extent(self) -> tuple[Vector, Vector]:
-        """Return the lowest and highest position on the way, each of shape (joints,), sampled every `_EXTENT_STEP`."""
+        """Return the lowest and highest position, each of shape (joints,), sampled every `_EXTENT_STEP`."""
         return at_once(self.extent_in_slices())
 
     def extent_in_slices(self) -> Generator[None, None, tuple[Vector, Vector]]:
@@ -61,7 +61,7 @@ _CALM = 0.5  # of the limits, on the way to a motion and back
 
 
 def calm_way(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference:
-    """Plan the way to a motion or back, within half of the velocity and acceleration limits where its ends allow.
+    """Plan a trajectory to a motion or back, within half of the velocity and acceleration limits where its ends allow.
 
     A way at the full limits leaves no margin for errors of the model, and nobody waits for its last second.
 

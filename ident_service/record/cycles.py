@@ -42,7 +42,7 @@ class Cycles:
 
 
 def read_cycles(path: Path) -> Iterator[Cycles]:
-    """Read `/cycle` in order, some thousand cycles at a time, up to the tear where there is one.
+    """Read `/cycle` in order, some thousand cycles at a time, up to where the file is cut off or damaged.
 
     Yields nothing from a file that is not MCAP or has no such topic of this package's type.
 

@@ -112,7 +112,7 @@ def grid(recording: Recording, fmt: RecordingFormat) -> Grid:
         if block.skipped is None:
             steps.add(run)
         else:
-            # A step over what was left out says nothing of how evenly samples were taken.
+            # A step across samples that were left out does not show how evenly samples were taken.
             skipped += int(block.skipped.sum())
             behind = np.flatnonzero(block.skipped) + len(run) - len(stamps)
             for part in np.split(run, behind):

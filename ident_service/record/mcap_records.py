@@ -110,7 +110,7 @@ def expand(content: bytes) -> bytes:
         raise TooLargeError(f"a chunk expands to {size} bytes, above the limit of {MAX_RECORD}")
     try:
         if chunk.compression == "zstd":
-            # A frame that names its size is expanded to it no matter what limit is given, so that is looked at first.
+            # A frame that states its size is expanded to it whatever limit is given, so the size is checked first.
             if zstandard.frame_content_size(chunk.data) > size:
                 raise TornError("a chunk expands beyond the size it declares")
             data = zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=size)

@@ -22,7 +22,7 @@ from ident_service.record.timing import Timing
 Array = NDArray[np.float64]
 
 SATURATED: Final = 0.999  # of the limit
-PLATEAU: Final = 5  # samples exactly at the extreme value in a row look like a limit where none is known
+PLATEAU: Final = 5  # so many samples in a row exactly at the extreme value look like a limit where none is known
 STANDSTILL: Final = 0.005  # [rad/s or m/s]
 STANDSTILL_OVER: Final = 0.02  # [s]
 MUCH_JITTER: Final = 0.05  # of a period, standard deviation

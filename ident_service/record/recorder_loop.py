@@ -106,7 +106,7 @@ class Drain:
         try:
             complete = self._take_until_end() and not self._reader.lost
             self._writer.finish(complete=complete)
-        except Exception as caught:  # noqa: BLE001 - whatever it is, the motion loop has to hear of it
+        except Exception as caught:  # noqa: BLE001 - whatever it is, the motion loop has to learn of it
             error, complete = message_of(caught), False
             self._tell_end(error)
             with suppress(RecordingError):

@@ -227,7 +227,7 @@ class RingReader:
             expected = 2 * number + 2
             sequence = words[word]
             if sequence < expected:
-                # Loaded once more behind the count: what the count says was written has its sequence by then.
+                # Loaded once more after the count: a record that the count includes has its sequence by then.
                 if words[at.WRITTEN] <= number:
                     return None
                 if words[word] < expected:

@@ -25,7 +25,7 @@ from ident_service.record.recording import Matrix, Stamps
 MOST_BYTES: Final = 1 << 20
 _HEAD: Final = struct.Struct("<BQ")
 _STATES, _COMMANDS, _EVENTS = "/joint_states", "/joint_commands", "/events"
-_EXCITING = "exciting"  # the word of `motion/states.py`
+_EXCITING = "exciting"  # value of `State.EXCITING` in `motion/states.py`
 
 
 @dataclass(frozen=True)

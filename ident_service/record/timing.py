@@ -16,7 +16,7 @@ from ident_service.record.recording import Block, cut, join
 
 _IRREGULAR: Final = 0.05  # of a period
 _LEAST: Final = 10  # irregular steps
-_CLEAR: Final = 4.0  # ratio of the squared errors below which nothing is said
+_CLEAR: Final = 4.0  # ratio of the squared errors below which it is not decided
 
 
 class Timing:

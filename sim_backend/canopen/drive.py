@@ -36,7 +36,7 @@ _PDO_PARAMETERS = {index for group in (*COMMUNICATION, *MAPPING) for index in gr
 _DRIVE_OBJECTS = 0x6000
 _FAULT = 1  # of 6007h
 _WARNING, _REMOTE, _LIMITED, _FOLLOWS, _VOLTAGE = 0x0080, 0x0200, 0x0800, 0x1000, 0x0010
-# What tells where the motor is; anything else that is sent is no feedback.
+# Key of the position entry; a TPDO without it is no feedback.
 _POSITION = 0x606400
 
 

@@ -13,7 +13,7 @@ _PRODUCER = "heartbeat"
 _CONSUMER = "heartbeat of "
 _BOOT = "boot"
 _LIFE = "life guarding"
-_HOST = 0  # stands for whoever asks by remote frames, who has no number
+_HOST = 0  # stands for the host that asks by remote frames, which has no number
 _CONSUMERS = range(1, 5)
 
 

@@ -15,7 +15,7 @@ from sim_backend.pucks.motor import Motor
 class Traffic(Enum):
     """Name the kinds of frames of a drive, for faults that remove or falsify only one kind."""
 
-    FEEDBACK = "feedback"  # tells where the motor is, in a cycle
+    FEEDBACK = "feedback"  # has the motor's position, in a cycle
     HEARTBEAT = "heartbeat"
     OTHER = "other"
 

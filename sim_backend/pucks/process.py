@@ -27,9 +27,9 @@ from sim_backend.pucks.station import Station
 from sim_backend.pucks.wires import INTERFACE as OUR_WIRE
 from sim_backend.pucks.wires import Wires
 
-_POLL_NS = 20_000_000  # commands, stop and states are looked at this often
-_AT_ONCE = 256  # frames handled before time is looked at again
-# Speed below which an arm is said to rest when it has been so for a while, and above which to move [rad/s or m/s].
+_POLL_NS = 20_000_000  # commands, stop and states are polled this often
+_AT_ONCE = 256  # frames handled before the clock is read again
+# Speed below which, for a while, an arm is reported to rest, and above which to move [rad/s or m/s].
 _RESTS, _MOVES = 1e-2, 3e-2  # closed brakes creep by some 1e-3
 _RESTING_NS = 500_000_000
 
@@ -117,13 +117,13 @@ class _Run:
         self._rested = True
         self._stirred_ns = 0
         self._quit = False
-        self._streaming = False  # whether somebody sends cycles
+        self._streaming = False  # whether a host sends cycles
 
     def until(self, seconds: float | None, stop_requested: Callable[[], bool]) -> Emulated:
         emulator, clock = self._emulator, self._clock
         begun = looked = heard_ns = clock.now_ns()
         end = None if seconds is None else begun + round(seconds * 1e9)
-        # What has been built stays; the collector need not look at it again in the middle of a cycle.
+        # What has been built stays; the garbage collector need not scan it again in the middle of a cycle.
         collecting = gc.isenabled()
         gc.collect()
         gc.freeze()

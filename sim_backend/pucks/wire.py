@@ -24,7 +24,7 @@ class Wire:
         self._free_ns = 0
         self._waiting: list[tuple[int, int, Sent]] = []
         self._count = 0
-        self._found: tuple[int, tuple[int, int, Sent]] | None = None  # who is next, while it is known
+        self._found: tuple[int, tuple[int, int, Sent]] | None = None  # the next frame, while it is known
 
     def as_sent(self, frame: Frame) -> Frame:
         """Return a frame as it is on this bus."""
@@ -59,7 +59,7 @@ class Wire:
     def take(self) -> Sent:
         """Return the frame that `next_ns` is about; it occupies the wire until then."""
         found = self._next()
-        assert found is not None  # noqa: S101 whoever takes has looked
+        assert found is not None  # noqa: S101 the caller has checked `next_ns`
         self._free_ns, item = found
         self._waiting.remove(item)
         self._found = None

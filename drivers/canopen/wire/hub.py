@@ -150,7 +150,7 @@ class Wire:
         with self.lock:
             if self._listener is None:
                 return [], None
-            # A port whose queue is full is not read: its socket fills up, and its sender is told.
+            # A port whose queue is full is not read: its socket fills up, and its sender gets an error.
             ends = [
                 number
                 for number, end in self._ends.items()

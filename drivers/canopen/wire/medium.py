@@ -94,7 +94,7 @@ class Port:
 
 
 def overflow(stamp_ns: int) -> Frame:
-    """Return the error frame that says that frames before it were lost, because nobody took them."""
+    """Return the error frame that says that frames before it were lost, because the inbox was full."""
     return Frame(CONTROLLER, bytes((0, RX_OVERFLOW, 0, 0, 0, 0, 0, 0)), error=True, stamp_ns=stamp_ns)
 
 

@@ -16,7 +16,7 @@ from ident_service.errors import DriverError
 
 MAGIC: Final = b"IDCW"
 VERSION: Final = 2
-_OWN, _FD = 1, 2  # flags of Hello: hear own frames; its controller knows CAN FD
+_OWN, _FD = 1, 2  # flags of Hello: receive own frames; its controller supports CAN FD
 _HELLO: Final = struct.Struct("<4sBBBx32s")
 _FILTER: Final = struct.Struct("<HH")
 _WELCOME: Final = struct.Struct("<4sBBBxII")

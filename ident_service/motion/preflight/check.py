@@ -16,7 +16,7 @@ class Verdict(Enum):
     PASSED = "passed"
     FAILED = "failed"
     SKIPPED = "skipped"  # it could not be made, or not safely; the reason says why
-    NEEDS_PERSON = "needs a person"  # it could be made, but nobody has agreed to it
+    NEEDS_PERSON = "needs a person"  # it could be made, but no person has agreed to it
 
 
 # Every check there is, in the order in which they are made.

@@ -26,7 +26,7 @@ _SLIDING = 0.3  # of the largest speed asked for, above which the joint is taken
 _WINDOW = 0.02  # s, of the filter that differentiates: the sine must pass
 _STEPS, _FARTHEST = 4, 0.005  # s a step
 _LEAST = 3.0  # periods of the sine that it must slide for
-_SURE = 0.2  # of a cycle: a delay that is known worse says nothing
+_SURE = 0.2  # of a cycle: a delay with a larger deviation is not judged
 # Of a cycle, by which the delay may exceed the configured one. Measured on the emulated WAM at 500 Hz, all joints
 # together: -0.94 ms with a deviation of 0.27 ms; with a hidden cycle of 2 ms 1.31 ms, deviation 0.22 ms.
 MOST = 0.25

@@ -41,7 +41,7 @@ MORE_TORQUE = 1.25
 LEAST_ANSWER = 1.0 / (2.0 * INERTIA[1])  # and how much less, where the model knows the drive's inertia
 # Rotors by data sheet are the least that is there: of the shipped WAM's wrist, a fifth of what is.
 LEAST_DESCRIBED = 0.1
-ODD_ANSWER = 0.5  # below which an answer is told, although a joint with an unknown inertia may give it
+ODD_ANSWER = 0.5  # below which an answer is reported, although a joint with an unknown inertia may give it
 _NEAREST = "answer to torque, the nearest within its doubt"
 # Behind an inertia that is missing in the model even a healthy joint answers with next to nothing.
 _NEAREST_LOOSELY = "answer to torque (too low a scale cannot be judged until the prior has the drive inertia)"
@@ -49,7 +49,7 @@ _DOUBT = 3.0  # standard deviations
 _EXPLAINS = 0.5  # of what is unexplained must remain at most when a wrong sign is put right
 _LEAST_CYCLES = 8
 _BEGUN = 0.95  # of the way that ended at the guard is still to come when a joint has begun to move
-_SEEN = 2e-3  # rad or m that a joint must have moved before it says anything about its sign
+_SEEN = 2e-3  # rad or m that a joint must have moved before its sign can be judged
 _WINDOW = 0.06  # s, of the filter that differentiates
 _MOVING = 0.2  # of the largest speed
 SIGN_REMEDY = (
@@ -252,7 +252,7 @@ def sign_failure(joints: Sequence[int], model: ArmModel, why: str) -> Check:
 def direction_check(
     answers: Sequence[Answer], model: ArmModel, session: Session, delays: Sequence[Delay] = ()
 ) -> Check:
-    """Judge all test motions of a session, and the delays that were measured on them."""
+    """Evaluate all test motions of a session, and the delays measured on them, as one check."""
     names, ones = model.chain.names, ("",) * model.chain.joints
     nothing = np.zeros(len(names))
     follows = np.array([one.follows for one in answers])
@@ -274,7 +274,7 @@ def direction_check(
         *(replace(one, what=_NEAREST if drive > 0.0 else _NEAREST_LOOSELY) for one, drive in zip(
             measures(_NEAREST, judged_at, ones, names, least=least, most=most), known + said, strict=True)),
     ]  # fmt: skip
-    # Where it cannot be told from friction how a joint answers torque, following is all there is to judge.
+    # Where the response to torque cannot be told from friction, only following can be judged.
     found = [one for one in found if one.value is not None or one.what.startswith("displacement")]
     found += delay_measures(delays, model, session.period)
     told = [

@@ -17,7 +17,7 @@ from ident_service.motion.preflight.remedy import remedy_of
 from ident_service.motion.preflight.session import Rows, Session
 
 SETTLE, HOLD = 0.3, 1.0  # s before the mean is taken, and over which
-_SUNK = 1e-3  # rad or m that a joint must have moved down before its load is told
+_SUNK = 1e-3  # rad or m that a joint must have moved down before a load is reported
 GRAVITY_ERROR = 0.1  # of the torque limit, beside Coulomb friction, which may carry as much of the weight
 _SIGNS = "Check the signs of encoders and torques too."
 REMEDY = (

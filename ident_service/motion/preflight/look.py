@@ -20,7 +20,7 @@ from ident_service.motion.preflight.check import Check, Verdict, failed, joint_u
 DRIFT = 0.05  # of the velocity limit, as at the beginning of a run
 LATE = 0.25  # of a period: a later cycle counts as late (FIELDBUS.md 5.2, after OWD)
 LATE_SHARE = 0.05  # of the cycles may be late (FIELDBUS.md 5.2)
-LONGEST_GAP = 20.0  # periods through which nobody guards the arm (FIELDBUS.md 5.2: whole bus silent)
+LONGEST_GAP = 20.0  # periods in which the arm is not supervised (FIELDBUS.md 5.2: whole bus silent)
 PERIOD_ERROR = 0.02  # of a period: what the median may differ by
 STEPS_OF_NOISE = 3.0  # encoder steps: an axis at rest stays on one, or between two
 VELOCITY_NOISE = 0.1  # of the velocity limit, peak: the guard stops at 1.2
@@ -202,7 +202,7 @@ def rate_check(looked: Looked, lock_step: bool) -> Check:
 
 
 def loop_rate_check(stamps_ns: Vector, period: float, lock_step: bool, before: Check) -> Check:
-    """Judge the rate of the whole loop under holding torque, in addition to the rate measured without torque.
+    """Check the rate of the whole loop under holding torque, in addition to the rate measured without torque.
 
     Args:
         stamps_ns: of the cycles [ns], shape (cycles,).
@@ -252,7 +252,7 @@ def noise_check(
     speed = joint_units(model.chain.revolute, "rad/s", "m/s")
     force = joint_units(model.chain.revolute, "N m", "N")
     step = described.position_resolution
-    # Where the driver does not say how fine its encoder is, only what the loop makes of the noise can be judged.
+    # Where the driver does not state its encoder's resolution, only the effect of noise on the loop can be judged.
     steps = np.where(step > 0.0, STEPS_OF_NOISE * step, np.inf)
     found = [
         *measures("position noise, standard deviation", noise.std(axis=0), angle, names, most=steps),

@@ -74,7 +74,7 @@ _LOOK_AGAIN = 20  # cycles
 Tell = Callable[[Check], None]
 
 
-@one_blas_thread()  # a second one would run beside whoever has the other core, and be waited for
+@one_blas_thread()  # a second one would compete for the other core, and be waited for
 def preflight(
     arm: Arm,
     model: ArmModel,
@@ -214,7 +214,7 @@ class _Preflight:
         return limits if self.excitation is not None else reachable(limits)
 
     def _agreed(self, looked: Looked, limits: MotionLimits) -> Consent | None:
-        """Judge the arm at rest; returns whether its watchdog may be tried, None where the arm may not be touched."""
+        """Check the arm at rest; returns whether its watchdog may be tried, None where the arm may not be touched."""
         if self.described is None or not self._passed(
             identities_check(self.described, self.model, limits, self.identities, looked)
         ):

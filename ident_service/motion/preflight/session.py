@@ -202,7 +202,7 @@ class Session:
         return self._torque
 
     def lead_in_silence(self, sample: Sample, setpoint: Setpoint, given_up: Flags, *, sends: bool) -> None:
-        """Judge a cycle in which drives miss something on purpose, and work out the torque that follows.
+        """Check a cycle in which a signal is withheld from drives on purpose, and compute the next torque.
 
         What drives say of themselves is what is being tried, and is not judged here; neither are joints whose drives
         have given up torque, but for their position limits. Every other joint is held and guarded as before.
@@ -226,7 +226,7 @@ class Session:
             self._torque = self._limited(wanted)
 
     def wait_in_silence(self) -> None:
-        """Go on with the torque that was sent last, through the guard, while drives tell no positions.
+        """Repeat the torque that was sent last, through the guard, while drives report no positions.
 
         Raises:
             ArmFault: the guard found something that is more than a warning.
@@ -249,7 +249,7 @@ class Session:
         self._arm.stop(StopKind.TORQUE_OFF)
 
     def _led(self, sample: Sample, setpoint: Setpoint, given_up: Flags) -> Vector:
-        """Judge a sample by the guard and return the control law's torque for it [N m or N], shape (joints,)."""
+        """Check a sample by the guard and return the control law's torque for it [N m or N], shape (joints,)."""
         since, control = self._since(sample.stamp_ns, sample.stamp_doubt_ns), self._control
         velocity, correction = (np.where(given_up, 0.0, of) for of in (control.velocity, control.correction))
         known = self._since.known

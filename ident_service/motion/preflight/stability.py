@@ -134,7 +134,7 @@ def delay_of(config: ArmConfig) -> int:
 def stability(
     model: ArmModel, limits: MotionLimits, delay_cycles: int = 1, postures: Vector | None = None
 ) -> StabilityReport:
-    """Judge the gains of an arm at some postures and over the range of inertias.
+    """Compute the stability of an arm's gains at some postures and over the range of inertias.
 
     Args:
         model: without a prior, only each joint by itself is judged.

@@ -32,7 +32,7 @@ _WORDS = {
     "sync_loss": "SYNC",
 }
 _ORDER = list(_WORDS)  # what leaves the most of the others alone comes first; without SYNC no position comes
-_LATER = 2.0  # times the configured time, some cycles, and what its report may wait, until a drive has said so
+_LATER = 2.0  # times the configured time, plus some cycles and the report's delay, until a drive must have reported
 _CYCLES = 10
 REMEDY = (
     "Set the drives' own watchdog (CANopen: 1400h:05, or another of drives.watchdog, and 6007h for its reaction), or "
