@@ -78,10 +78,10 @@ class Sample:
         age: cycles since each axis answered, shape (joints,); 0 where `valid`.
         lost: frames lost since `open`.
         status: slow per-axis status words, with `status_age` cycles since they were read.
-        events: what happened on the bus since the sample before.
+        events: of the bus since the sample before.
         drives: status of each drive in words of its fieldbus, for people; empty where there is nothing to add
             to `status`.
-        measured_torque: what drives measured until this stamp [N m or N], shape (joints,), NaN where none reported in
+        measured_torque: measured by the drives until this stamp [N m or N], shape (joints,), NaN where none reported in
             this cycle; None where none ever did.
         stamp_doubt_ns: by how much before `stamp_ns` they may have been sampled [ns], where the computer stalled
             between the request and its stamp; else 0.

@@ -29,7 +29,7 @@ class Fault:
         kind: of the fault.
         joint: index of the axis, None for all.
         duration: cycles it lasts; None for one cycle or for good, as `FAULT_RULES` says.
-        size: what `FAULT_RULES` says.
+        size: quantity that `FAULT_RULES` defines.
         offset: of a load, in the frame of the last link [m].
     """
 
@@ -127,7 +127,7 @@ class Feedback:
         """Pass one cycle's answers through the faults of that cycle.
 
         Args:
-            fresh: what the encoders show [rad or m], shape (joints,); kept.
+            fresh: positions that the encoders show [rad or m], shape (joints,); kept.
             status: status words of the drives, per axis.
             faults: those active.
 

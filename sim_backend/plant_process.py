@@ -65,7 +65,7 @@ class PlantProcess:
             listener: bound and listening, non-blocking.
             lifeline: a descriptor that ends with the parent.
             sha256: of the configuration, which a client must share.
-            story: where to say what happens.
+            story: records the status.
             lock_step: whether exchanges move time, instead of the machine's clock.
         """
         self._machine = machine

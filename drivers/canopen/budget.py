@@ -75,8 +75,8 @@ class Line:
     """Describe the frames of one sort.
 
     Attributes:
-        name: what they are.
-        cob_ids: one frame each.
+        name: of the sort.
+        cob_ids: identifiers, one frame each.
         length: bytes of one.
         per_second: how often each is sent, at most.
         cyclic: whether each is sent once a cycle.
@@ -101,8 +101,8 @@ class BusLoad:
     """Describe the load of one bus.
 
     Attributes:
-        profile: what flows on it.
-        lines: what that costs.
+        profile: frames of the bus.
+        lines: their load, by sort.
     """
 
     profile: BusProfile
@@ -143,7 +143,7 @@ class Budget:
     Attributes:
         rate: cycles per second.
         buses: in the order of the configuration.
-        remedies: what would make it fit, each alone and each in words; empty where it fits.
+        remedies: changes of which each alone would make the load fit, in words; empty where it fits.
     """
 
     rate: float
@@ -191,7 +191,7 @@ def frame_cost(cob_id: int, slots: Sequence[Entry], bus: CanBus) -> Cost:
 
     Args:
         cob_id: its identifier.
-        slots: what it carries; decides its length and which values are typical.
+        slots: entries that it carries; they decide its length and which values are typical.
         bus: its bit rates.
     """
     length, fd = sum(slot.kind.size for slot in slots), bus.data_bitrate is not None

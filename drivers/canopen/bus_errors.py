@@ -60,7 +60,7 @@ class BusError(DriverError):
         """Describe what is wrong and what to do.
 
         Args:
-            kind: what is wrong.
+            kind: of the error.
             name: of the bus, as it is configured.
             bitrate: for the command that brings an interface up.
             detail: the system's own word.
@@ -76,7 +76,7 @@ def kind_of(code: int | None, otherwise: Kind = "refused") -> Kind:
 
     Args:
         code: the errno, None where there is none.
-        otherwise: what any other one means; `gone` says that the bus is in use, so that it was there before.
+        otherwise: kind of any other errno; `gone` says that the bus is in use, so that it existed before.
     """
     kind = _KINDS.get(code or 0, otherwise)
     return "gone" if (kind, otherwise) == ("absent", "gone") else kind

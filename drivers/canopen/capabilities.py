@@ -70,7 +70,7 @@ class Found:
 
     Attributes:
         there: keys (index << 8 | sub-index) of entries that it has.
-        values: what they hold, by key, where that is known.
+        values: of the entries, by key, where known.
         unread: why one that it seems to have could not be read, by key.
         asked: whether the drive was asked; else its data sheet foretells.
     """
@@ -122,8 +122,8 @@ class Capabilities:
         dummies: indices of what may take the room of others' torques, in the order in which they are tried.
         shares: whether its data sheet or its family lets it share torque frames.
         problems: why it cannot be driven.
-        changes: what the description has to say instead.
-        notes: what it lacks, and what happens instead.
+        changes: that the description needs, with reasons.
+        notes: missing optional entries, and what happens instead.
     """
 
     family: Family

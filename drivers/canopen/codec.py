@@ -78,7 +78,7 @@ class Drive:
         torque: the last one that it measured [per mille of rated torque] (6077h).
         torques: how often that was told.
         status_age: cycles since it.
-        nmt: what its last heartbeat said, None before the first.
+        nmt: state of its last heartbeat, None before the first.
         heartbeat_ns: when that was [ns of the link's clock].
         boots: boot-up messages.
         emergency: the latest, None before the first and after a reset.
@@ -153,10 +153,10 @@ class BusCodec:
     """Encode and decode the frames of the drives of one bus.
 
     Attributes:
-        profile: what flows.
+        profile: frames of the bus.
         drives: the state of each, in the order of `profile.drives`.
         controller: state of the host's CAN controller.
-        counters: what was not used.
+        counters: frames that were not used.
     """
 
     def __init__(self, profile: BusProfile) -> None:

@@ -212,7 +212,7 @@ def unwrapped(before: int, counts: int) -> int:
 
     Args:
         before: the last position, unwrapped [counts].
-        counts: what the drive says now, a signed number of 32 bits.
+        counts: present position of the drive, a signed number of 32 bits.
     """
     return before + (counts - before + _TURN // 2) % _TURN - _TURN // 2
 

@@ -45,7 +45,7 @@ class Enabling:
 
         Args:
             drives: of all buses, as their codecs know them.
-            names: what people call them.
+            names: of the drives, for people.
             step: how long all drives together may take for one step [s].
             now_ns: of the link's clock.
             reports: least and longest time between two status reports of a drive [s].

@@ -17,11 +17,11 @@ class Overheard:
     """Listen on every bus of an arm.
 
     Attributes:
-        nmt: what each node's last heartbeat said, and when it came [ns of the links' clock].
-        booted: nodes whose last word was a boot-up message, which makes them pre-operational.
-        restarted: nodes that sent a boot-up message since somebody cleared this.
-        answered: nodes that sent an SDO reply which nobody waited for.
-        streaming: buses on which somebody sends SYNC.
+        nmt: state of each node's last heartbeat, and when it came [ns of the links' clock].
+        booted: nodes whose last heartbeat was a boot-up message, which makes them pre-operational.
+        restarted: nodes that sent a boot-up message since this was last cleared.
+        answered: nodes that sent an SDO reply for which no request waited.
+        streaming: buses on which another host sends SYNC.
     """
 
     def __init__(self) -> None:

@@ -98,7 +98,7 @@ class Pdo:
         sent: by the drive (TPDO), else to it (RPDO).
         cob_id: of its frame.
         type: transmission type.
-        slots: what it maps, in order.
+        slots: entries that it maps, in order.
         inhibit: least time between two [100 us]; of TPDOs.
         timer: of a TPDO its event timer, of an RPDO its deadline [ms]; 0 for none.
     """
@@ -168,18 +168,18 @@ class BusProfile:
         drives: which of the arm's drives are on it, in the arm's order.
         nodes: the same drives as node numbers.
         notices: of each of them, emergency codes by which it only informs.
-        torque_frames: what carries their torques.
+        torque_frames: that carry their torques.
         heartbeat_host: period of the host's heartbeat [s].
         heartbeat_drives: period of each drive's [s].
         heartbeat_timeout: how long the host waits for a drive's [s].
         heartbeat_wait: how long drives wait for the host's whose watchdog it is [s]; None for as long.
-        watchdogs: of each drive, what it watches (`CanopenDrive.watchdog`).
+        watchdogs: of each drive, the signal that it watches (`CanopenDrive.watchdog`).
         guarding: guard time [s] and life time factor of drives that are guarded.
         torque_deadline: after which a drive without torque frames stops by itself [s].
         status_period: of a drive's status report without a change [s].
         status_inhibit: least time between two of them [s].
-        position_slots: what a drive tells at every SYNC.
-        status_slots: what its status report tells.
+        position_slots: entries that a drive sends at every SYNC.
+        status_slots: entries of its status report.
     """
 
     number: int

@@ -108,7 +108,7 @@ class PythonCanLink:
 
         Args:
             bus: opened by `open_bus`; shut down with the link.
-            config: what it was opened from.
+            config: that it was opened from.
         """
         self.clock = RealClock()
         self._bus, self._config = bus, config

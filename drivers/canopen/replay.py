@@ -122,8 +122,8 @@ class ReplayLink:
     """Implement a Link that replays one bus of a log.
 
     Attributes:
-        sent: what the driver sent, stamped.
-        logged: what was sent in the log, to compare with.
+        sent: frames that the driver sent, stamped.
+        logged: frames that were sent in the log, to compare with.
     """
 
     def __init__(self, session: Sequence[LoggedFrame], bus: int = 0, clock: Clock | None = None) -> None:

@@ -51,7 +51,7 @@ class FoundNode:
         history: 1003h, the latest first; the error code is in the lower 16 bits.
         status: 6041h, of drives.
         last_error: 603Fh, of drives.
-        unread: what could not be read, and why, in words.
+        unread: entries that could not be read, and why, in words.
     """
 
     bus: int

@@ -29,10 +29,10 @@ class ComputedTorque:
     Attributes:
         position: of the last update [rad or m], shape (joints,), predicted where it was not measured.
         velocity: filtered velocity of the last update [rad/s or m/s], shape (joints,).
-        correction: what the errors added to the last torque, `M(q) (K_d (dq_r - dq) + K_p (q_r - q))` [N m or N],
+        correction: feedback part of the last torque, `M(q) (K_d (dq_r - dq) + K_p (q_r - q))` [N m or N],
             shape (joints,); nothing when the arm is only damped.
         feedforward: friction in the last torque [N m or N], shape (joints,); nothing when the arm is only damped.
-        answer: the acceleration in it, `K_d (dq_r - dq) + K_p (q_r - q)` [rad/s^2 or m/s^2], shape (joints,); nothing
+        answer: feedback acceleration, `K_d (dq_r - dq) + K_p (q_r - q)` [rad/s^2 or m/s^2], shape (joints,); nothing
             likewise.
     """
 

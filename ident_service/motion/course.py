@@ -54,7 +54,7 @@ class Course:
             start: where the arm stands.
             limits: of the arm, for stops and pauses.
             resuming: of ways out of pauses.
-            surroundings: what ways out of pauses must keep clear of.
+            surroundings: that trajectories out of pauses must avoid.
             held: whether the end of the last way is held like the end of a stop, instead of being done at once.
         """
         self.reference = start

@@ -99,7 +99,7 @@ class Deadlines:
         Args:
             findings: makes the faults.
             period: of the loop [s].
-            scheduled_stamps: what the arm says of its stamps (`ArmDescription`).
+            scheduled_stamps: whether stamps are those of a schedule (`ArmDescription`).
             longest_stall: that is survived [s].
         """
         self.lateness_ns = self.lost = 0

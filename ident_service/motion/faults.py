@@ -66,7 +66,7 @@ class Rule:
 
     Attributes:
         reaction: to the fault.
-        means: what may be the cause, the end of the sentence that a person reads.
+        means: the possible cause, the end of the sentence that a person reads.
         often: of a warning, in how many of the last 100 cycles it is still only a warning.
         becomes: the fault that one more makes of it.
         each: whether every message of a warning is told, not only the first of its code.

@@ -81,9 +81,9 @@ class Owed:
         Args:
             direction: in which each position has changed, 1 or -1, or 0 where it has not or was not measured, shape
                 (joints,).
-            correction: what the errors added to the torque [N m or N], shape (joints,); all zero where no position is
-                asked for, of which nothing follows.
-            answer: the acceleration in it [rad/s^2 or m/s^2], shape (joints,).
+            correction: feedback torque [N m or N], shape (joints,); all zero where no position is asked for, which
+                allows no conclusion.
+            answer: feedback acceleration [rad/s^2 or m/s^2], shape (joints,).
             position: last known [rad or m], shape (joints,).
             feedforward: friction in the torque [N m or N], shape (joints,).
 

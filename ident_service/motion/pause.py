@@ -68,7 +68,7 @@ class Paused:
 
         Args:
             limits: as for `resume`.
-            surroundings: what ways back must keep clear of; one that does not is none, and the search goes on.
+            surroundings: that trajectories back must avoid; after one that does not, the search goes on.
 
         Raises:
             MotionRefused: as `resume`, from any of its steps.
@@ -92,7 +92,7 @@ class Paused:
         Args:
             end: at rest.
             limits: of the way, as for `resume`.
-            surroundings: what the way must keep clear of.
+            surroundings: that the trajectory must avoid.
 
         Raises:
             MotionRefused: the straight way is not free; from any of the steps.

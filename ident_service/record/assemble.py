@@ -35,7 +35,7 @@ def assemble(
         samples: length of the blocks; the last one is shorter.
         path: of the file, for messages.
         joints: a name per column, for messages.
-        place: what to call the sample of this index (from 0, those left out counted) in messages.
+        place: name in messages of the sample of this index (from 0, those left out counted).
         skip_missing: whether to leave out samples with a value of NaN.
 
     Raises:

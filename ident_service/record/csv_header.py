@@ -31,7 +31,7 @@ class CsvColumns:
         torque: indices of the torques, shape (joints,).
         velocity: indices of the velocities, shape (joints,), or None.
         nanoseconds: in one unit of the time column.
-        scale: what each column's numbers are multiplied by to be in SI, shape (fields,); None where all are.
+        scale: factor from each column's unit to SI, shape (fields,); None where all are in SI.
         used: indices of all columns above, in the order of the file.
     """
 

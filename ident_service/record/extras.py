@@ -25,8 +25,8 @@ class Event:
     Attributes:
         stamp_ns: on the recording's time axis [ns].
         level: 10 debug, 20 information, 30 warning, 40 error, 50 fatal.
-        name: who logged.
-        message: what.
+        name: of the logger.
+        message: text that was logged.
     """
 
     stamp_ns: int
@@ -59,7 +59,7 @@ def read_extras(path: Path, stream: IO[bytes], size: int, utc_offset_ns: int) ->
         path: for messages.
         stream: the file.
         size: how many bytes of it to read.
-        utc_offset_ns: what to subtract from the events' stamps [ns].
+        utc_offset_ns: offset to subtract from the events' stamps [ns].
 
     Raises:
         RecordingError: attachments of more than 64 MiB, or a chunk that expands beyond that.

@@ -40,7 +40,7 @@ class McapRecording:
         torn: whether the file ends, or is damaged, before its end mark.
         metadata: the record `ident`, empty for a bag.
         own: whether this package wrote it; topic, names and sides are then its own whatever the arm's bags are like.
-        damage: what is wrong where the file is torn, else empty.
+        damage: description of the damage where the file is torn, else empty.
     """
 
     def __init__(

@@ -35,7 +35,7 @@ class RangeRecording:
             whole: a file, or a range of one.
             start: [s] after the first sample of the file.
             end: likewise; may be infinite.
-            label: what the name ends in, to tell ranges of one file apart.
+            label: suffix of the name, to tell ranges of one file apart.
         """
         self.path: Path = whole.path.with_name(whole.path.name + label)
         self.sha256 = whole.sha256

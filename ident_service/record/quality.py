@@ -81,7 +81,7 @@ class Quality:
         repeats: samples left out because they repeat the one before.
         arrival: whether the motion goes on evenly where the stamps do not, so that they say when a sample arrived and
             not when it was taken; None where too few steps are off by more than 5 % to tell.
-        declared: what the stamps were taken for.
+        declared: kind of stamps that the configuration states.
         resampled: whether the samples are read off curves between the recorded ones.
         torn: whether the file was cut off or damaged.
         first_ns: stamp of the first sample [ns].
@@ -149,8 +149,8 @@ def quality(
     """Assess a recording, in constant memory.
 
     Args:
-        recording: what to read, through once more after `grid`.
-        fmt: what to trim, and what a gap is.
+        recording: read once more after `grid`.
+        fmt: seconds to trim, and length of a gap.
         torque_limit: of each joint [N m or N], shape (joints,), NaN where it is not known.
         known: `grid(recording, fmt)`, where that has been found already.
 

@@ -58,7 +58,7 @@ class RecorderReport:
         events: events of the motion written.
         lost: records of the ring that were overrun.
         complete: whether the file says that it is complete.
-        error: what failed, empty if nothing did.
+        error: description of the failure, empty without one.
     """
 
     samples: int

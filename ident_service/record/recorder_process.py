@@ -64,7 +64,7 @@ class RecorderProcess:
             path: as for `RecordingWriter`, and so are the next five.
             joint_names: in the order of every vector.
             robot_description: URDF, as text.
-            utc_offset_ns: what to add to a stamp to get UTC [ns since 1970].
+            utc_offset_ns: offset from a stamp to UTC [ns since 1970].
             attachments: file name to content.
             metadata: added to the record `ident`.
             lock_step: whether time waits for the recorder (a clock's `lock_step`).

@@ -67,8 +67,8 @@ def uniform(
     result.
 
     Args:
-        recording: what to read.
-        fmt: what to trim, what a gap is, and the rate.
+        recording: to be read.
+        fmt: seconds to trim, length of a gap, and the rate.
         known: its `grid(recording, fmt)`, where that has been found already.
         shortest_s: segments shorter than `Grid.least_s` of this are left out [s].
         samples: how many samples to read at a time.

@@ -71,7 +71,7 @@ class RecordingWriter:
             path: the finished file; neither it nor `<path>.partial` may exist.
             joint_names: in the order of every vector.
             robot_description: URDF, as text.
-            utc_offset_ns: what to add to a stamp to get UTC [ns since 1970].
+            utc_offset_ns: offset from a stamp to UTC [ns since 1970].
             attachments: file name to content, such as the arm's configuration and the excitation.
             metadata: added to the record `ident`.
 

@@ -61,7 +61,7 @@ class PuckFault:
         drive: index of the drive; None for all.
         at: its beginning, from the moment it is counted from [s].
         duration: how long [s]; None for one cycle or for good, as `PUCK_FAULTS` says.
-        size: what `PUCK_FAULTS` says.
+        size: quantity that `PUCK_FAULTS` defines.
         offset: of a load, in the frame of the last link [m].
     """
 

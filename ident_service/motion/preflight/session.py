@@ -113,7 +113,7 @@ class Session:
             arm: open, at rest, not enabled.
             model: with a prior.
             limits: of the arm.
-            described: what the arm says of itself.
+            described: description of the open arm.
             home: where it stands [rad or m], shape (joints,).
             friction: widens the band of torques.
         """

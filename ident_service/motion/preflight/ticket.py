@@ -65,7 +65,7 @@ class Ticket:
     """Represent the result of a preflight.
 
     Attributes:
-        subject: what was checked.
+        subject: arm, motion, model and software that were checked.
         checks: all of them, in the order of `CODES`.
         created: UTC, whole milliseconds.
         expires: UTC.

@@ -48,7 +48,7 @@ class Consent:
 
     Attributes:
         given: it may.
-        check: what is said where it may not, else None.
+        check: the check to report where it may not, else None.
     """
 
     given: bool
@@ -99,7 +99,7 @@ def watchdog_check(
     Args:
         arm: enabled, held by `session`.
         model: for names, and the watchdog's time in the driver's section where the driver does not tell it.
-        session: what holds it; without torque frames the last torque acts until a drive gives it up.
+        session: the loop that holds the arm; without torque frames the last torque acts until a drive ends it.
         setpoint_at: where the joints that are held should be, by the time since the silence began [s].
         moving: number of the joint that moves, whose travel is measured; None at standstill.
 
