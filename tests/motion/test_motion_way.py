@@ -48,6 +48,15 @@ def test_between_gentle_states_a_way_exists(start: Setpoint, end: Setpoint) -> N
     assert (np.abs(velocity) <= LIMITS.velocity * (1 + 1e-6)).all()
 
 
+def test_a_joint_that_ends_as_it_begins_goes_round_while_another_moves() -> None:
+    start = Setpoint(np.array([0.0, 0.25]), np.zeros(2), np.array([0.0, 3.75]))
+    end = Setpoint(np.array([0.0, 0.25]), np.zeros(2), np.array([1.0, 3.75]))
+    reference = way(start, end, LIMITS)
+    close(reference.at(reference.duration), end)
+    times, position, velocity, acceleration = sampled(reference)
+    goes_together(LIMITS, times, position, velocity, acceleration)
+
+
 @pytest.mark.slow
 @given(setpoints(LIMITS), setpoints(LIMITS))
 def test_the_extent_of_a_way_is_where_it_goes(start: Setpoint, end: Setpoint) -> None:
