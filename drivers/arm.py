@@ -113,7 +113,7 @@ class Watchdog:
     Attributes:
         drive: its name, for people.
         kind: the signal it watches: `rpdo_timer` and the like.
-        seconds: how long that may stay away before the drive acts [s]; None where nobody says.
+        seconds: how long that may stay away before the drive acts [s]; None where unknown.
         of_torque: whether it is the torque frames, so that a cycle without torque withholds it.
     """
 

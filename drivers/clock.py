@@ -1,4 +1,4 @@
-"""Define the clocks that a loop can run on: the machine's, or a virtual one that waits for nobody.
+"""Define the clocks that a loop can run on: the machine's, or a virtual one that jumps to each deadline.
 
 Everything that knows time takes one of these, so that leases, watchdogs and deadlines agree and a loop behaves the
 same in real and in virtual time.

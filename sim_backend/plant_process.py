@@ -6,7 +6,7 @@ torque acts on and the drives' watchdog counts. In lock-step each exchange is on
 only a cycle without a torque, or a connection that ends, is silence.
 
 When the client is gone, silence goes on until the idle drives have braked the arm to rest, or `PATIENCE` has passed: at
-the machine's pace while somebody may come back in real time, otherwise as fast as it can be computed. When client and
+the machine's pace while a client may come back in real time, otherwise as fast as it can be computed. When client and
 parent are gone the process ends after that. It knows its client's end by the connection and its parent's by the end of
 its standard input, so that it outlives neither for long, however they died.
 """

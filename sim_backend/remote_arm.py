@@ -99,7 +99,7 @@ class RemoteArm(Arm):
         """Open the arm, starting its plant if none listens; cycles count from 0, the plant stays where it was.
 
         Raises:
-            DriverError: open already, somebody else's, another arm's, or the plant cannot be started.
+            DriverError: open already, in use by another process, of another arm, or the plant cannot be started.
         """
         if self._socket is not None:
             raise DriverError("the simulated arm is already open")

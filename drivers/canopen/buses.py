@@ -4,7 +4,7 @@ A cycle begins one period after the one before; periods that are over are skippe
 are missing, one that began late waits for them half a period, or as long as its frames need on the wire: positions
 carry no number, and one that came after the next SYNC would count for it. On every bus the
 torques go first, then SYNC on all of them back to back, so that all drives act and sample at one time. Our heartbeat is
-sent behind the answers, by this loop and nobody else: a loop that stops is missed by the drives.
+sent behind the answers, by this loop alone: drives notice a loop that stops.
 """
 
 from __future__ import annotations

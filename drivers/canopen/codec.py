@@ -120,9 +120,9 @@ class Counters:
     Attributes:
         ignored: remote frames, 29-bit identifiers, SDO replies and heartbeats of others.
         wrong_length: frames of a drive with another length than its profile has.
-        strangers: frames of nobody who should be on the bus.
+        strangers: frames of nodes that should not be on the bus.
         errors: error frames of the host's controller.
-        events_lost: events that nobody took before there were too many.
+        events_lost: events that were dropped because too many waited.
     """
 
     ignored: int = 0
@@ -228,7 +228,7 @@ class BusCodec:
         """Open a cycle after SYNC has been sent: from now on each drive may answer once.
 
         Args:
-            now_ns: when [ns of the link's clock], for frames that nobody stamped.
+            now_ns: time of SYNC [ns of the link's clock], for frames without a stamp.
         """
         self._open, self._now_ns, self._missing = True, now_ns, len(self.drives)
         for drive in self.drives:

@@ -54,7 +54,9 @@ def configure_pdos(objects: Objects, pdos: Sequence[Pdo], unused: Sequence[Pdo],
             raise SdoRefused(f"{refused}; {words}", refused.code) from None
     for pdo in pdos:
         if not pdo.sent and not pdo.timer:
-            objects.ensure_if_there(pdo.timing)  # a deadline that somebody else left could end a silence that is none
+            objects.ensure_if_there(
+                pdo.timing
+            )  # a deadline left by another host could report a silence where there is none
 
 
 def _variants(pdo: Pdo, dummies: Sequence[int]) -> list[Pdo]:

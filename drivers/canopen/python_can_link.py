@@ -2,7 +2,7 @@
 
 Stamps of python-can are seconds since 1970, of a controller's own clock, or missing; they are turned into monotonic
 time by their age, and replaced by the time of reception where that age cannot be. Its `udp_multicast` always hears its
-own frames: ours carry a mark that it hands through, by which they are told apart from a foreign frame of the same
+own frames: the link's carry a mark that it passes on, which distinguishes them from a foreign frame of the same
 content.
 """
 

@@ -1,7 +1,7 @@
 """Implement a Link on a CAN socket of the kernel (interface `raw`, Documentation/networking/can.rst).
 
 One system call a frame. Stamps are the kernel's, taken when the frame arrived, turned from wall-clock to monotonic time
-by their age. Frames that the kernel dropped because nobody read them are told as an error frame of receive overflow.
+by their age. Frames that the kernel dropped are reported as an error frame of receive overflow.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def open_socket(channel: str, bitrate: int = 1_000_000, *, fd: bool = False) -> 
 
     Args:
         channel: network interface, as `ip link` names it.
-        bitrate: for the remedy in messages only; whoever brings the interface up sets it.
+        bitrate: for the remedy in messages only; the interface is configured outside.
         fd: whether CAN FD frames may come and go.
 
     Raises:

@@ -148,7 +148,7 @@ class ReplayLink:
                 passed += _marks(sent, logged.frame)
                 sent += 1
         self._next = 0
-        self._shift_ns = [self.clock.now_ns()]  # from the log's time to ours, by marks passed
+        self._shift_ns = [self.clock.now_ns()]  # from the log's time to the clock's, by marks passed
 
     @property
     def finished(self) -> bool:

@@ -1,7 +1,7 @@
 """Choose how a stopped arm is secured: its brakes hold it, the loop holds it, or it is lowered.
 
 Joints are asked by their weight: one whose gravity torque, by the prior model, is above `WEIGHS` of its torque limit in
-some posture falls when its drive lets go, unless it has a brake.
+some posture falls when its drive is switched off, unless it has a brake.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Exchange cycles without torque while the caller blocks, so that drives do not report a lost host.
 
-Drives treat a host that falls silent as dead and disable themselves or stop. So whoever plans, checks or asks a person
-while an arm is open lets cycles without torque go on meanwhile. In virtual time nobody waits, and the work is simply
-done. With torque on nothing else is done at all: the loop's thread would have to share the interpreter.
+Drives treat a host that falls silent as dead and disable themselves or stop. So code that plans, checks or asks a
+person while an arm is open lets cycles without torque go on meanwhile. In virtual time no drive waits, and the block
+just runs. With torque on nothing else is done at all: the loop's thread would have to share the interpreter.
 """
 
 from __future__ import annotations

@@ -73,7 +73,7 @@ class ComputedTorque:
             position: measured [rad or m], shape (joints,).
             valid: where `position` is fresh; elsewhere the arm is taken to have gone on as it went.
             reference: where it should be.
-            elapsed: since the update before [s]; one period when None; 0 where nobody knows, and the velocity stays.
+            elapsed: since the update before [s]; one period when None; 0 where it is unknown, and the velocity stays.
 
         Returns:
             Torque [N m or N], shape (joints,), not yet limited.

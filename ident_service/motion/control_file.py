@@ -16,12 +16,12 @@
 | 40 | int64 | when a stop was asked for last, whether or not the arm moved then [ns of the same]; 0 for never |
 | 48 | int64 | when the lease of a way home was renewed last [ns of the same] |
 
-A motion takes seconds to begin, in which nobody can be reached yet. So a stop leaves its time behind, and a motion that
-was asked for before it takes the controls with the stop in them.
+A motion takes seconds to begin, in which no loop can be reached yet. So a stop leaves its time behind, and a motion
+that was asked for before it takes the controls with the stop in them.
 
-Every word is written by one side at a time and read whole. The loop reads memory, so asking costs it nothing and nobody
-can make it wait. Whoever moves the arm holds an exclusive lock on the file, which vanishes with the process: a second
-one is refused, and a file without a lock is nobody's.
+Every word is written by one side at a time and read whole. The loop reads memory, so reading costs it nothing and no
+other process can make it wait. The process that moves the arm holds an exclusive lock on the file, which vanishes with
+the process: a second one is refused, and a file without a lock belongs to no process.
 
 The lease is measured on the machine's clock: it is about a process that hangs, not about the arm. `lifeline.py` says
 when it counts.
@@ -105,7 +105,7 @@ class ControlFile:
         """Open the controls of an arm that another process moves.
 
         Raises:
-            UsageError: nobody moves the arm.
+            UsageError: no process moves the arm.
         """
         try:
             fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
@@ -128,7 +128,7 @@ class ControlFile:
             now_ns: the clock of `take`.
 
         Returns:
-            The process that moves the arm; None where nobody does.
+            The id of the process that moves the arm; None where none does.
 
         Raises:
             UsageError: the file cannot be written; an arm that moves has been stopped all the same.
@@ -203,7 +203,7 @@ class ControlFile:
         """Confirm, as a person who sees it, that the arm is supported or home; cannot be taken back.
 
         Raises:
-            UsageError: the arm does not wait for it; what is said beforehand would let go an arm that still moves.
+            UsageError: the arm does not wait for it; confirmed beforehand, it would release an arm that still moves.
         """
         if not self.waiting:
             raise UsageError("the arm is not held after a stop; there is nothing to confirm")
@@ -236,15 +236,15 @@ class ControlFile:
         self._memory[_HOMING] = Homing.ASKED
 
     def renew_home(self) -> None:
-        """Renew the lease of whoever had the arm led home."""
+        """Renew the lease of the requester of the motion home."""
         self._words[_HOME_RENEWED // 8] = self._now_ns()
 
     def home_lease_ok(self) -> bool:
-        """Return whether the lease of leading the arm home was renewed within `LEASE_SECONDS`."""
+        """Return whether the lease of the requester of the motion home was renewed within `LEASE_SECONDS`."""
         return self._now_ns() - self._words[_HOME_RENEWED // 8] <= round(LEASE_SECONDS * 1e9)
 
     def renew(self) -> None:
-        """Renew the lease of whoever asked for the motion."""
+        """Renew the lease of the requester of the motion."""
         self._words[_RENEWED // 8] = self._now_ns()
 
     def lease_ok(self, now_ns: int) -> bool:

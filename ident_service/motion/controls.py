@@ -53,10 +53,10 @@ class Controls(Protocol):
         """Return whether a person wants the held arm led home, and the stage of that."""
 
     def tell_homing(self, stage: Homing) -> None:
-        """Set the stage of leading the arm home; from `GOING` on, the lease of whoever asked for that counts."""
+        """Set the stage of leading the arm home; from `GOING` on, the lease of its requester counts."""
 
     def lease_ok(self, now_ns: int) -> bool:
-        """Return whether whoever asked for the motion is still there at this time of the loop's clock [ns]."""
+        """Return whether the requester of the motion is still alive, at this time of the loop's clock [ns]."""
 
 
 class StopWhen:

@@ -1,7 +1,7 @@
 """Sequence the references of a run: approach, motion, return, pauses in any of them, and the stop.
 
 A run that is finished early pauses, and goes straight back to where it stood instead of on. Where that way is not free
-it goes on: what was planned is proven, and ends in order too.
+it goes on as planned, which is proven and ends regularly, too.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ class Elapsed:
     """Measure the seconds from one sample to the next, by their stamps.
 
     Where cycles come late or are skipped, velocities are differences over what has really passed. Stamps that make no
-    sense are the guard's matter; nobody shall divide by them.
+    sense are the guard's matter and are never divided by.
 
     Attributes:
         known: whether both samples were taken when their stamps say, so that a velocity can be told from them. Where

@@ -24,7 +24,7 @@ UNFINISHED: Final = "motion_process"
 
 @dataclass(frozen=True)
 class Remembered:
-    """Represent a fault on disk that nobody has acknowledged.
+    """Represent an unacknowledged fault on disk.
 
     Attributes:
         code: its name.
@@ -53,7 +53,7 @@ class FaultFile:
         """Return all stored faults, the earliest first.
 
         Raises:
-            UsageError: a file was damaged by somebody.
+            UsageError: a file is damaged.
         """
         return self._remembered(moving=in_use(self._controls))
 
@@ -64,8 +64,8 @@ class FaultFile:
             run: folder of the run.
 
         Raises:
-            MotionRefused: a fault that nobody has acknowledged.
-            UsageError: a file was damaged by somebody, or cannot be written.
+            MotionRefused: there is an unacknowledged fault.
+            UsageError: a file is damaged, or cannot be written.
         """
         self.require_none({one.code: one.cause for one in self._remembered(moving=False)})
         self._mark.parent.mkdir(parents=True, exist_ok=True)
@@ -87,7 +87,7 @@ class FaultFile:
         """Store a fault; one that is stored already keeps its first cause.
 
         Raises:
-            UsageError: the file was damaged by somebody, or cannot be written.
+            UsageError: the file is damaged, or cannot be written.
         """
         rows = self._rows()
         if all(row.code != code for row in rows):
@@ -97,7 +97,7 @@ class FaultFile:
         """Remove a fault from the store; returns its cause.
 
         Raises:
-            UsageError: no fault of this name is latched, or a file was damaged by somebody.
+            UsageError: no fault of this name is latched, or a file is damaged.
         """
         faults = self.latched()
         if code not in faults:

@@ -6,7 +6,7 @@ Reactions, from mild to severe; a motion only ever goes from a milder one to a m
   too many of the last 100 cycles becomes a controlled stop.
 * **controlled stop**: the loop stays closed on a stop within limits (`stop.py`). The arm must then be measured at rest
   within `SETTLE` of the end of the stop, and is held: gravity compensated, motion damped, what else it needed to stand
-  kept on, no position asked for, so that it gives way to whoever pushes it. After `HOLD` seconds the drives of an arm
+  kept on, no position asked for, so that it yields when it is pushed. After `HOLD` seconds the drives of an arm
   with brakes are told to quick-stop. Without brakes (`after_stop.py`) it is held until a person confirms that it is
   supported or home, or lowered; either ends without torque when the arm rests.
 * **damped lowering**: for an arm that does not follow although it can be measured. No position is asked for any more:
@@ -171,7 +171,7 @@ class Findings:
     """Create faults from the table, and turn repeated warnings into a fault.
 
     Attributes:
-        cycle: number of the present cycle, for whoever counts cycles to advance.
+        cycle: number of the present cycle, advanced by the caller.
         warnings: how often each warning was found.
     """
 

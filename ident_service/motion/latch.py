@@ -12,7 +12,7 @@ from ident_service.errors import UsageError
 
 @dataclass(frozen=True)
 class Latched:
-    """Represent a fault in memory that nobody has acknowledged yet.
+    """Represent an unacknowledged fault in memory.
 
     Attributes:
         code: its name.
@@ -44,7 +44,7 @@ class Latch:
         """Acknowledge one fault: remove and return it.
 
         Raises:
-            UsageError: no fault of this name is latched; whoever acknowledges must know what.
+            UsageError: no fault of this code is latched; a person must acknowledge a known fault.
         """
         if code not in self._faults:
             known = ", ".join(self._faults) or "none"

@@ -1,4 +1,4 @@
-"""Check that whoever asked for the motion is still there: by a pipe that it holds, and a lease that it renews.
+"""Check that the requester of a motion is still alive: by a pipe that it holds, and a lease that it renews.
 
 The pipe ends with the process at its other end, however that dies, and within a cycle; so does the motion, in real and
 in virtual time. The lease is for one that lives but hangs. It is measured on the machine's clock, because that is where
@@ -23,7 +23,7 @@ class Lifeline:
 
         Args:
             controls: taken by this process.
-            pipe: readable end of the pipe that whoever asked for the motion holds open; a file or a device, too, which
+            pipe: readable end of the pipe that the requester of the motion holds open; a file or a device, too, which
                 never ends.
             lock_step: whether the loop's clock waits (a clock's `lock_step`).
         """
@@ -70,9 +70,9 @@ class Lifeline:
         return bool(self._poll.poll(0))
 
     def lease_ok(self, now_ns: int) -> bool:
-        """Return whether whoever asked for the motion is still there; a system call that does not wait.
+        """Return whether the requester of the motion is still alive; a system call that does not wait.
 
-        A held arm that is led home was asked for by somebody else, whose lease counts instead.
+        The motion home of a held arm has another requester, whose lease counts instead.
         """
         if self._controls.homing is Homing.GOING:
             return self._lock_step or self._controls.home_lease_ok()

@@ -336,7 +336,7 @@ class Loop:
 
     def _record(self, sample: Sample, reference: Setpoint, compute_ns: int) -> Fault | None:
         if self.states.state is State.STOPPED and self.after_stop is not AfterStop.BRAKE:
-            # Nobody identifies from it, and a person may let an arm wait for hours.
+            # No identification uses these samples, and a person may let an arm wait for hours.
             self._recorded = self._recorded or (sample.stamp_ns - self._since_ns) * 1e-9 > self.hold_seconds
         if self._recorded:
             return None

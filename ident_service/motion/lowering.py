@@ -31,7 +31,7 @@ MEANT: Final = frozenset({"position_limit", "position_envelope", "workspace"})
 
 
 class Anchor:
-    """Represent the position at which an arm is held; it yields to whoever pushes, so that the arm can be led by hand.
+    """Represent the position at which an arm is held; it yields to a push, so that the arm can be led by hand.
 
     Held by damping alone, an arm would creep wherever the model's weight is not its own.
     """

@@ -1,4 +1,4 @@
-"""Run the motion process: the arm and its control loop, started by whoever wants the arm to move.
+"""Run the motion process: the arm and its control loop, started by the process that requests the motion.
 
 It gets one JSON object on its standard input and says in lines of JSON on its standard output which state it enters and
 how the run ended; samples and story go through the ring to the recorder's process. It takes the arm's control file and
@@ -6,7 +6,7 @@ holds its lock, so that `ident stop` reaches it whatever became of its parent. A
 standard input, and one that hangs lets the lease lapse: either stops the arm (`lifeline.py`). What is to be known
 afterwards does not need a parent: faults are latched, and the ending is written into the run folder, from here.
 
-A pipe that nobody reads must not make the loop wait: lines that do not fit are dropped.
+A pipe that the parent does not read must not make the loop wait: lines that do not fit are dropped.
 """
 
 from __future__ import annotations

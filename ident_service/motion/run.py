@@ -47,7 +47,7 @@ class RunReport:
     """Represent the outcome of a run.
 
     Attributes:
-        state: DONE, or STOPPED where somebody asked for a stop.
+        state: DONE, or STOPPED after a request to stop.
         cycles: exchanged.
         peak_following_error: [rad or m], shape (joints,).
         peak_torque: largest torque sent [N m or N], shape (joints,).
@@ -85,7 +85,7 @@ def run(
         model: with the prior parameters that control needs.
         excitation: checked against the limits beforehand.
         sink: takes every sample.
-        controls: read every cycle; None for a run that nobody stops, pauses or finishes early.
+        controls: read every cycle; None for a run without stop, pause or early finish.
         speed: share of the motion's own speed at which all of it is played, approach, return and ways out of pauses
             too; a rehearsal takes 0.2. Stops are never slowed.
         latch: the arm's faults, which outlive the run; a new one when None.

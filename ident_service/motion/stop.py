@@ -65,11 +65,11 @@ def stop_overshoot(limits: MotionLimits) -> Vector:
 def stop_extent(path: Path, limits: MotionLimits) -> tuple[Vector, Vector]:
     """Return the lowest and highest position that stops from anywhere on a motion reach, the motion itself included.
 
-    Between two times looked at it may be exceeded by a trifle; and where stops come so close to a position limit that
+    Between two sampled times it may be exceeded slightly; and where stops come so close to a position limit that
     some must brake harder, by how far these settle back from there. Neither leads outside the limits: see above.
 
     Args:
-        path: looked at every 5 ms wherever it does something new.
+        path: sampled every 5 ms in its distinct parts.
         limits: that the stops keep.
 
     Returns:

@@ -1,6 +1,6 @@
 """Check that a run avoids collisions: the motion, the trajectories to and from it, and the stops out of all of them.
 
-Motion and ways are proven for all time (`excitation/clearance.py`); stops are looked at where they begin every 50 ms,
+Motion and trajectories are proven for all time (`excitation/clearance.py`); stops are sampled every 50 ms,
 and must only not touch: a stop is short, rare, and better than what it was asked for.
 
 A way back from a pause is proven while the arm stands and the loop goes on, one posture at a time. Within a time h a

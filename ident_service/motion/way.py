@@ -77,7 +77,7 @@ _CALM = 0.5  # of the limits, on the way to a motion and back
 def calm_way(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference:
     """Plan a trajectory to a motion or back, within half of the velocity and acceleration limits where its ends allow.
 
-    A way at the full limits leaves no margin for errors of the model, and nobody waits for its last second.
+    A trajectory at the full limits leaves no margin for errors of the model, and a second more does not matter.
 
     Raises:
         MotionRefused: as `way`.

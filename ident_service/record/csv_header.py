@@ -61,7 +61,7 @@ def parse_header(path: Path, header: str, columns: Mapping[str, Column] | None =
     Args:
         path: for messages.
         header: the first line.
-        columns: the file's column for each of ours, where it has others; None reads ours, in SI.
+        columns: the file's column for each standard name, where it has others; None reads standard names, in SI.
 
     Raises:
         RecordingError: the message lists all problems.

@@ -1,8 +1,8 @@
-"""Run the recorder process: take records from the ring and write them, until there is nobody to write for.
+"""Run the recorder process: take records from the ring and write them, until their writer and its parent have ended.
 
 Started by `recorder_process.py` as `python -m ident_service.record.recorder_loop RING CHANNEL WORK ROOM`, all four file
 descriptors. The channel is a socket to the parent: one line of JSON comes in (what to record), one goes out when the
-file is open, one when it is finished; its end is the parent's end. The ring is looked at every 5 ms, and at once when
+file is open, one when it is finished; its end is the parent's end. The ring is polled every 5 ms, and at once when
 a sink waits in lock step.
 
 ======================================== ====================================================================

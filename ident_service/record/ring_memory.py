@@ -1,7 +1,7 @@
 """Map the shared memory of the ring between motion and recorder, with its layout and a check of its identity.
 
 The memory is anonymous (`memfd_create`) and passed by file descriptor, so that it vanishes with the last process that
-has it, however that ends. It is sealed against growing and shrinking: nobody can cut it off under a reader. All words
+has it, however that ends. It is sealed against growing and shrinking: it cannot be cut off under a reader. All words
 are unsigned 64-bit in the machine's order, since both sides run on one machine.
 
 ====== ===== ===================================================== =============

@@ -4,11 +4,11 @@
 whether the recorder lives. It answers False in real time, and goes on writing into the ring, when
 
 * the recorder has said that it failed (a full disk) or that it ended;
-* the recorder's process is gone, or has not looked at the ring for two seconds;
+* the recorder's process is gone, or has not read the ring for two seconds;
 * more than a share of the ring waits to be taken.
 
 In lock step time stands still meanwhile, so that `put` may wait: for the third, until the recorder has made room, woken
-by an event counter. The first two, or a wait without end, raise there: whoever waits does not want to hear False. Which
+by an event counter. The first two, or a wait without end, raise there instead of returning False. Which
 samples reach the file is thus the same every time; the loop and the disk still work side by side.
 """
 

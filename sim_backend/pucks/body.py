@@ -2,7 +2,7 @@
 
 Between two instants at which something changes, motors do the same, and the plant moves in one step; a longer silence
 is divided into steps near the nominal period, between which `watch` is called, so that whoever limits torques by
-position and speed can. A step of exactly the nominal period is the simulated arm's. Somebody holds the arm until all
+position and speed can. A step of exactly the nominal period is the simulated arm's. The arm is supported until all
 motors are powered and one of them has been given torque: drives are enabled with none.
 """
 
@@ -34,7 +34,7 @@ class Body:
         motors: in the order of the configuration.
         now_ns: the time that the plant has been moved to.
         watch: called after each step but the last of a longer silence, with the time.
-        supported: whether somebody still holds the arm.
+        supported: whether the arm is still supported.
     """
 
     def __init__(self, plant: Plant, gears: Gears, noise: Vector, seed: int) -> None:

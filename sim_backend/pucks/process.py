@@ -78,7 +78,7 @@ def emulate(
         The summary.
 
     Raises:
-        DriverError: as `build_emulator`, an interface that cannot be had or is lost, a fault that nobody understands.
+        DriverError: as `build_emulator`, an interface that cannot be had or is lost, a malformed fault.
     """
     driver = config.driver
     if isinstance(driver, CanopenDriver) and any(bus.interface == INTERFACE for bus in driver.buses):

@@ -64,7 +64,7 @@ def connect(channel: str) -> socket.socket:
     """Connect to the wire.
 
     Raises:
-        BusError: nobody runs it, or somebody else does.
+        BusError: no process runs it, or one of another user does.
     """
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     name = f"ident_wire {channel}"

@@ -53,7 +53,7 @@ class IdentWireBus(can.BusABC):
             kwargs: ignored, as python-can's own interfaces do.
 
         Raises:
-            can.CanInitializationError: nobody runs the wire, or it cannot be run here.
+            can.CanInitializationError: no process runs the wire, or it cannot be run here.
         """
         self._thread: WireThread | None = None
         self.channel, self.channel_info = channel, f"ident_wire channel {channel!r}"

@@ -33,8 +33,8 @@ def from_config(config: ArmConfig, bus_number: int) -> WireLink:
     """Open the link of one bus of an arm; entry point `ident_wire`.
 
     Raises:
-        BusError: nobody runs the wire, or it refuses.
-        DriverError: the driver section is not CANopen's, or an option that nobody knows; `pace` is the host's.
+        BusError: no process runs the wire, or it refuses.
+        DriverError: the driver section is not CANopen's, or an unknown option; `pace` is the host's.
     """
     if not isinstance(config.driver, CanopenDriver):
         raise DriverError(f"{config.name}: the driver is not CANopen's")
@@ -61,7 +61,7 @@ class Connection:
             hello: label, filters and CAN FD of this end.
 
         Raises:
-            BusError: nobody runs the wire, or it refuses.
+            BusError: no process runs the wire, or it refuses.
         """
         self.name = f"ident_wire {channel}"
         self._socket = address.connect(channel)

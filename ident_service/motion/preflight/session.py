@@ -7,7 +7,7 @@ where it can be let go. So every end here, good or bad, is torque off; a drive's
 sign that has not been proven yet.
 
 While the torque is on nothing is worked out between two cycles, for drives give up within a few cycles without torque
-frames: what was recorded is judged when the arm has been let go.
+frames: what was recorded is evaluated when torque is off again.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ FASTEST = 1.0  # rad/s or m/s: where the guard stops; motions here are slower by
 BAND = 0.25  # of the torque limit, beside the model's gravity torque and expected friction
 _CREEP = 0.02  # rad/s or m/s, below which friction is not compensated, so that nothing hunts at rest
 RELEASE = 0.5  # s over which torque is led to zero
-SUNK = 0.02  # rad or m: what sinks farther while torque fades has no support, and is let go at once
+SUNK = 0.02  # rad or m: what sinks farther while torque fades has no support, and torque is taken off at once
 
 Rows = Sequence[tuple[Sample, Setpoint]]
 

@@ -71,7 +71,7 @@ class JointStability:
 
     Attributes:
         joint: its name.
-        lightest: the least true inertia looked at, as a share of the model's.
+        lightest: the least true inertia considered, as a share of the model's.
         radius: the largest spectral radius over the range of inertias.
         gain_margin: the loop gain may rise by this factor at the model's inertia before it oscillates; 1000 stands for
             more, and 1 for none.

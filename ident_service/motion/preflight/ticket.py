@@ -1,6 +1,6 @@
 """Represent preflight tickets: the findings, for which arm, motion, model and software, and until when they count.
 
-One JSON object of format `ident-ticket`. Whoever moves the arm asks it `valid_for` what it is about to do; any change
+One JSON object of format `ident-ticket`. The code that moves the arm asks it `valid_for` the motion; any change
 since asks for a new check. It is a record, not a signature: it protects against mistakes, not against people.
 """
 

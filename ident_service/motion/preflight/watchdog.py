@@ -60,7 +60,7 @@ def consent(model: ArmModel, sample: Sample, confirm: Confirm) -> Consent:
 
     Args:
         model: of the arm; its name must be typed.
-        sample: of the arm without torque; without status words nobody can see what the drives do.
+        sample: of the arm without torque; without status words the drives' reaction cannot be seen.
         confirm: shows a question and returns what the person typed.
     """
     if not sample.status:
