@@ -1,1 +1,1 @@
-"""Drivers: the Arm contract and one module per fieldbus arm; nothing here knows of identification."""
+"""Drive arms: the Arm contract and one package per fieldbus; nothing here knows of identification."""

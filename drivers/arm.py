@@ -1,7 +1,7 @@
-"""The Arm contract: what every arm, real or simulated, is to the motion loop.
+"""Define the Arm contract: the interface of every arm, real or simulated, to the motion loop.
 
-One blocking call per cycle for all axes, in joint space and SI units. This room knows nothing of identification,
-and a driver does no mathematics beyond units and transmission.
+One blocking call per cycle for all axes, in joint space and SI units. This package knows nothing of identification, and
+a driver does no mathematics beyond units and transmission.
 
 Timing. `exchange(torque)` of cycle k waits for the start of cycle k, hands the torque over and returns the sample of
 that cycle: positions at its stamp, and in `Sample.torque` the torque that acts from that stamp until the next one,
@@ -30,7 +30,7 @@ Counts = NDArray[np.int64]
 
 
 class StopKind(Enum):
-    """How an arm is told to stop from below; a coordinated stop is the motion loop's, not the driver's."""
+    """Name the ways in which drives end torque; a coordinated stop is planned by the motion loop, not by the driver."""
 
     TORQUE_OFF = "torque_off"  # no torque; an arm without brakes falls
     QUICK_STOP = "quick_stop"  # the drives decelerate on their own, then hold or release as configured
@@ -38,7 +38,7 @@ class StopKind(Enum):
 
 @dataclass(frozen=True)
 class ArmDescription:
-    """What an open arm says of itself.
+    """Describe an open arm: joints, rate, limits, resolutions and identities.
 
     Attributes:
         joint_names: in the order of every vector.
@@ -66,7 +66,7 @@ class ArmDescription:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """What one cycle brought.
+    """Hold the result of one cycle.
 
     Attributes:
         cycle: number of the cycle since `open`.
@@ -78,15 +78,15 @@ class Sample:
         age: cycles since each axis answered, shape (joints,); 0 where `valid`.
         lost: frames lost since `open`.
         status: slow per-axis status words, with `status_age` cycles since they were read.
-        events: what happened on the bus since the sample before.
-        drives: what each drive says of itself, in the words of its fieldbus, for people; empty where there is nothing
-            to add to `status`.
-        measured_torque: what drives measured until this stamp [N m or N], shape (joints,), NaN where none reported in
+        events: of the bus since the sample before.
+        drives: status of each drive in words of its fieldbus, for people; empty where there is nothing to add
+            to `status`.
+        measured_torque: measured by the drives until this stamp [N m or N], shape (joints,), NaN where none reported in
             this cycle; None where none ever did.
-        stamp_doubt_ns: how much earlier than `stamp_ns` they may have been sampled [ns], where the computer stalled
+        stamp_doubt_ns: by how much before `stamp_ns` they may have been sampled [ns], where the computer stalled
             between the request and its stamp; else 0.
-        torque_difference: by how much their last reports are more than what drives were told [N m or N], shape
-            (joints,), with what a sound drive may take to follow allowed for; None where nothing is to be compared.
+        torque_difference: by how much the drives' last reports exceed the torque they were told [N m or N], shape
+            (joints,), less what a healthy drive may deviate; None where nothing is to be compared.
     """
 
     cycle: int
@@ -108,12 +108,12 @@ class Sample:
 
 @dataclass(frozen=True)
 class Watchdog:
-    """Keep how one drive stops by itself when its host is gone.
+    """Describe how one drive stops by itself when its host is gone.
 
     Attributes:
         drive: its name, for people.
-        kind: what it watches: `rpdo_timer` and the like.
-        seconds: how long that may stay away before the drive acts [s]; None where nobody says.
+        kind: the signal it watches: `rpdo_timer` and the like.
+        seconds: how long that may stay away before the drive acts [s]; None where unknown.
         of_torque: whether it is the torque frames, so that a cycle without torque withholds it.
     """
 
@@ -124,12 +124,12 @@ class Watchdog:
 
 
 class Arm(ABC):
-    """A context manager with a handful of methods. Entering opens, leaving closes; closing stops torque first."""
+    """Define an arm as a context manager: entering opens it, leaving closes it; closing stops torque first."""
 
     clock: Clock
 
     def look(self) -> Arm:
-        """The same hardware as an arm that only looks, not open; this one must not be open beside it.
+        """Return the same hardware as an arm that can only be observed, not open; this one must not be open beside it.
 
         Of what is returned only `open`, `describe`, `exchange(None)` and `close` are used, and none of them sends a
         command, changes what a drive does or is configured to do, or keeps its watchdog quiet. It may be slower
@@ -138,7 +138,7 @@ class Arm(ABC):
         return self
 
     def zero(self) -> tuple[str, ...]:
-        """Take where the arm stands now for the home of its description; not open, it is opened and closed by this.
+        """Set the present position of the arm as the home of its description; it must not be open.
 
         For a person who has led the arm there, and only where encoders count from where they were when power came.
         Nothing is energised and nothing moves; until the encoders lose their power, `open` finds its positions by it.
@@ -164,30 +164,30 @@ class Arm(ABC):
         raise DriverError("this arm has no fieldbus whose frames could be logged")
 
     def logged(self) -> str:
-        """How the log of frames of the last session ended, in words; empty where none was kept."""
+        """Describe how the log of frames of the last session ended, in words; empty where none was kept."""
         return ""
 
     def watchdogs(self) -> tuple[Watchdog, ...]:
-        """Say what each drive's watchdog watches; empty where it is the torque frames of all axes, in `status`."""
+        """Return the watchdog of each drive; empty where all watch the torque frames and show in `status`."""
         return ()
 
     def withhold(self, kind: str) -> None:  # noqa: B027 - nothing to do where watchdogs watch torque frames
-        """Send no more of what watchdogs of one kind watch, until the next `stop`, and go on with everything else.
+        """Stop sending what watchdogs of one kind watch, until the next `stop`, and go on with everything else.
 
         Watchdogs of torque frames need none of it: `exchange(None)` withholds those.
         """
 
     def drive_status(self) -> tuple[AxisStatus, ...]:
-        """Say what each drive has told last, in the order of `watchdogs`."""
+        """Return what each drive has reported last, in the order of `watchdogs`."""
         return ()
 
     @abstractmethod
     def open(self) -> None:
-        """Take the arm exclusively and make it answer. Raises DriverError when it cannot be had."""
+        """Open the arm exclusively and check that it answers; raises DriverError where that fails."""
 
     @abstractmethod
     def describe(self) -> ArmDescription:
-        """Say what is open. Raises DriverError when the arm is not open."""
+        """Return the description of the open arm; raises DriverError when it is not open."""
 
     @abstractmethod
     def enable(self) -> None:
@@ -200,7 +200,7 @@ class Arm(ABC):
 
     @abstractmethod
     def reset(self) -> None:
-        """Clear what the drives have latched: faults of their own, an emergency stop, their watchdog.
+        """Clear the faults that drives have latched: their own, an emergency stop, their watchdog.
 
         For a person who knows why; no loop calls it. Nothing is energised by it, and an axis that is braked stays
         braked: an arm without brakes must not fall because a fault is forgotten. Without anything latched it does
@@ -212,11 +212,11 @@ class Arm(ABC):
 
     @abstractmethod
     def exchange(self, torque: Vector | None) -> Sample:
-        """One cycle for all axes.
+        """Exchange one cycle with all axes: send the torque, return the sample.
 
         Args:
-            torque: to act from this cycle's stamp on [N m or N], shape (joints,); None only looks, and is the
-                only value an arm that is not enabled accepts; on an enabled arm it lets the last torque act on.
+            torque: to act from this cycle's stamp on [N m or N], shape (joints,); None reads without a torque, and is
+                the only value an arm that is not enabled accepts; on an enabled arm it lets the last torque act on.
 
         Returns:
             The sample of this cycle.
@@ -235,15 +235,15 @@ class Arm(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Torque off, release the arm; safe from any state, any number of times."""
+        """Take the torque off and release the arm; safe from any state, any number of times."""
 
     def __enter__(self) -> Self:
-        """Open."""
+        """Open the arm."""
         self.open()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close, whatever happened."""
+        """Close the arm, whatever happened."""
         self.close()

@@ -1,4 +1,4 @@
-"""The clocks a loop can run on: the machine's, or a virtual one that waits for nobody.
+"""Define the clocks that a loop can run on: the machine's, or a virtual one that jumps to each deadline.
 
 Everything that knows time takes one of these, so that leases, watchdogs and deadlines agree and a loop behaves the
 same in real and in virtual time.
@@ -11,25 +11,25 @@ from typing import Protocol
 
 
 class Clock(Protocol):
-    """Monotonic time in integer nanoseconds."""
+    """Define a clock of monotonic time in integer nanoseconds."""
 
     @property
     def lock_step(self) -> bool:
-        """Whether time stands still until it is told to move, so that a consumer may be waited for."""
+        """Return whether time stands still until it is told to move, so that a consumer may be waited for."""
 
     @property
     def utc_offset_ns(self) -> int:
-        """What to add to `now_ns` to get nanoseconds since 1970 in UTC."""
+        """Return the difference from `now_ns` to nanoseconds since 1970 in UTC."""
 
     def now_ns(self) -> int:
-        """Monotonic time [ns]."""
+        """Return the monotonic time [ns]."""
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
         """Return at or after `deadline_ns`; at once when it has passed."""
 
 
 class RealClock:
-    """The machine's monotonic clock."""
+    """Read the machine's monotonic clock."""
 
     lock_step = False
 
@@ -37,7 +37,7 @@ class RealClock:
         self.utc_offset_ns = time.time_ns() - time.monotonic_ns()
 
     def now_ns(self) -> int:
-        """Monotonic time [ns]."""
+        """Return the monotonic time [ns]."""
         return time.monotonic_ns()
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
@@ -47,7 +47,7 @@ class RealClock:
 
 
 class VirtualClock:
-    """Time that jumps to whatever is waited for; `utc_offset_ns` is fixed so that runs repeat to the byte."""
+    """Simulate time that jumps to whatever is waited for; `utc_offset_ns` is fixed so that runs repeat to the byte."""
 
     lock_step = True
 
@@ -56,7 +56,7 @@ class VirtualClock:
         self.utc_offset_ns = utc_offset_ns
 
     def now_ns(self) -> int:
-        """Virtual time [ns]."""
+        """Return the virtual time [ns]."""
         return self._now
 
     def sleep_until_ns(self, deadline_ns: int) -> None:

@@ -1,7 +1,7 @@
-"""What the drive of one axis says of itself, in the same words for every fieldbus.
+"""Define the status and the events of an axis, common to all fieldbuses.
 
-Boundary: names of bits and of events. A driver translates its hardware's words into these (CiA 402 status words, puck
-modes); `Sample.status` holds one number per axis, `Sample.events` what happened since the sample before.
+A driver translates its hardware's codes into these (CiA 402 status words, puck modes); `Sample.status` holds one number
+per axis, `Sample.events` the events since the sample before.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from enum import IntFlag, StrEnum
 
 
 class AxisStatus(IntFlag):
-    """Bits of one axis; 0 is an axis that is merely switched off."""
+    """Name the status bits of one axis; 0 is an axis that is merely switched off."""
 
     POWERED = 1  # energised: a torque will act
     FAULT = 2  # the drive found something wrong with itself and gives no torque
@@ -25,7 +25,7 @@ TRIPPED = AxisStatus.FAULT | AxisStatus.EMERGENCY_STOP | AxisStatus.WATCHDOG
 
 
 class AxisEventCode(StrEnum):
-    """What may happen on a fieldbus beside the exchange; each is a fault or a warning of the guard's table."""
+    """Name the events on a fieldbus beside the exchange; each is a fault or a warning of the guard's table."""
 
     EMERGENCY_MESSAGE = "drive_emergency"  # a drive reports an error of its own
     DRIVE_SILENT = "drive_silent"  # its heartbeat is missing
@@ -33,22 +33,22 @@ class AxisEventCode(StrEnum):
     DRIVE_RESTARTED = "drive_restarted"  # it booted in the middle of a run
     DRIVE_LEFT = "drive_left"  # it left the state in which it takes torques
     TORQUE_IGNORED = "torque_ignored"  # energised, it does not follow its torque any more
-    SECOND_HOST = "second_host"  # somebody else sends what only this host may
+    SECOND_HOST = "second_host"  # another node sends what only this host may
     BUS_DEGRADED = "bus_degraded"  # so many errors that the host's controller or a drive's is in error passive
     BUS_OFF = "bus_off"  # the host's controller has left the bus
     DRIVE_WARNING = "drive_warning"
     DRIVE_NOTICE = "drive_notice"  # a drive informs of something that is no error
     TORQUE_LIMITED = "torque_limited"  # the drive gives less than it was asked for
-    STRANGE_FRAME = "strange_frame"  # of nobody, of a wrong length, or at a wrong time
+    STRANGE_FRAME = "strange_frame"  # of an unknown node, of a wrong length, or at a wrong time
 
 
 @dataclass(frozen=True, slots=True)
 class AxisEvent:
-    """Something that happened since the last sample.
+    """Represent an event since the last sample.
 
     Attributes:
-        code: what.
-        axis: whose, by the order of the joints; None for the bus or the host.
+        code: of the event.
+        axis: concerned, by the order of the joints; None for the bus or the host.
         words: one sentence's middle, for people, that names the drive itself.
     """
 

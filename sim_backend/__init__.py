@@ -1,1 +1,1 @@
-"""A simulated arm: a plant that knows the truth, behind the same contract as a real one."""
+"""Simulate arms: a plant with true parameters, behind the same contract as a real arm."""

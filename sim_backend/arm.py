@@ -1,4 +1,4 @@
-"""The simulated arm: a plant behind the Arm contract, in real or in virtual time.
+"""Implement the Arm contract with a simulated plant, in real or in virtual time.
 
 Time. Cycle k waits for its deadline, moves the plant from stamp k-1 to stamp k under the torque that acts between them,
 shows the positions, and latches the new torque, which acts from stamp k on. Simulated time only passes with cycles:
@@ -31,7 +31,7 @@ from sim_backend.schedule import Schedule
 
 
 class SimulatedArm(Arm):
-    """A plant, its imperfections and its faults as an Arm; the same seed gives the same samples bit for bit."""
+    """Simulate an arm: a plant, its imperfections and its faults; the same seed gives the same samples bit for bit."""
 
     def __init__(
         self,
@@ -47,10 +47,10 @@ class SimulatedArm(Arm):
         faults: Sequence[Fault] = (),
         observer: Callable[[Truth], None] | None = None,
     ) -> None:
-        """Put the pieces together; one cycle is one period of the plant.
+        """Assemble the simulated arm; one cycle is one period of the plant.
 
         Args:
-            plant: what moves.
+            plant: body of the arm.
             imperfections: of encoders and drives.
             clock: the loop's.
             seed: of the torque noise.
@@ -82,17 +82,17 @@ class SimulatedArm(Arm):
 
     @property
     def plant(self) -> Plant:
-        """What moves."""
+        """Return the simulated body."""
         return self._machine.plant
 
     @property
     def imperfections(self) -> Imperfections:
-        """Of encoders and drives."""
+        """Return the imperfections of encoders and drives."""
         return self._machine.imperfections
 
     @property
     def faults(self) -> tuple[Fault, ...]:
-        """To inject, by cycle since `open`."""
+        """Return the faults to inject, by cycle since `open`."""
         return self._machine.faults
 
     @faults.setter
@@ -100,7 +100,7 @@ class SimulatedArm(Arm):
         self._machine.faults = tuple(faults)
 
     def open(self) -> None:
-        """Take the arm; its cycles count from 0, its plant stays where it was."""
+        """Open the arm; its cycles count from 0, its plant stays where it was."""
         if self._open:
             raise DriverError("the simulated arm is already open")
         self._machine.restart()
@@ -108,7 +108,7 @@ class SimulatedArm(Arm):
         self._open = True
 
     def describe(self) -> ArmDescription:
-        """Say what is simulated; raises DriverError when not open."""
+        """Return the description of the simulated arm; raises DriverError when not open."""
         self._require_open()
         return description(self._machine)
 
@@ -118,12 +118,12 @@ class SimulatedArm(Arm):
         self._machine.enable()
 
     def reset(self) -> None:
-        """Clear what the drives have latched, as the contract has it; raises DriverError when not open."""
+        """Clear what the drives have latched, as the contract says; raises DriverError when not open."""
         self._require_open()
         self._machine.reset()
 
     def exchange(self, torque: Vector | None) -> Sample:
-        """One cycle, as the contract has it; None while enabled lets the last torque act on, as drives do.
+        """Exchange one cycle, as the contract says; None while enabled lets the last torque act on, as drives do.
 
         Raises:
             DriverError: as in the contract; or the plant ran away, or a fault took the bus, both of which use up
@@ -149,11 +149,11 @@ class SimulatedArm(Arm):
         )
 
     def stop(self, kind: StopKind) -> None:
-        """No torque: what the last sample reported acts until its period ends, then drives are off, or brake first."""
+        """End torque: the torque of the last sample acts until its period ends, then drives are off, or brake first."""
         self._machine.stop(kind)
 
     def close(self) -> None:
-        """Torque off and released; any number of times."""
+        """Take the torque off and release the arm; any number of times."""
         self.stop(StopKind.TORQUE_OFF)
         self._open = False
 
@@ -169,7 +169,7 @@ def from_config(
     faults: Sequence[Fault] = (),
     observer: Callable[[Truth], None] | None = None,
 ) -> SimulatedArm | RemoteArm:
-    """The arm a configuration with a simulated driver describes, at its home position and at rest.
+    """Create the arm of a configuration with a simulated driver, at its home position and at rest.
 
     Args:
         config: its driver's truth, or else its prior, becomes the plant.

@@ -1,6 +1,6 @@
-"""From a configuration with a simulated driver to what stands beyond the bus.
+"""Build the simulated machine beyond the bus from a configuration with a simulated driver.
 
-Boundary: construction only. Missing pieces get values here: home where none is given, infinite torque limits, and the
+Missing values are set here: home where none is given, infinite torque limits, and the
 braking of idle drives and of drives that are off.
 """
 
@@ -21,7 +21,7 @@ from sim_backend.imperfections import Imperfections
 from sim_backend.machine import Machine
 from sim_backend.plant import Plant
 
-# Where limits do not say how strong a drive is, its shorted windings stop the joint in about this time [s].
+# Where limits do not state a drive's strength, its shorted windings stop the joint in about this time [s].
 _BRAKING_TIME = 0.1
 _BRAKING_SHARE = 0.5
 # A closed brake, times the braking: creeps by mrad/s where idle drives let the joint sink by rad/s.
@@ -29,7 +29,7 @@ _HOLDING = 1e3
 
 
 def build_machine(config: ArmConfig, faults: Sequence[Fault] = ()) -> Machine:
-    """The machine a configuration describes, at its home position and at rest.
+    """Build the machine that a configuration describes, at its home position and at rest.
 
     Args:
         config: its driver's truth, or else its prior, becomes the plant.

@@ -1,7 +1,4 @@
-"""What both simulated arms do at the door of the contract: check a torque, describe themselves.
-
-Boundary: no state, no bus.
-"""
+"""Check torques and describe arms, for both simulated arms."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ from sim_backend.machine import Machine
 
 
 def checked_torque(torque: Vector | None, enabled: bool, joints: int) -> Vector | None:
-    """A torque that may be sent, or None to look.
+    """Return a torque that may be sent, or None for a cycle without torque.
 
     Raises:
         DriverError: a torque for an arm that is not enabled, of another shape, or not finite.
@@ -33,7 +30,7 @@ def checked_torque(torque: Vector | None, enabled: bool, joints: int) -> Vector 
 
 
 def description(machine: Machine) -> ArmDescription:
-    """What a simulated arm says of itself."""
+    """Return the description of a simulated arm."""
     names = machine.plant.chain.names
     return ArmDescription(
         joint_names=names,

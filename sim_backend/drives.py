@@ -1,12 +1,10 @@
-"""The simulated drives: which torque acts from which stamp on, what noise acts with it, and when they give up.
+"""Simulate drives: which torque acts from which stamp on, its noise, and when the watchdog stops the drives.
 
 A drive is on, off, or idle. Off, an axis coasts, unless its windings are shorted then or it has a brake. Idle, its
 windings are shorted and brake it like viscous friction, `tau = -b dq`; after the ramp of a quick stop it is as when it
 is off, and so it is at once where the power was taken from outside. Without a torque frame for the watchdog's time,
 whatever the host believes, all drives go idle and stay so until they are enabled again. A drive's own fault and an
 emergency stop stay latched until `reset`, which leaves their axes idle.
-
-Boundary: torques only, period by period; who may send one is `arm.py`, what a drive can make of it `imperfections.py`.
 """
 
 from __future__ import annotations
@@ -38,13 +36,14 @@ _WHY = {
 
 
 class Drives:
-    """A latch behind a queue, for all axes; it starts without torque.
+    """Simulate the drives of all axes, as a latch behind a queue; they start without torque.
 
     Attributes:
-        acting: what a sample says acts from the last stamp on, without noise [N m or N], shape (joints,), read-only.
-        torque: what really does, where these differ; as `acting`.
-        damping: with what idle axes are braked [N m s/rad or N s/m], shape (joints,), read-only.
-        on: whether the host has energised them.
+        acting: torque that a sample says acts from the last stamp on, without noise [N m or N], shape (joints,),
+            read-only.
+        torque: torque that really acts, where the two differ; as `acting`.
+        damping: of idle axes [N m s/rad or N s/m], shape (joints,), read-only.
+        on: whether the host has energised the drives.
     """
 
     def __init__(
@@ -97,17 +96,17 @@ class Drives:
 
     @property
     def gave_up(self) -> bool:
-        """Whether the watchdog's time has passed without a frame."""
+        """Return whether the watchdog's time has passed without a frame."""
         return self._silent >= self._watchdog
 
     @property
     def status(self) -> tuple[int, ...]:
-        """Bits of `AxisStatus` per axis."""
+        """Return the bits of `AxisStatus` per axis."""
         return self._words
 
     @property
     def latched(self) -> tuple[int, ...]:
-        """Axes that only `reset` lets be enabled again."""
+        """Return the axes that can be enabled again only after `reset`."""
         return tuple(np.flatnonzero(self._trips & int(AxisStatus.FAULT | AxisStatus.EMERGENCY_STOP)).tolist())
 
     def reset(self) -> None:
@@ -116,7 +115,7 @@ class Drives:
         self._silent = 0
 
     def enable(self) -> None:
-        """Energise without torque, and forget that the drives had given up for silence."""
+        """Energise without torque, and clear the watchdog."""
         self._forget()
         self._trips[:] = 0
         self._braked[:] = 0
@@ -131,14 +130,14 @@ class Drives:
             self._trips |= int(AxisStatus.IDLE)
 
     def restart(self) -> None:
-        """Begin anew, off; drives that gave up stay as they are until enabled."""
+        """Restart with the drives off; drives whose watchdog struck stay as they are until enabled."""
         self.release(StopKind.TORQUE_OFF)
         self._silent = 0
         self.acting = self.torque = self._none
         self.damping = self._off
 
     def refusal(self, faults: Sequence[Fault], names: Sequence[str]) -> str | None:
-        """Why the drives cannot be enabled while these faults strike; None if they can."""
+        """Return why the drives cannot be enabled while these faults strike; None if they can."""
         for fault in faults:
             if fault.kind in _WHY:
                 which = "all axes" if fault.joint is None else names[fault.joint]
@@ -168,7 +167,7 @@ class Drives:
         self._begin(faults)
 
     def output(self) -> Vector:
-        """What moves the plant for one period: the torque and its noise [N m or N], shape (joints,)."""
+        """Return the torque with its noise that moves the plant for one period [N m or N], shape (joints,)."""
         if not (self._noisy and self._energised):
             return self.torque
         noise = self._imperfections.torque_noise * self._noise.standard_normal(self.torque.size)
@@ -208,7 +207,7 @@ class Drives:
         self.acting, self.torque = _frozen(told), _frozen(really)
         idle = (trips & int(AxisStatus.IDLE)) != 0
         self._braked = np.where(idle, self._braked + 1, 0)
-        # Who lost its power, by the emergency stop or by itself, has no ramp.
+        # An axis that lost its power, by the emergency stop or by itself, has no ramp.
         ramping = idle & (self._braked <= self._ramp) & ((trips & _POWERLESS) == 0)
         off = np.where(idle, self._after_ramp, self._off)
         failed = (trips & int(AxisStatus.FAULT)) != 0

@@ -1,9 +1,7 @@
-"""Faults to inject into the simulated arm, so that whoever guards a motion can be seen to notice them.
+"""Define faults to inject into the simulated arm, so that supervision of a motion can be tested.
 
 `FAULT_RULES` says in words what each kind does. What it does to readings is the table `_SHOWN` here, to drives
 `drives.py`, to the body `machine.py`, to time `schedule.py`.
-
-Boundary: which fault strikes when, and what it does to one cycle's readings; the arm asks, nothing here has a clock.
 """
 
 from __future__ import annotations
@@ -24,14 +22,14 @@ LONGEST_DELAY = 1000  # cycles of positions kept for delayed feedback
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault.
+    """Describe one fault to inject.
 
     Attributes:
         at_cycle: first cycle it strikes, counted from `open`; in a separate process in real time, first period.
-        kind: what goes wrong.
+        kind: of the fault.
         joint: index of the axis, None for all.
         duration: cycles it lasts; None for one cycle or for good, as `FAULT_RULES` says.
-        size: what `FAULT_RULES` says.
+        size: quantity that `FAULT_RULES` defines.
         offset: of a load, in the frame of the last link [m].
     """
 
@@ -44,11 +42,11 @@ class Fault:
 
     @property
     def axes(self) -> slice:
-        """The axes it strikes."""
+        """Return the axes that the fault strikes."""
         return slice(None) if self.joint is None else slice(self.joint, self.joint + 1)
 
     def strikes(self, cycle: int) -> bool:
-        """Whether it strikes in this cycle."""
+        """Return whether the fault strikes in this cycle."""
         if cycle < self.at_cycle:
             return False
         if self.duration is None:
@@ -57,12 +55,12 @@ class Fault:
 
 
 def active_faults(faults: Sequence[Fault], cycle: int) -> tuple[Fault, ...]:
-    """The faults that strike in this cycle."""
+    """Return the faults that strike in this cycle."""
     return tuple([fault for fault in faults if fault.strikes(cycle)]) if faults else ()
 
 
 def configured_faults(faults: Sequence[SimulatedFault], names: Sequence[str], period: float) -> tuple[Fault, ...]:
-    """Faults as a configuration describes them, in cycles and joint numbers.
+    """Convert configured faults to cycles and joint numbers.
 
     Args:
         faults: from the driver section.
@@ -90,7 +88,7 @@ def configured_faults(faults: Sequence[SimulatedFault], names: Sequence[str], pe
     return tuple(found)
 
 
-# What becomes of (the fresh position, the last one shown, the one of `size` seconds ago) of the axes struck.
+# New position of the axes struck, from (the fresh position, the last one shown, the one of `size` seconds ago).
 _SHOWN: dict[FaultKind, Callable[[Vector, Vector, Vector, float], Vector]] = {
     FaultKind.LOST_FEEDBACK: lambda fresh, last, old, size: last,
     FaultKind.NODE_SILENT: lambda fresh, last, old, size: last,
@@ -106,10 +104,10 @@ _UNANSWERED = (FaultKind.LOST_FEEDBACK, FaultKind.NODE_SILENT)
 
 
 class Feedback:
-    """What the receiving side knows of the axes: last positions and status words, their ages, frames lost."""
+    """Hold what the receiving side knows of the axes: last positions and status words, their ages, frames lost."""
 
     def __init__(self, joints: int, period: float) -> None:
-        """Know nothing yet.
+        """Start without any answer.
 
         Args:
             joints: their number.
@@ -129,8 +127,8 @@ class Feedback:
         """Pass one cycle's answers through the faults of that cycle.
 
         Args:
-            fresh: what the encoders show [rad or m], shape (joints,); kept.
-            status: what the drives say, per axis.
+            fresh: positions that the encoders show [rad or m], shape (joints,); kept.
+            status: status words of the drives, per axis.
             faults: those active.
 
         Returns:

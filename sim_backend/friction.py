@@ -1,11 +1,9 @@
-"""Dry friction that really sticks: one step's velocities as a small box-constrained complementarity problem.
+"""Simulate dry friction that really sticks: one step's velocities as a box-constrained complementarity problem.
 
 Find `v` with `A v + lambda = b` and `lambda_i` in `bound_i Sgn(v_i)`, where Sgn is set-valued: a sliding joint feels
 its whole friction against its motion, and a joint at rest whatever keeps it at rest, up to its bound (Moreau 1988,
 Stewart & Trinkle 1996). `A` is symmetric positive definite, so `v` is the one minimum of the strictly convex
 `v^T A v / 2 - b^T v + sum bound_i |v_i|`.
-
-Boundary: linear algebra; where A and b come from is `plant.py`.
 """
 
 from __future__ import annotations
@@ -50,7 +48,7 @@ def stick_slip_velocity(A: Vector, b: Vector, bound: Vector, guess: Vector) -> V
 def _pivot(
     A: Vector, b: Vector, bound: Vector, mode: Vector, slack: float, pivots: int = _PIVOTS
 ) -> tuple[Vector, bool]:
-    """Solve with each joint's mode (-1, 0, 1) taken for granted, correct the modes, and so on.
+    """Solve with each joint's mode (-1, 0, 1) assumed, correct the modes, and repeat.
 
     Returns:
         The last solution, and whether its modes are the right ones.
@@ -81,7 +79,7 @@ def _with_modes(A: Vector, b: Vector, sliding: NDArray[np.bool_]) -> Vector:
 
 
 def _sweep(A: Vector, b: Vector, bound: Vector, start: Vector) -> Vector:
-    """Projected Gauss-Seidel: each joint in turn to its own minimum, the others held."""
+    """Minimise by projected Gauss-Seidel: each joint in turn to its own minimum, the others held."""
     rows, v = A.tolist(), start.tolist()
     for _ in range(_SWEEPS):
         for i, (row, force, limit) in enumerate(zip(rows, b.tolist(), bound.tolist(), strict=True)):

@@ -1,7 +1,4 @@
-"""What stands between a true state and a sample: encoder steps, torque steps and limits, torque noise.
-
-Boundary: pure computation; when a sample is taken is `arm.py`, what breaks is `faults.py`.
-"""
+"""Simulate the difference between a true state and a sample: encoder steps, torque steps and limits, torque noise."""
 
 from __future__ import annotations
 
@@ -16,7 +13,7 @@ from ident_service.errors import DriverError
 
 @dataclass(frozen=True)
 class Imperfections:
-    """Per joint, all of shape (joints,).
+    """Hold the imperfections per joint, all of shape (joints,).
 
     Attributes:
         encoder_resolution: step of the position [rad or m]; 0 where continuous.
@@ -42,15 +39,15 @@ class Imperfections:
 
     @classmethod
     def none(cls, joints: int) -> Imperfections:
-        """A perfect arm: continuous, silent, unlimited."""
+        """Return the imperfections of a perfect arm: continuous, without noise, unlimited."""
         return cls(np.zeros(joints), np.zeros(joints), np.zeros(joints), np.full(joints, np.inf))
 
     def encode(self, position: Vector) -> Vector:
-        """The position an encoder shows, a new array of shape (joints,)."""
+        """Return the position that encoders show, a new array of shape (joints,)."""
         return _in_steps(position, self._encoder_steps)
 
     def drive(self, torque: Vector) -> Vector:
-        """The torque a drive can make of a request, a new array of shape (joints,)."""
+        """Return the torque that drives give for a request, a new array of shape (joints,)."""
         least, most = self._range
         return np.asarray(np.minimum(np.maximum(_in_steps(torque, self._torque_steps), least), most))
 
@@ -64,7 +61,7 @@ class Imperfections:
 
     @cached_property
     def _range(self) -> tuple[Vector, Vector]:
-        """The largest whole steps inside the limits, because rounding could lead out of them again."""
+        """Return the largest whole steps inside the limits, because rounding could lead out of them again."""
         step, limit = self.torque_resolution, self.torque_limit
         whole = np.where(step > 0.0, step, 1.0)
         # A limit that is a whole number of steps must stay one when their quotient is rounded down.
@@ -72,7 +69,7 @@ class Imperfections:
         return -reach, reach
 
 
-# Where values have steps, or None where all have; and the steps, 1 where a value is continuous.
+# Which values have steps, None where all have; and the steps, 1 where a value is continuous.
 _Steps = tuple[Flags | None, Vector]
 
 

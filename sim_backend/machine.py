@@ -1,9 +1,9 @@
-"""Everything beyond the bus: body, drives, encoders and what breaks, one period at a time.
+"""Simulate everything beyond the bus: body, drives, encoders and faults, one period at a time.
 
 The torque of a period is known at its beginning and constant until its end, so a period can be computed as soon as it
 has begun: `cycle` (or `hold`, when no frame came) begins one, `advance` moves the body to its end.
 
-Boundary: no clock, no process, no contract; `arm.py` and `plant_process.py` put theirs around it.
+`arm.py` and `plant_process.py` add clock, process and contract.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _DELAYS = (FaultKind.DELAYED_FEEDBACK, FaultKind.HIDDEN_DELAY)
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What the plant really did, for scoring only.
+    """Hold the true motion of the plant, for scoring only.
 
     Attributes:
         stamp_ns: the sample's stamp [ns], right even where the sample's is not.
@@ -44,7 +44,7 @@ class Truth:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What the bus brings in one cycle; the fields are those of a `Sample`."""
+    """Hold what the bus brings in one cycle; the fields are those of a `Sample`."""
 
     position: Vector
     torque: Vector
@@ -56,7 +56,7 @@ class Reading:
 
 
 class Machine:
-    """A plant, its drives, its encoders and its faults; the same seed gives the same readings bit for bit."""
+    """Simulate a plant, its drives, encoders and faults; the same seed gives the same readings bit for bit."""
 
     def __init__(
         self,
@@ -70,10 +70,10 @@ class Machine:
         unpowered: Vector | None = None,
         faults: Sequence[Fault] = (),
     ) -> None:
-        """Put the pieces together; one cycle is one period of the plant.
+        """Assemble the machine; one cycle is one period of the plant.
 
         Args:
-            plant: what moves.
+            plant: body of the arm.
             imperfections: of encoders and drives.
             seed: of the torque noise.
             delay_cycles: from a sample to the first stamp at which a torque computed from it can act.
@@ -123,21 +123,21 @@ class Machine:
 
     @property
     def enabled(self) -> bool:
-        """Whether the host has energised the drives."""
+        """Return whether the host has energised the drives."""
         return self._drives.on
 
     @property
     def gave_up(self) -> bool:
-        """Whether the drives have heard nothing for their watchdog's time."""
+        """Return whether the drives have received no torque frame for their watchdog's time."""
         return self._drives.gave_up
 
     @property
     def torque(self) -> Vector:
-        """What acts in the present period, without noise and braking [N m or N], shape (joints,)."""
+        """Return the torque that acts in the present period, without noise and braking [N m or N], shape (joints,)."""
         return self._drives.torque
 
     def restart(self) -> None:
-        """Count periods and faults from 0 again, drives off; the body stays where it is."""
+        """Count periods and faults from 0 again, with drives off; the body stays where it is."""
         self.tick = 0
         self._feedback = Feedback(self.plant.chain.joints, self.plant.period)
         self._drives.restart()
@@ -172,7 +172,7 @@ class Machine:
         self._drives.reset()
 
     def stop(self, kind: StopKind) -> None:
-        """No torque from the end of this period on: off after a torque off, braked first after a quick stop."""
+        """End torque with this period: drives are off after a torque off, and brake first after a quick stop."""
         self._drives.release(kind)
 
     def cycle(self, torque: Vector | None) -> Reading:
@@ -210,7 +210,7 @@ class Machine:
             self.plant.step(self._drives.output())
 
     def truth(self, stamp_ns: int) -> Truth:
-        """The truth at the beginning of the present period, which is at `stamp_ns`."""
+        """Return the truth at the beginning of the present period, which is at `stamp_ns`."""
         plant = self.plant
         return Truth(stamp_ns, plant.position, plant.velocity, plant.acceleration, self._drives.torque)
 

@@ -1,4 +1,4 @@
-"""The simulated arm's body: rigid links, drive inertia, viscous and dry friction, stepped at a fixed period.
+"""Simulate the arm's body: rigid links, drive inertia, viscous and dry friction, stepped at a fixed period.
 
 `M(q) ddq + c(q, dq) + g(q) + fo + fv dq + lambda = tau` with `lambda_i` in `fc_i Sgn(dq_i)` (eqs. 1, 27). One step
 takes a constant torque (zero-order hold) and everything smooth at the predicted midpoint, viscous friction
@@ -14,8 +14,6 @@ stick: `C^T (fo + fv w + lambda)` with `lambda_i` in `fc_i Sgn(w+_i)`, solved fo
 
 Idle drives brake like more of `fv`, or, where a gear couples joints, like a symmetric damping matrix. A load is a point
 mass that moves with the last link, on which it appears without an impact.
-
-Boundary: the only file of this room that knows pinocchio; no clock, no encoder, no noise.
 """
 
 from __future__ import annotations
@@ -37,17 +35,17 @@ _ROUNDING = 1e-12  # of the largest number in an inverse
 
 
 class Plant:
-    """A chain with true parameters, moved one period at a time by constant torques."""
+    """Simulate a chain with true parameters, moved one period at a time by constant torques."""
 
     def __init__(self, chain: Chain, layout: Layout, delta: Array, position: Array, period: float) -> None:
-        """Put the arm at rest.
+        """Place the arm at rest at a position.
 
         Args:
             chain: the mechanism, gravity included.
             layout: order of the parameters.
             delta: true parameters [SI], shape (layout.size,).
             position: where it starts [rad or m], shape (joints,).
-            period: what `step` advances [s].
+            period: time that `step` advances [s].
 
         Raises:
             ModelError: shapes that do not fit, a link without mass, negative friction, or a mass matrix that is not
@@ -80,17 +78,17 @@ class Plant:
 
     @property
     def chain(self) -> Chain:
-        """The mechanism."""
+        """Return the mechanism."""
         return self._chain
 
     @property
     def period(self) -> float:
-        """What `step` advances [s]."""
+        """Return the time that `step` advances [s]."""
         return self._period
 
     @property
     def position(self) -> Array:
-        """[rad or m], shape (joints,), read-only."""
+        """Return the position [rad or m], shape (joints,), read-only."""
         return self._position
 
     @property
@@ -100,7 +98,7 @@ class Plant:
 
     @property
     def acceleration(self) -> Array:
-        """Mean over the last step [rad/s^2 or m/s^2], shape (joints,), read-only."""
+        """Return the mean acceleration over the last step [rad/s^2 or m/s^2], shape (joints,), read-only."""
         return self._acceleration
 
     @property
@@ -110,7 +108,7 @@ class Plant:
 
     @property
     def inertia(self) -> Array:
-        """Of each joint, all others held, where the arm is: the diagonal of M(q) [kg m^2 or kg], shape (joints,)."""
+        """Return the inertia of each joint, all others held: the diagonal of M(q) [kg m^2 or kg], shape (joints,)."""
         return np.array(np.diag(self._inverse.mass_matrix(self._position)))
 
     def brake(self, damping: Array) -> None:
@@ -125,11 +123,11 @@ class Plant:
             self._damp()
 
     def rest(self) -> None:
-        """Stand still where it is, as an arm that somebody holds."""
+        """Stop the arm where it is, as if somebody held it."""
         self.place(self._position)
 
     def place(self, position: Array) -> None:
-        """Stand still somewhere, as an arm that somebody has led there.
+        """Place the arm at rest at a position, as if somebody had led it there.
 
         Args:
             position: [rad or m], shape (joints,).
@@ -160,7 +158,7 @@ class Plant:
 
         Args:
             torque: [N m or N], shape (joints,).
-            period: by how much [s]; None for `period`, to which the error of a step belongs: keep near or below it.
+            period: time to advance [s]; None for `period`, to which the error of a step belongs: keep near or below it.
 
         Raises:
             DriverError: the state is no longer finite; it stays what it was before the step.
@@ -188,7 +186,7 @@ class Plant:
         self._set(self._position + self._half * (v + v_next), v_next, (v_next - v) / h, rate)
 
     def inverse_dynamics(self, position: Array, velocity: Array, acceleration: Array) -> Array:
-        """The torque the true parameters ask for at one state, free of noise: the truth to score against.
+        """Return the torque that the true parameters need at one state, without noise: the truth to score against.
 
         Args:
             position: [rad or m], shape (joints,).

@@ -1,9 +1,7 @@
-"""Starting and ending the process that a plant lives in, and finding one that runs already.
+"""Start and end the process that a plant lives in, and find one that runs already.
 
 The process is spawned in a session of its own, so that a Ctrl-C meant for its parent does not take the arm away from
 under it. It is told what to be on its standard input, whose end later tells it that its parent is gone.
-
-Boundary: processes, descriptors and addresses; no frame, no plant.
 """
 
 from __future__ import annotations
@@ -29,7 +27,7 @@ _END_TIMEOUT = 20.0
 
 
 class PlantLaunch:
-    """One plant process that this process has started; it ends with this object, or with this process."""
+    """Manage a plant process that this process has started; it ends with this object, or with this process."""
 
     def __init__(self, config: ArmConfig, faults: tuple[Fault, ...], address: str, status: str | None) -> None:
         """Prepare; nothing runs yet.
@@ -58,7 +56,7 @@ class PlantLaunch:
         """Start the process and wait until it listens.
 
         Returns:
-            Whether it does; False when another plant listens there already.
+            Whether it listens; False when another plant listens there already.
 
         Raises:
             DriverError: it cannot be started.
@@ -90,12 +88,12 @@ class PlantLaunch:
         raise DriverError(f"the plant process did not start: {said or 'it said nothing'}")
 
     def end(self) -> None:
-        """Tell the process that it is no longer needed, and wait until the arm is at rest and it is gone."""
+        """Tell the process that it is no longer needed, and wait until the arm is at rest and the process has ended."""
         self._finalizer()
 
     @property
     def status_path(self) -> Path:
-        """Where the status can be read for as long as this object has not ended the plant."""
+        """Return the path to read the status from, valid until this object has ended the plant."""
         return Path(f"/proc/self/fd/{self.status}")
 
 
@@ -113,13 +111,13 @@ def _end(process: subprocess.Popen[bytes], status: int) -> None:
 
 
 def address_of(bus: str | None) -> str:
-    """The abstract address of a bus of this user; one that nobody else knows without a name."""
+    """Return the abstract address of a user's bus; without a name, one that nobody else knows."""
     name = f"{os.getpid()}-{secrets.token_hex(8)}" if bus is None else f"bus-{bus}"
     return f"ident-plant-{os.getuid()}-{name}"
 
 
 def connect(address: str) -> socket.socket | None:
-    """A connection to the plant that listens there; None if none does."""
+    """Connect to the plant that listens at an address; None if none does."""
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
         sock.connect("\0" + address)

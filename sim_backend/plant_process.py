@@ -1,4 +1,4 @@
-"""The simulated arm's plant as a process of its own, so that killing its host's processes means something.
+"""Run the simulated arm's plant as a process of its own, so that it survives when its host's processes are killed.
 
 Time. The plant is always computed to the end of the period whose torque is known. In real time it moves by the
 machine's clock: a frame may come up to one period after its stamp; after that the period has been silent, the last
@@ -6,11 +6,9 @@ torque acts on and the drives' watchdog counts. In lock-step each exchange is on
 only a cycle without a torque, or a connection that ends, is silence.
 
 When the client is gone, silence goes on until the idle drives have braked the arm to rest, or `PATIENCE` has passed: at
-the machine's pace while somebody may come back in real time, otherwise as fast as it can be computed. When client and
+the machine's pace while a client may come back in real time, otherwise as fast as it can be computed. When client and
 parent are gone the process ends after that. It knows its client's end by the connection and its parent's by the end of
 its standard input, so that it outlives neither for long, however they died.
-
-Boundary: sockets, the machine's clock and the process; what moves is `machine.py`, frames are `wire.py`.
 """
 
 from __future__ import annotations
@@ -43,13 +41,13 @@ PATIENCE = 60.0  # simulated seconds that an abandoned arm is given; sinking aga
 # towards its lowest place; slower than this counts as at rest. Near its highest place that may be before it sinks.
 REST_SPEED = 1e-2
 REST_TIME = 0.1  # simulated seconds that nothing may be faster
-_AT_ONCE = 100  # periods to make up for between two looks at the sockets
-_MOST_WAITING = 8  # connections that have not said who they are
+_AT_ONCE = 100  # periods to catch up between two polls of the sockets
+_MOST_WAITING = 8  # connections that have not sent their Hello
 _LONGEST_FUTURE_NS = 1_000_000_000
 
 
 class PlantProcess:
-    """Serves one client at a time on a listening socket."""
+    """Serve one client at a time on a listening socket."""
 
     def __init__(
         self,
@@ -60,14 +58,14 @@ class PlantProcess:
         story: PlantStory,
         lock_step: bool,
     ) -> None:
-        """Take the pieces.
+        """Use the given machine and socket.
 
         Args:
-            machine: what moves.
+            machine: to simulate.
             listener: bound and listening, non-blocking.
             lifeline: a descriptor that ends with the parent.
             sha256: of the configuration, which a client must share.
-            story: where to say what happens.
+            story: records the status.
             lock_step: whether exchanges move time, instead of the machine's clock.
         """
         self._machine = machine
@@ -102,7 +100,7 @@ class PlantProcess:
                     sock.close()
 
     def _turn(self) -> None:
-        """Wait for something to happen, and do it: frames of the client first, then newcomers, then time."""
+        """Wait for an event and handle it: frames of the client first, then newcomers, then time."""
         sources: list[Any] = [self._listener, *self._strangers]
         sources += [source for source in (self._client, self._lifeline) if source is not None]
         readable, _, _ = select.select(sources, [], [], self._patience())
@@ -114,7 +112,7 @@ class PlantProcess:
             self._strangers.remove(stranger)
             self._meet(stranger)
         if self._listener in readable:
-            with suppress(OSError):  # whoever knocked may be gone already
+            with suppress(OSError):  # the connecting process may be gone already
                 self._strangers.append(self._listener.accept()[0])
                 self._strangers[-1].setblocking(False)
             for stranger in self._strangers[:-_MOST_WAITING]:
@@ -130,13 +128,13 @@ class PlantProcess:
         return not self._lock_step and (self._client is not None or self._story.state is PlantState.SETTLING)
 
     def _patience(self) -> float | None:
-        """How long nothing needs to happen [s]; None for ever."""
+        """Return how long to wait for events [s]; None for ever."""
         if not self._moves_by_clock():
             return None
         return max(0, self._next_ns + self._period_ns - time.monotonic_ns()) * 1e-9
 
     def _meet(self, stranger: socket.socket) -> None:
-        """Take a newcomer for the client, or tell it why not."""
+        """Accept a newcomer as the client, or send it the reason of the refusal."""
         try:
             number, hello = wire.decode_request(stranger.recv(wire.MAX_BYTES), self._joints)
             if not isinstance(hello, wire.Hello):
@@ -163,7 +161,7 @@ class PlantProcess:
         self._story.serve(pid)
 
     def _serve(self) -> None:
-        """One request of the client; its end, and a frame that cannot be meant, are the end of the connection."""
+        """Serve one request of the client; its end, or a malformed frame, ends the connection."""
         client = self._client
         if client is None:
             return
@@ -268,7 +266,7 @@ class PlantProcess:
 def start_document(
     config: ArmConfig, faults: tuple[Fault, ...], address: str, status: int, *, lock_step: bool
 ) -> dict[str, object]:
-    """What a plant process is told on its standard input; see `main`."""
+    """Return the document that a plant process reads from its standard input; see `main`."""
     listed = [[f.at_cycle, f.kind.value, f.joint, f.duration, f.size, f.offset] for f in faults]
     return {
         "address": address,
@@ -281,7 +279,7 @@ def start_document(
 
 
 def _leave_the_core() -> None:
-    """Let the loop have its core: a plant that inherits it stands still whenever the loop computes, as no arm does."""
+    """Leave the loop's core to it: a plant that inherits the core would stand still whenever the loop computes."""
     inherited, others = os.sched_getaffinity(0), set(range(os.cpu_count() or 1))
     others -= inherited
     if len(inherited) == 1 and others:
@@ -317,7 +315,7 @@ def main() -> int:
         ]
         machine = build_machine(config, faults)
         story = PlantStory(machine, start["status"])
-    except Exception as error:  # noqa: BLE001 - whoever started this process must learn why it cannot begin
+    except Exception as error:  # noqa: BLE001 - the parent must learn why this process cannot begin
         listener.close()
         _say(f"{type(error).__name__}: {error}")
         return 1

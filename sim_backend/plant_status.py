@@ -1,9 +1,7 @@
-"""What a plant in its own process says of itself, readable while it runs and after it is gone.
+"""Encode and decode the status of a plant process, readable while it runs and after it is gone.
 
 One record of fixed layout at the beginning of a file (or of anonymous memory), written in place through a mapping, so
 that not even `kill -9` of the plant takes it away. A checksum tells a record read while it was written.
-
-Boundary: bytes of the record and how they are read; when they are written is `plant_process.py`.
 """
 
 from __future__ import annotations
@@ -37,27 +35,27 @@ _TRIES = 50
 
 
 class PlantState(IntEnum):
-    """What a plant process is at."""
+    """Name the states of a plant process."""
 
     WAITING = 0  # for its first client
     SERVING = 1  # a client is connected
-    SETTLING = 2  # nobody is; idle drives brake what moves
-    AT_REST = 3  # nobody is, and nothing moves
-    STILL_MOVING = 4  # nobody is, and it moved until the plant's patience ended
-    RAN_AWAY = 5  # nobody is, and its state is no longer finite
+    SETTLING = 2  # no client is connected; idle drives brake what moves
+    AT_REST = 3  # no client is connected, and nothing moves
+    STILL_MOVING = 4  # no client is connected, and the arm moved until the plant's patience ended
+    RAN_AWAY = 5  # no client is connected, and the state is no longer finite
     ENDED_AT_REST = 6  # as AT_REST, and the process has ended
-    ENDED_MOVING = 7  # the process has ended without
+    ENDED_MOVING = 7  # the process has ended while the arm moved
 
 
 @dataclass(frozen=True)
 class PlantStatus:
-    """The plant's own story; arrays of shape (joints,), in rad or m, rad/s or m/s, N m or N.
+    """Describe the state and the extremes of a plant; arrays of shape (joints,), in rad or m, rad/s or m/s, N m or N.
 
     Attributes:
-        state: what the process is at.
+        state: of the process.
         pid: its process.
         client_pid: the process that drives the arm, 0 if none does.
-        clients: how many have been connected.
+        clients: number of clients so far.
         ticks: periods the plant has been moved for, whole life.
         silent_ticks: of these, since the last frame.
         period: of the plant [s].
@@ -89,27 +87,27 @@ class PlantStatus:
 
     @property
     def came_to_rest(self) -> bool:
-        """Whether nothing moves, and nobody drives it."""
+        """Return whether nothing moves and no client drives the arm."""
         return self.state in (PlantState.AT_REST, PlantState.ENDED_AT_REST)
 
     @property
     def ended(self) -> bool:
-        """Whether the process has ended by itself."""
+        """Return whether the process has ended by itself."""
         return self.state >= PlantState.ENDED_AT_REST
 
     @property
     def silent_time(self) -> float:
-        """Since the last frame, in the plant's time [s]; once at rest, how long that took."""
+        """Return the plant's time since the last frame [s]; once at rest, how long it took to come to rest."""
         return self.silent_ticks * self.period
 
 
 def status_size(joints: int) -> int:
-    """Bytes of the record of an arm of so many joints."""
+    """Return the size of the record of an arm of so many joints [bytes]."""
     return _FIXED.size + 8 * joints * len(_VECTORS) + _CRC.size
 
 
 def encode_status(status: PlantStatus) -> bytes:
-    """The record as bytes."""
+    """Encode the record as bytes."""
     s = status
     fixed = (_MAGIC, len(s.position), s.state, s.pid, s.client_pid, s.clients, s.ticks, s.silent_ticks, s.period)
     body = _FIXED.pack(*fixed) + b"".join(np.asarray(getattr(s, name), dtype="<f8").tobytes() for name in _VECTORS)
@@ -117,7 +115,7 @@ def encode_status(status: PlantStatus) -> bytes:
 
 
 def decode_status(data: bytes) -> PlantStatus | None:
-    """The record in these bytes; None if they are torn or none has been written yet.
+    """Decode the record; None if it was read while being written, or none has been written yet.
 
     Raises:
         DriverError: bytes of something else.
@@ -135,7 +133,7 @@ def decode_status(data: bytes) -> PlantStatus | None:
 
 
 def read_status(path: Path | str) -> PlantStatus:
-    """What the plant says now.
+    """Read the present status of a plant.
 
     Args:
         path: the file that `driver.status` names, or `/proc/self/fd/N` of anonymous memory.

@@ -1,7 +1,4 @@
-"""The extremes of a plant's life, kept up every period and written down where others can read them.
-
-Boundary: what is remembered and when it is written; the record is `plant_status.py`.
-"""
+"""Collect the extremes of a plant's motion every period, and write them where others can read them."""
 
 from __future__ import annotations
 
@@ -17,13 +14,13 @@ _EVERY = 20  # periods between two writings, when nothing happens
 
 
 class PlantStory:
-    """Writes the status record of one machine."""
+    """Collect and write the status record of one machine."""
 
     def __init__(self, machine: Machine, descriptor: int) -> None:
-        """Begin.
+        """Start, and write the first record.
 
         Args:
-            machine: whose story it is.
+            machine: whose status is recorded.
             descriptor: of the file or anonymous memory to write into; it is made as long as needed.
         """
         joints = machine.plant.chain.joints
@@ -39,13 +36,13 @@ class PlantStory:
         self.write()
 
     def serve(self, pid: int) -> None:
-        """A client has come."""
+        """Record that a client has connected."""
         self._clients, self._client_pid = self._clients + 1, pid
         self.heard()
         self.become(PlantState.SERVING)
 
     def settle(self) -> None:
-        """The client is gone."""
+        """Record that the client is gone."""
         self._client_pid = 0
         self.become(PlantState.AT_REST if self._machine.supported else PlantState.SETTLING)
 
@@ -56,19 +53,19 @@ class PlantStory:
         self.write()
 
     def end(self) -> None:
-        """The process ends."""
+        """Record that the process ends."""
         resting = self.state is PlantState.AT_REST or self._machine.supported
         self.become(PlantState.ENDED_AT_REST if resting else PlantState.ENDED_MOVING)
 
     def heard(self) -> None:
-        """A frame has come; what happens in silence is counted from here."""
+        """Record that a frame has come; silence is counted from here."""
         if self.silent_ticks:
             self.silent_ticks = 0
         self._silent_velocity[:] = 0.0
         self._silent_torque[:] = 0.0
 
     def moved(self, *, silent: bool) -> None:
-        """A period is over."""
+        """Record the motion of a period that is over."""
         plant = self._machine.plant
         speed, torque = np.abs(plant.velocity), np.abs(self._machine.torque)
         np.minimum(self._lowest, plant.position, out=self._lowest)

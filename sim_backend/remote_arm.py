@@ -1,11 +1,9 @@
-"""The simulated arm whose plant lives in a process of its own: the same contract, over a local socket.
+"""Implement a simulated arm whose plant lives in a process of its own: the same contract, over a local socket.
 
 The connection is the lock: a plant serves one client at a time, and the kernel closes a client's connection with its
 process, however that dies. In virtual time each exchange moves the plant by one period (lock-step), and gives the same
 samples bit for bit as a plant in this process. In real time the plant moves by the machine's clock: a loop that is late
 finds periods missing between its stamps, as on a real bus.
-
-Boundary: the contract and its deadline; frames are `wire.py`, the process `plant_launch.py`.
 """
 
 from __future__ import annotations
@@ -44,11 +42,11 @@ _REFUSALS = {
 
 
 class _PlantGone(DriverError):
-    """The connection has ended."""
+    """Report that the connection to the plant has ended."""
 
 
 class RemoteArm(Arm):
-    """A client of a plant process, which it starts when there is none.
+    """Connect to a plant process as its client, and start the process when there is none.
 
     Attributes:
         observer: called with the truth of every cycle; for scoring only.
@@ -63,7 +61,7 @@ class RemoteArm(Arm):
         faults: Sequence[Fault] = (),
         observer: Callable[[Truth], None] | None = None,
     ) -> None:
-        """Take the description; nothing is started before `open`.
+        """Use the arm's description; nothing is started before `open`.
 
         Args:
             config: with a simulated driver.
@@ -80,7 +78,7 @@ class RemoteArm(Arm):
         self.clock = clock
         self.observer = observer
         self.truth: Truth | None = None
-        # The same construction tells what the plant will be, and which mistakes keep it from being.
+        # The same construction gives the plant's description, and the errors that would prevent its start.
         twin = build_machine(config, faults)
         self.faults = twin.faults
         self._description = description(twin)
@@ -98,10 +96,10 @@ class RemoteArm(Arm):
         self.plant_pid = 0
 
     def open(self) -> None:
-        """Take the arm, starting its plant if none listens; cycles count from 0, the plant stays where it was.
+        """Open the arm, starting its plant if none listens; cycles count from 0, the plant stays where it was.
 
         Raises:
-            DriverError: open already, somebody else's, another arm's, or the plant cannot be started.
+            DriverError: open already, in use by another process, of another arm, or the plant cannot be started.
         """
         if self._socket is not None:
             raise DriverError("the simulated arm is already open")
@@ -114,14 +112,14 @@ class RemoteArm(Arm):
                 self._launch.end()
             self._launch = PlantLaunch(self._config, self._added, self._address, self._status)
             if not self._launch.start(lock_step=self.clock.lock_step):
-                self.end_plant()  # somebody else's was faster
+                self.end_plant()  # another process started its plant first
             if not self._enter():
                 raise DriverError("the plant process does not listen")
         self._enabled, self._cycle, self.truth = False, 0, None
         self._schedule.restart()
 
     def describe(self) -> ArmDescription:
-        """Say what is simulated; raises DriverError when not open."""
+        """Return the description of the simulated arm; raises DriverError when not open."""
         self._require_open()
         return self._description
 
@@ -133,12 +131,12 @@ class RemoteArm(Arm):
         self._enabled = True
 
     def reset(self) -> None:
-        """Clear what the drives have latched, as the contract has it; raises DriverError when not open."""
+        """Clear what the drives have latched, as the contract says; raises DriverError when not open."""
         self._require_open()
         self._done(self._ask(wire.Reset(), self._deadline))
 
     def exchange(self, torque: Vector | None) -> Sample:
-        """One cycle, as the contract has it; a cycle without a torque is silence for the drives' watchdog.
+        """Exchange one cycle, as the contract says; a cycle without a torque is silence for the drives' watchdog.
 
         Raises:
             DriverError: as in the contract; a fault took the bus; or the plant did not answer within the deadline,
@@ -176,7 +174,7 @@ class RemoteArm(Arm):
         )
 
     def stop(self, kind: StopKind) -> None:
-        """No torque from the end of this period on; drives that do not hear it stop by their own watchdog."""
+        """End torque with this period; drives that do not receive this stop by their own watchdog."""
         self._enabled = False
         if self._socket is not None:
             with suppress(DriverError):
@@ -184,7 +182,7 @@ class RemoteArm(Arm):
                 self._ask(wire.Stop(int(kind is StopKind.QUICK_STOP)), deadline)
 
     def close(self) -> None:
-        """Torque off and released; the plant lives on for the next `open`, until this object or process ends."""
+        """Take the torque off and release the arm; the plant lives on for the next `open`, until this object ends."""
         self.stop(StopKind.TORQUE_OFF)
         self._hang_up()
 
@@ -196,7 +194,7 @@ class RemoteArm(Arm):
             self._launch = None
 
     def plant_status(self) -> PlantStatus:
-        """What the plant says of itself.
+        """Return the status of the plant.
 
         Raises:
             DriverError: this arm has not started it, and no status file is configured; or it has not said anything.
@@ -208,7 +206,7 @@ class RemoteArm(Arm):
         return read_status(self._launch.status_path)
 
     def _enter(self) -> bool:
-        """Become the client of the plant at the address; False if there is none."""
+        """Become the client of the plant at the address; returns False if there is none."""
         sock = connect(self._address)
         if sock is None:
             return False
@@ -222,7 +220,7 @@ class RemoteArm(Arm):
 
     def _welcome(self, sock: socket.socket) -> None:
         _, uid, _ = struct.unpack("3i", sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
-        if uid != os.getuid():  # anybody may listen on an abstract address
+        if uid != os.getuid():  # any user's process may listen on an abstract address
             raise DriverError(_REFUSALS[wire.OTHER_USER])
         reply = self._ask(wire.Hello(bytes.fromhex(self._config.sha256)), START_TIMEOUT)
         if isinstance(reply, wire.Refused):
@@ -232,7 +230,7 @@ class RemoteArm(Arm):
         self.plant_pid = reply.pid
 
     def _ask(self, request: wire.Request, deadline: float) -> wire.Reply:
-        """Send a request and wait for its reply; replies that were given up are passed over."""
+        """Send a request and return its reply; late replies to earlier requests are discarded."""
         sock = self._require_open()
         self._number += 1
         ends = time.monotonic() + deadline

@@ -1,10 +1,10 @@
-"""When cycles begin, and what their samples say about it.
+"""Schedule the beginnings of cycles, and the stamps of their samples.
 
 Two ways to be late. Where the plant only moves with cycles, the schedule moves back by the lateness and stamps stay
 exactly one period apart. Where the plant moves by the machine's clock, a period that is over is skipped, and the
 stamps say so. Neither ever catches up with a burst of short cycles.
 
-Boundary: stamps and waiting on the loop's clock; faults of time act here (late cycles, jumps of the clock).
+Faults of time act here (late cycles, jumps of the clock).
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from sim_backend.faults import Fault, FaultKind, active_faults
 
 
 class Schedule:
-    """The beginnings of cycles, one period apart, on one clock."""
+    """Schedule cycles one period apart on one clock."""
 
     def __init__(self, clock: Clock, period_ns: int, *, skips: bool) -> None:
-        """Take the clock.
+        """Start before the first cycle.
 
         Args:
             clock: the loop's.
@@ -32,13 +32,13 @@ class Schedule:
         self.restart()
 
     def restart(self) -> None:
-        """The next cycle is the first."""
+        """Start again before the first cycle."""
         self._first_ns: int | None = None
         self.stamp_ns = self._slip_ns = 0
 
     @property
     def tick(self) -> int:
-        """Periods from the first stamp to the present one."""
+        """Return the periods from the first stamp to the present one."""
         return 0 if self._first_ns is None else (self.stamp_ns - self._first_ns) // self._period_ns
 
     def wait(self, faults: Sequence[Fault]) -> int:
@@ -57,6 +57,6 @@ class Schedule:
         return self.stamp_ns
 
     def shown_ns(self, faults: Sequence[Fault]) -> int:
-        """What a sample gives as the present stamp [ns]."""
+        """Return the stamp that a sample gives for the present cycle [ns]."""
         jumps = [fault.size for fault in active_faults(faults, self.tick) if fault.kind is FaultKind.CLOCK_JUMP]
         return self.stamp_ns + round(sum(jumps) * 1e9)

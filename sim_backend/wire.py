@@ -1,4 +1,4 @@
-"""Frames between an arm and a plant in another process: bytes in, values out.
+"""Encode and decode frames between an arm and a plant in another process.
 
 Every frame is one packet of a sequenced-packet socket, little-endian and packed: a header, then the fields of `TABLE`
 in their order. A frame's length follows from its kind and the number of joints; anything else is refused. The plant
@@ -10,7 +10,7 @@ answers every request with one reply that has its number, in order::
     Exchange -> Answer | Failed        one cycle
     Stop     -> Done
 
-Boundary: no socket, no process, no meaning; a value that cannot be told from noise (a torque that is not finite) is
+A value that cannot be told from noise (a torque that is not finite) is
 refused here too.
 """
 
@@ -37,21 +37,21 @@ IN_USE, OTHER_ARM, OTHER_USER = 1, 2, 3  # reasons to refuse
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """The client's first frame; both must have been configured alike."""
+    """Represent the client's first frame, with the hash of its configuration, which both must share."""
 
     sha256: bytes
 
 
 @dataclass(frozen=True, slots=True)
 class Welcome:
-    """The plant is the client's until the connection ends."""
+    """Represent the acceptance of a client: the plant is its own until the connection ends."""
 
     pid: int
 
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """It is not; `pid` is the process that has it, 0 where that is not the reason."""
+    """Represent the refusal of a client; `pid` is the process that has the plant, 0 where that is not the reason."""
 
     reason: int
     pid: int
@@ -59,17 +59,17 @@ class Refused:
 
 @dataclass(frozen=True, slots=True)
 class Enable:
-    """Energise with zero torque."""
+    """Represent the request to energise with zero torque."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reset:
-    """Clear what the drives have latched."""
+    """Represent the request to clear what the drives have latched."""
 
 
 @dataclass(frozen=True, slots=True)
 class Exchange:
-    """One cycle: its stamp [ns] and, if `sends`, the torque from then on [N m or N], shape (joints,)."""
+    """Represent one cycle: its stamp [ns] and, if `sends`, the torque from then on [N m or N], shape (joints,)."""
 
     stamp_ns: int
     sends: int
@@ -78,26 +78,26 @@ class Exchange:
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """No torque from the end of this period on, braked or not."""
+    """Represent the request to end torque with this period, braked or not."""
 
     brakes: int
 
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """It has happened."""
+    """Represent the reply that a request has been fulfilled."""
 
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """It has not, and why; of a cycle, it is used up all the same."""
+    """Represent the reply that a request failed, and why; a cycle that failed has passed all the same."""
 
     text: bytes
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What a cycle brought, as in `Reading`, and the truth, as in `Truth`."""
+    """Hold the result of a cycle, as in `Reading`, and the truth, as in `Truth`."""
 
     stamp_ns: int
     lost: int
@@ -149,20 +149,20 @@ TABLE: tuple[tuple[int, type[Request] | type[Reply], tuple[tuple[str, bool], ...
 )
 _KINDS = {frame: (kind, fields) for kind, frame, fields in TABLE}
 _FRAMES = {kind: (frame, fields) for kind, frame, fields in TABLE}
-# What becomes of the numbers of a per-joint field.
+# Conversion of the numbers of a per-joint field.
 _ARRAYS: dict[str, type[np.float64] | type[np.int64] | type[np.bool_]] = {"d": np.float64, "q": np.int64, "B": np.bool_}
 
 
 class MalformedFrame(DriverError):
-    """Bytes that are no frame; whoever sends such is not spoken to any more."""
+    """Report bytes that are not a frame; the connection to their sender is closed."""
 
 
 def encode(frame: Request | Reply, number: int, joints: int) -> bytes:
-    """A frame as bytes.
+    """Encode a frame as bytes.
 
     Args:
         frame: with arrays of shape (joints,).
-        number: of the request it is or answers.
+        number: of the request that the frame is or answers.
         joints: of the arm.
     """
     kind, fields = _KINDS[type(frame)]
@@ -179,7 +179,7 @@ def encode(frame: Request | Reply, number: int, joints: int) -> bytes:
 
 
 def decode_request(data: bytes, joints: int) -> tuple[int, Request]:
-    """Number and frame of what a client sent.
+    """Decode number and frame of a client's request.
 
     Raises:
         MalformedFrame: not a request to an arm of so many joints.
@@ -191,7 +191,7 @@ def decode_request(data: bytes, joints: int) -> tuple[int, Request]:
 
 
 def decode_reply(data: bytes, joints: int) -> tuple[int, Reply]:
-    """Number and frame of what a plant sent.
+    """Decode number and frame of a plant's reply.
 
     Raises:
         MalformedFrame: not a reply of an arm of so many joints.
@@ -244,10 +244,10 @@ def _body(kind: int, joints: int) -> struct.Struct:
 
 
 def text_of(failed: Failed) -> str:
-    """Why, as text."""
+    """Return the reason of a failure as text."""
     return failed.text.rstrip(b"\0").decode("utf-8", errors="replace")
 
 
 def failed(error: Exception) -> Failed:
-    """An error as a frame, cut where it is too long."""
+    """Convert an error to a frame, cut where it is too long."""
     return Failed(str(error).encode()[:_TEXT])

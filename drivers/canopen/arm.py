@@ -1,4 +1,4 @@
-"""An arm of CANopen drives in cyclic synchronous torque mode.
+"""Drive an arm of CANopen drives in cyclic synchronous torque mode.
 
 A sample is stamped when SYNC was sent, at which the torque that was handed over began to act and all positions were
 taken.
@@ -43,15 +43,15 @@ from ident_service.config.canopen import CanopenDriver
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError, PositionUnknown
 
-# Between two looks at everybody's heartbeats and status reports: share of a status period, and cycles at most.
+# Between two checks of everybody's heartbeats and status reports: share of a status period, and cycles at most.
 _LOOK_SHARE, _MOST_UNLOOKED = 0.1, 10
 
 
 class CanopenArm(Arm):
-    """Drives on one or more buses, behind one transmission."""
+    """Implement an arm with drives on one or more buses, behind one transmission."""
 
     def __init__(self, config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_links) -> None:
-        """Take the description; nothing is opened.
+        """Use the arm's description; nothing is opened.
 
         Args:
             config: with a CANopen driver and a transmission.
@@ -92,7 +92,7 @@ class CanopenArm(Arm):
     def _reset_state(self) -> None:
         self._enabled = self._streaming = False
         self._stop = StopCommand()
-        self._stops = 0  # told so far
+        self._stops = 0  # stop commands so far
         self._counts = [0] * len(self._limits)
         self._acting = _frozen(np.zeros(len(self._limits)))
         self._unwrapped: list[int] | None = None
@@ -105,26 +105,26 @@ class CanopenArm(Arm):
         self._identities: tuple[str, ...] = ()
 
     def look(self) -> Arm:
-        """An arm that reads the drives' objects by SDO and sends nothing else."""
+        """Return an arm that reads the drives' objects by SDO and sends nothing else."""
         return LookingArm(self._config, self._open_bus)
 
     def zero(self) -> tuple[str, ...]:
-        """Let the drives keep where they are as the home of the description; as in the contract."""
+        """Store the drives' present position as the home of the description; as in the contract."""
         if self._buses is not None:
             raise DriverError("the arm is open; close it before it is zeroed")
         with ZeroingArm(self._config, self._open_bus) as arm:
             return arm.take_home()
 
     def log_frames(self, path: Path) -> None:
-        """Keep every frame of the next session in a `.log` of candump's, `.asc` or `.blf`; as in the contract."""
+        """Log every frame of the next session to a `.log` of candump's, `.asc` or `.blf`; as in the contract."""
         self._log_path = require_format(path)
 
     def logged(self) -> str:
-        """How the log of frames of the last session ended, in words; empty where none was kept."""
+        """Describe how the log of frames of the last session ended, in words; empty where none was kept."""
         return "" if self._log is None or self._log.report is None else str(self._log.report)
 
     def open(self) -> None:
-        """Lock and open every bus, and tell every drive what it is to do; nothing is energised.
+        """Lock and open every bus, and configure every drive; nothing is energised.
 
         Raises:
             DriverError: a bus is in use, also by another host on it, or cannot be had; a drive does not answer, is
@@ -160,7 +160,7 @@ class CanopenArm(Arm):
             raise
 
     def describe(self) -> ArmDescription:
-        """Say what is open; raises DriverError when nothing is."""
+        """Return the description of the open arm; raises DriverError when it is not open."""
         self._open()
         found = self._coordinates
         return ArmDescription(
@@ -209,7 +209,7 @@ class CanopenArm(Arm):
         self._through(buses, Resetting(buses.drives, self._names, self._driver.bring_up, self.clock.now_ns()))
 
     def exchange(self, torque: Vector | None) -> Sample:
-        """One cycle, as the contract has it.
+        """Exchange one cycle, as the contract says.
 
         Raises:
             DriverError: as in the contract.
@@ -225,7 +225,7 @@ class CanopenArm(Arm):
             self._counts, _ = self._coordinates.torque_counts(wanted)
             self._acting = _frozen(self._coordinates.joint_torque(self._counts))
         self._stop.repeat(buses)
-        # Enabled, an exchange that only looks is no torque frame: drives that count them must notice.
+        # While enabled, an exchange without a torque sends no torque frame: drives that supervise them must notice.
         idle = self._stop.counts(self._counts) if self._streaming and not self._enabled else None
         stamp_ns = buses.cycle(idle if torque is None else self._counts)
         self._measured.cycle(self._counts, buses.drives)
@@ -238,15 +238,15 @@ class CanopenArm(Arm):
         return watchdogs_of(self._driver, self._names)
 
     def withhold(self, kind: str) -> None:
-        """Stop sending what watchdogs of a kind watch, see `Arm`."""
+        """Stop sending what watchdogs of one kind watch, see `Arm`."""
         self._open().withheld.add(kind)
 
     def drive_status(self) -> tuple[AxisStatus, ...]:
-        """Return what each drive last said of itself, see `Arm`."""
+        """Return the last reported status of each drive, see `Arm`."""
         return tuple(drive.axis_status for drive in self._open().drives)
 
     def stop(self, kind: StopKind) -> None:
-        """Tell every drive to let go, or to stop by itself; never raises. What was sent before acts until it does.
+        """Command every drive to switch off, or to stop by itself; never raises. The last torque acts until it does.
 
         A drive that cannot be told is told again for 75 ms, and then before each cycle.
         """
@@ -258,7 +258,7 @@ class CanopenArm(Arm):
             self._stop.give(self._buses, kind)
 
     def close(self) -> None:
-        """Torque off, drives as they were powered up, buses free; any number of times.
+        """Take torque off, restore the drives' power-up settings and close the buses; any number of times.
 
         A quick stop is not cut short by it: drives that are told to let go in the midst of one would let the arm fall.
         The same holds for drives that were found holding the arm in quick stop, unless they have been told to let go.
@@ -277,7 +277,7 @@ class CanopenArm(Arm):
             self._log.close()
 
     def _leave(self, buses: Buses) -> None:
-        """Let drives that are off forget that a host will be missed; the others shall miss it. Never raises."""
+        """Disable the supervision of the host in drives that are off; the others shall miss the host. Never raises."""
         zero = self._counts if self._streaming else None
         self._stop.see_through(buses, zero, self._period_ns)
         there: dict[int, Objects] = {}  # by bus
@@ -306,13 +306,13 @@ class CanopenArm(Arm):
         self._acting = _frozen(np.zeros(len(self._limits)))
 
     def _find_zero(self, buses: Buses) -> None:
-        """Coordinates by what the drives vouch for, before they are configured, which may make them forget it."""
+        """Find the zero that the drives confirm, before they are configured, which may make them forget it."""
         if self._zeros is not None:
             held = [self._zeros.held(buses.objects(number), number) for number in range(len(buses.drives))]
             self._coordinates = self._coordinates.zeroed(self._zeros.all_of(held), self._zeros.home)
 
     def _configured(self, buses: Buses) -> Iterator[str]:
-        """All drives identified and configured, one by one; the identity of each in words."""
+        """Identify and configure all drives one by one; yields the identity of each in words."""
         motors = motor_limits(self._config, self._coordinates)
         for number, drive in enumerate(self._driver.drives):
             objects = buses.objects(number)
@@ -328,12 +328,12 @@ class CanopenArm(Arm):
             yield identity
 
     def _require_no_restart(self, buses: Buses) -> None:
-        """Drives that restarted after they were configured have lost their zero."""
+        """Raise PositionUnknown where a drive has restarted since it was configured, and so has lost its zero."""
         if self._zeros is not None and (restarted := [drive.node for drive in buses.drives if drive.boots]):
             raise PositionUnknown(self._zeros.lost(restarted))
 
     def _through(self, buses: Buses, steps: Enabling | Resetting) -> None:
-        """Cycle with zero torque until the drives have gone where they are led; a stop meanwhile wins."""
+        """Cycle with zero torque until the drives have gone through the given states; a stop meanwhile wins."""
         stops = self._stops
         while not steps.done:
             buses.cycle(self._counts if self._streaming else None)
@@ -374,7 +374,7 @@ class CanopenArm(Arm):
         )
 
     def _statuses(self, drives: Sequence[Drive]) -> tuple[int, ...]:
-        """Of the joints; put together again only when a drive has told something new."""
+        """Return the status of each joint; computed again only when a drive has reported something new."""
         told = [(drive.status, drive.emergency) for drive in drives]
         if told != self._told:
             self._told = told
@@ -383,7 +383,7 @@ class CanopenArm(Arm):
 
 
 def from_config(config: ArmConfig, clock: Clock | None = None) -> CanopenArm:
-    """The arm that a configuration with a CANopen driver describes, not open.
+    """Create the arm of a configuration with a CANopen driver, not open.
 
     Args:
         config: the arm's.

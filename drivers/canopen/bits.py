@@ -1,4 +1,4 @@
-"""How many bits a frame takes on the wire, and how long they last (ISO 11898-1:2015, 10.4 and 10.5).
+"""Compute how many bits a frame takes on the wire, and how long they last (ISO 11898-1:2015, 10.4 and 10.5).
 
 Classical frame with an 11-bit identifier and n bytes: start, identifier, RTR, IDE, r0, DLC, data and CRC-15 are
 34 + 8 n bits, among which a bit of the other value is stuffed after five alike; CRC delimiter, acknowledge, end of
@@ -10,7 +10,7 @@ frame; ESI, DLC, data and CRC take data bits. Up to the end of the data bits are
 ends there; stuff count and CRC (17 bits up to 16 bytes, 21 above) have a fixed stuff bit in front and after every
 four bits, so that their values do not change the length.
 
-Boundary: pure computation, no I/O. Every length includes the three bits of intermission.
+Every length includes the three bits of intermission.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ _FD_CONTROL = 5  # ESI, DLC
 
 
 class Bits(NamedTuple):
-    """Length of a frame: bits at the bit rate of arbitration, and at that of CAN FD's data."""
+    """Hold the length of a frame: bits at the arbitration bit rate, and at the data bit rate of CAN FD."""
 
     nominal: int
     data: int = 0
 
     def seconds(self, bitrate: int, data_bitrate: int | None = None) -> float:
-        """How long they last at these bit rates [bit/s]."""
+        """Return how long the bits last at these bit rates [s]; rates in [bit/s]."""
         return self.nominal / bitrate + (self.data / data_bitrate if data_bitrate is not None else 0.0)
 
 
 def padded(length: int) -> int:
-    """The shortest length of CAN FD's that holds so many bytes; raises ValueError above 64."""
+    """Return the shortest CAN FD length that holds so many bytes; raises ValueError above 64."""
     for longer in FD_LENGTHS:
         if longer >= length:
             return longer
@@ -46,14 +46,14 @@ def padded(length: int) -> int:
 
 
 def unstuffed(length: int, *, fd: bool = False) -> Bits:
-    """Bits of a data frame of so many bytes without stuffing; raises ValueError for a length no frame has."""
+    """Return the bits of a data frame of so many bytes without stuffing; ValueError for a length no frame has."""
     if not fd:
         return Bits(_classical(length) + _TAIL)
     return Bits(_FD_ARBITRATION + _TAIL, _FD_CONTROL + 8 * padded(length) + _fd_checksum(padded(length)))
 
 
 def worst(length: int, *, fd: bool = False) -> Bits:
-    """The most bits that a data frame of so many bytes can have; raises ValueError for a length no frame has."""
+    """Return the most bits that a data frame of so many bytes can have; ValueError for a length no frame has."""
     plain = unstuffed(length, fd=fd)
     if not fd:
         return Bits(plain.nominal + (_classical(length) - 1) // 4)
@@ -63,7 +63,7 @@ def worst(length: int, *, fd: bool = False) -> Bits:
 
 
 def exact(frame: Frame, *, fd: bool = False) -> Bits:
-    """The bits of one frame with this content; raises ValueError for a length no frame has.
+    """Return the bits of one frame with this content; raises ValueError for a length no frame has.
 
     Error frames are the controller's and not on the wire: 0 bits. Remote frames count as asking for no data.
     """
@@ -85,7 +85,7 @@ def exact(frame: Frame, *, fd: bool = False) -> Bits:
 
 
 def crc15(value: int, count: int) -> int:
-    """CRC-15 of so many bits, first bit highest (ISO 11898-1:2015, 10.4.2.6)."""
+    """Return the CRC-15 of the lowest `count` bits, first bit highest (ISO 11898-1:2015, 10.4.2.6)."""
     crc = 0
     # Leading zeros leave a CRC that starts at 0 as it is.
     for byte in value.to_bytes((count + 7) // 8, "big"):
@@ -107,14 +107,14 @@ def _exact_fd(frame: Frame) -> Bits:
 
 
 def _classical(length: int) -> int:
-    """Bits from start to CRC of a frame with an 11-bit identifier."""
+    """Return the bits from start to CRC of a frame with an 11-bit identifier."""
     if not 0 <= length <= 8:
         raise ValueError(f"a classical frame has 0 to 8 bytes, not {length}")
     return 34 + 8 * length
 
 
 def _fd_checksum(length: int) -> int:
-    """Stuff count (4), CRC, and a fixed stuff bit in front and after every four bits."""
+    """Return the bits of stuff count (4), CRC, and a fixed stuff bit in front and after every four bits."""
     content = 4 + (17 if length <= 16 else 21)
     return content + 1 + content // 4
 
@@ -124,7 +124,7 @@ _START = 0
 
 
 def _step(state: int, bit: int) -> tuple[int, int]:
-    """The state after one bit, and how many bits were stuffed; states are 1 + 5 bit + (run - 1), run 1 to 4."""
+    """Return the state after one bit, and how many bits were stuffed; states are 1 + 5 bit + (run - 1), run 1 to 4."""
     last, run = divmod(state - 1, 5) if state else (1 - bit, 0)
     run = run + 2 if state and last == bit else 1
     if run == 5:
@@ -156,7 +156,7 @@ def _stuffed(value: int, count: int) -> int:
 
 
 def _run_ends(value: int, count: int) -> int:
-    """1 when a bit is stuffed after the last one, else 0."""
+    """Return 1 when a bit is stuffed after the last one, else 0."""
     return _stuffed(value, count) - _stuffed(value >> 1, count - 1)
 
 

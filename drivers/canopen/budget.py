@@ -1,6 +1,6 @@
-"""What an arm's frames cost on each bus, whether they fit, and what to do where they do not.
+"""Compute the load of an arm's frames on each bus, whether it fits, and remedies where it does not.
 
-Every frame costs its bits without stuffing at least, those of the worst case at most; typical is the mean over real
+Every frame takes its bits without stuffing at least, those of the worst case at most; typical is the mean over real
 identifiers, real checksums and values as a moving arm has them (positions within ten motor turns of zero, torques of
 a tenth of rated torque). A cycle has SYNC, torque frames and positions; beside it there are heartbeats, status reports
 as often as their inhibit time allows, and one emergency a second and drive (`EMERGENCY_INHIBIT`). SDOs flow before
@@ -8,8 +8,6 @@ streaming only, control words once.
 
 The rule: at most 100 % of a bus in the worst case, at most 90 % typically. Frames of the background have the lower
 priority (but for emergencies), so that they wait for the cycle, not the cycle for them.
-
-Boundary: pure computation, no I/O.
 """
 
 from __future__ import annotations
@@ -61,24 +59,24 @@ _VALUES: dict[Entry, Callable[[random.Random], int]] = {
 
 
 class Cost(NamedTuple):
-    """One quantity without stuffing, in the mean, and in the worst case."""
+    """Hold one quantity without stuffing, in the mean, and in the worst case."""
 
     unstuffed: float
     typical: float
     worst: float
 
     def times(self, factor: float) -> Cost:
-        """So many times as much."""
+        """Return the cost multiplied by a factor."""
         return Cost(*(factor * each for each in self))
 
 
 @dataclass(frozen=True)
 class Line:
-    """Frames of one sort.
+    """Describe the frames of one sort.
 
     Attributes:
-        name: what they are.
-        cob_ids: one frame each.
+        name: of the sort.
+        cob_ids: identifiers, one frame each.
         length: bytes of one.
         per_second: how often each is sent, at most.
         cyclic: whether each is sent once a cycle.
@@ -94,17 +92,17 @@ class Line:
 
     @property
     def load(self) -> Cost:
-        """Share of the bus that all of them take."""
+        """Return the share of the bus that all frames of this sort take."""
         return self.each.times(len(self.cob_ids) * self.per_second)
 
 
 @dataclass(frozen=True)
 class BusLoad:
-    """One bus.
+    """Describe the load of one bus.
 
     Attributes:
-        profile: what flows on it.
-        lines: what that costs.
+        profile: frames of the bus.
+        lines: their load, by sort.
     """
 
     profile: BusProfile
@@ -112,27 +110,27 @@ class BusLoad:
 
     @property
     def cycle(self) -> Cost:
-        """Time on the wire of the frames of one cycle [s]; in it the last position has come."""
+        """Return the time on the wire of the frames of one cycle [s], within which the last position has come."""
         return _sum(line.each.times(len(line.cob_ids)) for line in self.lines if line.cyclic)
 
     @property
     def background(self) -> Cost:
-        """Share of the bus that does not depend on the rate."""
+        """Return the share of the bus that does not depend on the rate."""
         return _sum(line.load for line in self.lines if not line.cyclic)
 
     @property
     def load(self) -> Cost:
-        """Share of the bus in all."""
+        """Return the share of the bus taken by all frames."""
         return _sum(line.load for line in self.lines)
 
     @property
     def fits(self) -> bool:
-        """Whether the rule is kept."""
+        """Return whether the bus keeps the rule: at most `MOST_WORST` and `MOST_TYPICAL` of it."""
         return self.load.worst <= MOST_WORST and self.load.typical <= MOST_TYPICAL
 
     @property
     def highest_rate(self) -> int:
-        """The most whole cycles per second that keep the rule; 0 where the background alone breaks it."""
+        """Return the most whole cycles per second that keep the rule; 0 where the background alone breaks it."""
         cycle, background = self.cycle, self.background
         most = min((MOST_WORST - background.worst) / cycle.worst, (MOST_TYPICAL - background.typical) / cycle.typical)
         return max(0, floor(most + 1e-9))
@@ -140,12 +138,12 @@ class BusLoad:
 
 @dataclass(frozen=True)
 class Budget:
-    """All buses of an arm.
+    """Describe the load of all buses of an arm.
 
     Attributes:
         rate: cycles per second.
         buses: in the order of the configuration.
-        remedies: what would make it fit, each alone and each in words; empty where it fits.
+        remedies: changes of which each alone would make the load fit, in words; empty where it fits.
     """
 
     rate: float
@@ -154,17 +152,17 @@ class Budget:
 
     @property
     def fits(self) -> bool:
-        """Whether every bus keeps the rule."""
+        """Return whether every bus keeps the rule."""
         return all(bus.fits for bus in self.buses)
 
     @property
     def highest_rate(self) -> int:
-        """The most whole cycles per second that every bus carries."""
+        """Return the most whole cycles per second that every bus carries."""
         return min(bus.highest_rate for bus in self.buses)
 
     @property
     def reason(self) -> str:
-        """What does not fit, in words; empty where all does."""
+        """Describe in words which buses are over budget; empty where none is."""
         return "; ".join(
             f"bus {bus.profile.number} ({bus.profile.bus.channel}) is over budget at {self.rate:g} Hz: {_shares(bus)}"
             for bus in self.buses
@@ -173,12 +171,12 @@ class Budget:
 
     @property
     def remedy(self) -> str:
-        """What to do, one sentence; empty where nothing has to be done."""
+        """Return one sentence that says what to do; empty where nothing has to be done."""
         return f"Do one of these: {'; '.join(self.remedies)}." if self.remedies else ""
 
 
 def budget(driver: CanopenDriver, rate: float) -> Budget:
-    """What an arm's frames cost at a rate.
+    """Compute the bus loads of an arm's frames at a rate.
 
     Args:
         driver: the arm's section `driver`.
@@ -189,11 +187,11 @@ def budget(driver: CanopenDriver, rate: float) -> Budget:
 
 
 def frame_cost(cob_id: int, slots: Sequence[Entry], bus: CanBus) -> Cost:
-    """Time of one frame with these contents on a bus, intermission included [s].
+    """Return the time of one frame with these contents on a bus, intermission included [s].
 
     Args:
         cob_id: its identifier.
-        slots: what it carries; decides its length and which values are typical.
+        slots: entries that it carries; they decide its length and which values are typical.
         bus: its bit rates.
     """
     length, fd = sum(slot.kind.size for slot in slots), bus.data_bitrate is not None
@@ -205,7 +203,7 @@ def frame_cost(cob_id: int, slots: Sequence[Entry], bus: CanBus) -> Cost:
 
 @lru_cache(maxsize=512)
 def _mean_bits(cob_id: int, slots: tuple[Entry, ...], fd: bool) -> tuple[float, float]:
-    """Mean length over typical values, at the nominal and at the data bit rate; the same on every call."""
+    """Return the mean length over typical values, at the nominal and at the data bit rate; the same on every call."""
     draw = random.Random(cob_id)  # noqa: S311 - values, not secrets
     nominal = data = 0
     for _ in range(_DRAWN):
@@ -260,7 +258,7 @@ def _line(
 
 
 def _remedies(driver: CanopenDriver, rate: float, plain: Budget) -> Iterator[str]:
-    """Single changes that would make it fit, in words, with what would be left."""
+    """Yield single changes that would make the load fit, in words, with the load that they lead to."""
     if slower := next((r for r in ROUND_RATES if r <= min(plain.highest_rate, rate)), None):
         yield f"run at {slower} Hz (control.rate): {_left(_budget(driver, float(slower)))}"
     for words, changed in _variants(driver):

@@ -1,9 +1,8 @@
-"""What can be wrong with a bus as a whole, as one typed error with a remedy.
+"""Represent failures of a bus as a whole as one typed error with a remedy.
 
 Sources: errno values of the kernel's `net/can/raw.c` and `drivers/net/can/dev`; python-can hands them on in
 `CanError.error_code` or as the cause.
-
-Boundary: no interface is touched here.
+`CanError.error_code` or as the cause.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ _KINDS: dict[int, Kind] = {
 
 
 class BusError(DriverError):
-    """A bus cannot be opened, or can no longer be used.
+    """Report that a bus cannot be opened, or can no longer be used.
 
     Attributes:
         kind: `absent` no such interface; `down` not brought up; `off` bus-off; `full` nothing more can be sent; `gone`
@@ -58,10 +57,10 @@ class BusError(DriverError):
     def __init__(
         self, kind: Kind, name: str, bitrate: int = 1_000_000, detail: str = "", *, remedy: str | None = None
     ) -> None:
-        """Say what is wrong and what to do.
+        """Describe what is wrong and what to do.
 
         Args:
-            kind: what is wrong.
+            kind: of the error.
             name: of the bus, as it is configured.
             bitrate: for the command that brings an interface up.
             detail: the system's own word.
@@ -73,18 +72,18 @@ class BusError(DriverError):
 
 
 def kind_of(code: int | None, otherwise: Kind = "refused") -> Kind:
-    """What an errno means for a bus.
+    """Return the kind of bus error that an errno means.
 
     Args:
         code: the errno, None where there is none.
-        otherwise: what any other one means; `gone` says that the bus is in use, so that it was there before.
+        otherwise: kind of any other errno; `gone` says that the bus is in use, so that it existed before.
     """
     kind = _KINDS.get(code or 0, otherwise)
     return "gone" if (kind, otherwise) == ("absent", "gone") else kind
 
 
 class BusOffWatch:
-    """Remembers from error frames whether the controller has left the bus.
+    """Track from error frames whether the controller has left the bus.
 
     The kernel accepts frames of a controller that is bus-off and drops them silently, so that the link itself must
     refuse. Receiving goes on: only so can a restart be heard.
@@ -94,6 +93,6 @@ class BusOffWatch:
         self.off = False
 
     def heard(self, frame: Frame) -> None:
-        """Note an error frame; others do not matter."""
+        """Note an error frame; ignore other frames."""
         if frame.error:
             self.off = (self.off or bool(frame.identifier & BUS_OFF)) and not frame.identifier & RESTARTED

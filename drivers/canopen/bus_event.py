@@ -1,7 +1,4 @@
-"""What a codec tells of its bus beside the state of the drives.
-
-Boundary: names and words; who finds them is `codec.py`, what they mean to an arm `events.py`.
-"""
+"""Define the events that a codec reports of its bus beside the state of the drives."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ HOST = 0  # the node of events that are of the bus or the host's own controller
 
 
 class EventCode(StrEnum):
-    """What can happen on a bus beside what is asked for."""
+    """Name the events on a bus."""
 
     EMERGENCY = "emergency"
     EMERGENCY_RESET = "emergency_reset"
@@ -29,8 +26,8 @@ class EventCode(StrEnum):
     DUPLICATE = "duplicate"
     LATE = "late"
     WRONG_LENGTH = "wrong_length"
-    STRANGER = "stranger"  # a frame of nobody who should be on this bus
-    SECOND_HOST = "second_host"  # somebody else sends what only we may
+    STRANGER = "stranger"  # a frame of no node that should be on this bus
+    SECOND_HOST = "second_host"  # another node sends what only this host may
     ERROR_PASSIVE = "error_passive"  # the host's controller
     BUS_OFF = "bus_off"  # the host's controller
     CONTROLLER = "controller"  # any other change of its state
@@ -49,11 +46,11 @@ MILD = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that happened.
+    """Represent an event on a bus.
 
     Attributes:
-        code: what.
-        node: whose; `HOST` for the bus as a whole.
+        code: of the event.
+        node: that it is about; `HOST` for the bus as a whole.
         words: for people, without the node.
     """
 

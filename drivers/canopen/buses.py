@@ -1,12 +1,10 @@
-"""All buses of an arm in step: when a cycle begins, what is sent in it and in which order, until when answers count.
+"""Run all buses of an arm in step: when a cycle begins, the order of its frames, and until when answers count.
 
 A cycle begins one period after the one before; periods that are over are skipped, never made up for. While positions
 are missing, one that began late waits for them half a period, or as long as its frames need on the wire: positions
 carry no number, and one that came after the next SYNC would count for it. On every bus the
 torques go first, then SYNC on all of them back to back, so that all drives act and sample at one time. Our heartbeat is
-sent behind the answers, by this loop and nobody else: a loop that stops is missed by the drives.
-
-Boundary: frames and time. What torques mean and what states drives should be in is `arm.py`'s.
+sent behind the answers, by this loop alone: drives notice a loop that stops.
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ from drivers.clock import Clock
 from ident_service.errors import DriverError
 
 RECEIVE = 0.97  # of a period, within which a position counts for its cycle (FIELDBUS.md: the last is on the wire then)
-HUSH = 0.02  # s in which the last frames of a session before ours may still be on their way
+HUSH = 0.02  # s in which the last frames of an earlier session may still be on their way
 LISTEN = 0.12  # s before we send anything; another host's heartbeat comes within it
 AWAKE = 2.0  # s within which every drive must answer
 LEAST = 0.5  # of a period, from SYNC on, that positions are waited for in any case
@@ -40,7 +38,7 @@ _ASK = bytes([0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0])  # SDO upload of the device t
 
 @dataclass
 class GuardedNode:
-    """A drive that misses us when it is not asked in time: its node, how often it is asked, and when next [ns]."""
+    """Represent a drive that misses its host when it is not asked in time: node, period of asking, next time [ns]."""
 
     node: int
     period_ns: int
@@ -48,7 +46,7 @@ class GuardedNode:
 
 
 class Buses:
-    """The open buses of one arm.
+    """Run the open buses of one arm.
 
     Attributes:
         codecs: one a bus.
@@ -62,7 +60,7 @@ class Buses:
     """
 
     def __init__(self, profiles: Sequence[BusProfile], links: Sequence[Link], period_ns: int) -> None:
-        """Take the links, which this closes.
+        """Use the given links, which `close` closes.
 
         Args:
             profiles: of the buses.
@@ -97,13 +95,13 @@ class Buses:
         self._next_ns: int | None = None
 
     def close(self) -> None:
-        """Give all links back; never raises."""
+        """Close all links; never raises."""
         for link in self._links:
             with suppress(Exception):
                 link.close()
 
     def command(self, command: NmtCommand) -> None:
-        """An NMT command for our drives; others on the bus are none of our business."""
+        """Send an NMT command to the arm's drives, not to other nodes on the bus."""
         for number in range(len(self.drives)):
             self.command_drive(number, command)
 
@@ -113,26 +111,26 @@ class Buses:
         link.send(codec.nmt(command, self.drives[number].node))
 
     def control(self, number: int, word: int) -> None:
-        """A control word for one drive."""
+        """Send a control word to one drive."""
         codec, link = self._at[number]
         link.send(codec.control_word(self.drives[number].node, word, self.modes[number]))
 
     def objects(self, number: int) -> Objects:
-        """The object dictionary of one drive, for as long as nothing streams."""
+        """Return the object dictionary of one drive, usable as long as nothing streams."""
         codec, link = self._at[number]
         return Objects(link, self.drives[number].node, codec.receive)
 
     def profile(self, number: int) -> BusProfile:
-        """Of the bus that a drive is on."""
+        """Return the profile of the bus that a drive is on."""
         return self._at[number][0].profile
 
     def restarted(self, number: int) -> Callable[[], bool]:
-        """What tells whether a drive has sent a boot-up message since the buses were opened."""
+        """Return a function that tells whether a drive has sent a boot-up message since the buses were opened."""
         drive = self.drives[number]
         return lambda: drive.boots > 0
 
     def listen(self) -> None:
-        """Wait whether another host drives this arm, which anything of ours would disturb in the midst of it.
+        """Listen whether another host drives this arm, before anything is sent that could disturb it.
 
         Raises:
             DriverError: one does; nothing has been sent.
@@ -181,9 +179,9 @@ class Buses:
             )
 
     def begin(self) -> None:
-        """Drives and host are configured: let PDOs flow until all drives say so and their positions come in time.
+        """Start PDOs once drives and host are configured, and wait until all drives answer every SYNC in time.
 
-        Everybody reports his state at first, which takes the bus longer than a cycle.
+        At first every drive reports its state, which takes the bus longer than a cycle.
 
         Raises:
             DriverError: some do not get there.
@@ -206,19 +204,19 @@ class Buses:
         self.forget_events()
 
     def forget_events(self) -> None:
-        """What happened until now was expected, or has been told otherwise."""
+        """Discard the events so far: they were expected, or have been reported otherwise."""
         for codec in self.codecs:
             codec.forget_events()
         self.lost = 0
 
     def cycle(self, counts: Sequence[int] | None) -> int:
-        """Wait for the next cycle and make it.
+        """Wait for the next cycle and exchange its frames.
 
         Args:
             counts: torque of every drive [per mille of rated torque]; None for SYNC alone.
 
         Returns:
-            When SYNC was sent [ns].
+            When SYNC was sent, on the link's clock [ns].
 
         Raises:
             DriverError: a bus is gone, or torques that cannot be sent, of which none has been.
@@ -260,7 +258,7 @@ class Buses:
         return stamp_ns
 
     def keep_alive(self) -> None:
-        """Our heartbeat, when half of its period is over: one that is sent late must not be missed."""
+        """Send the host's heartbeat at half of its period, so that a late one is not missed; poll guarded drives."""
         now_ns = self.clock.now_ns()
         self._ask_guarded(now_ns)
         if now_ns >= self._heartbeat_ns and "heartbeat" not in self.withheld:
@@ -279,7 +277,7 @@ class Buses:
 
 
 def _on_the_wire(profile: BusProfile) -> float:
-    """How long the frames of a cycle take at most [s]."""
+    """Return how long the frames of a cycle take at most [s]."""
     lengths = [
         0,
         *(2 * len(frame.drives) for frame in profile.torque_frames),

@@ -1,10 +1,8 @@
-"""Judge what a drive can against what this driver needs: asked by SDO uploads, or foretold by its data sheet.
+"""Compare what a drive can do with what this driver needs, by SDO uploads or by its data sheet.
 
 A drive's answer counts before its family (`profiles/`), the family before the file. What is indispensable and missing
-is a problem, with the object and the reason; what is optional and missing is told with what happens instead. Of what
-can be had in several ways the first of the family's list is taken.
-
-Boundary: it writes nothing. Whether an entry can be written shows when `setup.py` writes it.
+is a problem, with the object and the reason; what is optional and missing is noted with what happens instead. Of
+alternatives the first of the family's list is taken. Whether an entry can be written shows when `setup.py` writes it.
 """
 
 from __future__ import annotations
@@ -68,11 +66,11 @@ _OTHERS: Sequence[Entry] = (
 
 @dataclass(frozen=True)
 class Found:
-    """Hold what is known of a drive's entries.
+    """Hold what is known of a drive's object dictionary.
 
     Attributes:
         there: keys (index << 8 | sub-index) of entries that it has.
-        values: what they hold, by key, where that is known.
+        values: of the entries, by key, where known.
         unread: why one that it seems to have could not be read, by key.
         asked: whether the drive was asked; else its data sheet foretells.
     """
@@ -92,14 +90,14 @@ class Found:
 
     @property
     def identity(self) -> dict[str, int]:
-        """Vendor and product (1018h), as far as they are known."""
+        """Return vendor and product (1018h), as far as they are known."""
         said = {"vendor": self.get(od.VENDOR), "product": self.get(od.PRODUCT)}
         return {name: value for name, value in said.items() if value is not None}
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Name what is indispensable and missing: the object's index [h], and why it is needed, in words."""
+    """Describe what is indispensable and missing: the object's index [h], and why it is needed, in words."""
 
     where: str
     why: str
@@ -110,7 +108,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class Capabilities:
-    """Hold what one drive can, and what of it is taken.
+    """Hold what one drive can do, and which of the alternatives are used.
 
     Attributes:
         family: that it belongs to.
@@ -124,8 +122,8 @@ class Capabilities:
         dummies: indices of what may take the room of others' torques, in the order in which they are tried.
         shares: whether its data sheet or its family lets it share torque frames.
         problems: why it cannot be driven.
-        changes: what the description has to say instead.
-        notes: what it lacks, and what happens instead.
+        changes: that the description needs, with reasons.
+        notes: missing optional entries, and what happens instead.
     """
 
     family: Family
@@ -150,7 +148,7 @@ class Capabilities:
 
 
 def capabilities(objects: Objects, driver: CanopenDriver, number: int) -> Capabilities:
-    """Ask a drive of an arm what it can, by uploads alone, and judge it.
+    """Ask a drive of an arm, by uploads alone, for its capabilities, and judge them.
 
     Args:
         objects: of the drive.
@@ -173,7 +171,7 @@ def required(objects: Objects, driver: CanopenDriver, number: int) -> Capabiliti
 
 
 def discovered(objects: Objects, drive: CanopenDrive, own: Sequence[Family] = ()) -> tuple[Family, Found]:
-    """Ask a drive for all that matters, by uploads alone.
+    """Ask a drive for all entries that matter, by uploads alone.
 
     Args:
         objects: of the drive.
@@ -190,7 +188,7 @@ def discovered(objects: Objects, drive: CanopenDrive, own: Sequence[Family] = ()
 
 
 def foretold(sheet: DataSheet, drive: CanopenDrive, own: Sequence[Family] = ()) -> tuple[Family, Found]:
-    """Return what a data sheet says instead of the drive; arguments as for `discovered`."""
+    """Return a drive's entries from its data sheet instead of the drive; arguments as for `discovered`."""
     told = {0x101800 | sub: value for sub, value in sheet.identity.items()}
     family = family_of(Found(frozenset(), told).identity, own)
     values = {key: value for key, one in sheet.entries.items() if (value := one.number(drive.node)) is not None}
@@ -230,7 +228,7 @@ def _asked(objects: Objects, entries: Mapping[int, Entry] | Sequence[Entry]) -> 
 def judged(
     found: Found, family: Family, drive: CanopenDrive, driver: CanopenDriver, sheet: DataSheet | None
 ) -> Capabilities:
-    """Hold what a drive has against what it needs.
+    """Compare what a drive has with what it needs.
 
     Args:
         found: what it has.
@@ -299,12 +297,12 @@ def where(entry: Entry) -> str:
 
 
 def named(text: str) -> str:
-    """Return an entry of a family likewise."""
+    """Return an entry of a family, given as text, as people write it."""
     return where(entry_of(text, ""))
 
 
 def _streams(path: TorquePath, found: Found) -> bool:
-    """Return whether a drive has a way of streaming torques; one whose 6502h is not known may have it."""
+    """Return whether a drive supports a way of streaming torques; where 6502h is unknown, it may."""
     needed = [path.target, *([path.slope] if path.slope else []), *([path.by.entry] if path.by else [])]
     modes = found.get(od.SUPPORTED_MODES)
     supported = path.supported is None or modes is None or bool(modes >> path.supported & 1)
@@ -323,7 +321,7 @@ def _limits(limit: TorqueLimit, found: Found) -> bool:
 
 
 def _count(family: Family, found: Found, drive: CanopenDrive) -> float | None:
-    """Return what one count of the target is [N m]; None where nothing tells it."""
+    """Return the torque of one count of the target [N m]; None where it is unknown."""
     unit = family.unit
     if unit is None or (unit.unit == "mA" and drive.torque_constant is None):
         return None
@@ -344,7 +342,7 @@ def _unit_problems(family: Family, found: Found, count: float | None) -> Iterato
 
 
 def _unit_changes(family: Family, found: Found, drive: CanopenDrive, count: float | None) -> Iterator[Problem]:
-    """Hold what a count is by the drive against the description, and against its current and torque constant."""
+    """Compare a count's torque in the drive with the description, and with its current and torque constant."""
     unit = family.unit
     if unit is None or unit.writable:
         return
@@ -385,7 +383,7 @@ def _watchdogs(family: Family, found: Found, drive: CanopenDrive) -> Iterator[Wa
     own = mine is not None and mine.index << 8 | mine.sub in found.there
     if own if drive.watchdog == "vendor" else theirs:
         yield "vendor"
-    if drive.watchdog == "sync_loss":  # which no standard entry tells: the description says that there is one
+    if drive.watchdog == "sync_loss":  # which no standard entry shows: the description states it
         yield "sync_loss"
     if found.has(od.HEARTBEAT_CONSUMER):
         yield "heartbeat"
@@ -394,6 +392,6 @@ def _watchdogs(family: Family, found: Found, drive: CanopenDrive) -> Iterator[Wa
 
 
 def _identifier_is_free(sheet: DataSheet | None) -> bool:
-    """Return whether the COB-ID of torque frames may be another; one that is fixed is nobody else's."""
+    """Return whether the COB-ID of torque frames can be changed; a fixed one cannot be shared with other drives."""
     entry = None if sheet is None else sheet.entries.get(od.RPDO_COB_ID.key)
     return entry is None or entry.writable

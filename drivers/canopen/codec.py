@@ -1,10 +1,10 @@
-"""The cyclic plane of one bus: torques in, bytes out; bytes in, the state of every drive out.
+"""Encode and decode the cyclic frames of one bus: torques to frames, frames to the state of every drive.
 
-Cycle: torque frames and SYNC go out, `begin_cycle` opens it, the frames that are heard go through `receive`, and
+Cycle: torque frames and SYNC go out, `begin_cycle` opens it, the frames that are received go through `receive`, and
 `end_cycle` closes it. A drive answers once a cycle: a second position is a duplicate, one outside a cycle is late, and
-neither is used. What must not be missed is told as events (`take_events`), in words and with a code for the guard.
+neither is used. What must not be missed is reported as events (`take_events`), in words and with a code for the guard.
 
-Boundary: no I/O, no clock, no decision. `receive` takes any frame whatever and never raises; nothing that is received
+There is no I/O, no clock and no decision here. `receive` takes any frame and never raises; nothing that is received
 changes a torque. This runs in every cycle: `struct` and one look-up by identifier, no arrays.
 """
 
@@ -54,7 +54,7 @@ _FOLLOWED = 64  # identifiers of strangers that are remembered
 
 @dataclass(frozen=True, slots=True)
 class Emergency:
-    """The latest emergency of a drive: error code, error register (1001h), the vendor's bytes."""
+    """Represent the latest emergency of a drive: error code, error register (1001h), the vendor's bytes."""
 
     code: int
     register: int
@@ -63,7 +63,7 @@ class Emergency:
 
 @dataclass(slots=True)
 class Drive:
-    """What is known of one drive.
+    """Hold the last reported state of one drive.
 
     Attributes:
         node: its number.
@@ -78,7 +78,7 @@ class Drive:
         torque: the last one that it measured [per mille of rated torque] (6077h).
         torques: how often that was told.
         status_age: cycles since it.
-        nmt: what its last heartbeat said, None before the first.
+        nmt: state of its last heartbeat, None before the first.
         heartbeat_ns: when that was [ns of the link's clock].
         boots: boot-up messages.
         emergency: the latest, None before the first and after a reset.
@@ -103,26 +103,26 @@ class Drive:
 
     @property
     def state(self) -> DriveState:
-        """Of CiA 402, unknown before the first status word."""
+        """Return the state of CiA 402, unknown before the first status word."""
         return DriveState.UNKNOWN if self.status is None else state_of(self.status)
 
     @property
     def axis_status(self) -> AxisStatus:
-        """In the words of all fieldbuses; nothing before the first status word."""
+        """Return the status in flags common to all fieldbuses; none before the first status word."""
         error = 0 if self.emergency is None else self.emergency.code
         return AxisStatus(0) if self.status is None else axis_status(self.status, error)
 
 
 @dataclass(slots=True)
 class Counters:
-    """Frames that were received but not used, since the beginning.
+    """Count frames that were received but not used, since the beginning.
 
     Attributes:
         ignored: remote frames, 29-bit identifiers, SDO replies and heartbeats of others.
         wrong_length: frames of a drive with another length than its profile has.
-        strangers: frames of nobody who should be on the bus.
+        strangers: frames of nodes that should not be on the bus.
         errors: error frames of the host's controller.
-        events_lost: events that nobody took before there were too many.
+        events_lost: events that were dropped because too many waited.
     """
 
     ignored: int = 0
@@ -134,14 +134,14 @@ class Counters:
 
 @dataclass(slots=True)
 class _Packed:
-    """A torque frame and how its bytes are made."""
+    """Describe a torque frame and how its bytes are packed."""
 
     cob_id: int
     drives: tuple[int, ...]
     pack: Callable[..., bytes] = field(repr=False)
 
 
-# Bits of the status word that are told when they come and when they go.
+# Bits of the status word whose setting and clearing are reported as events.
 _BITS = (
     (WARNING, EventCode.DRIVE_WARNING, "warns"),
     (INTERNAL_LIMIT, EventCode.TORQUE_LIMITED, "limits its torque"),
@@ -150,13 +150,13 @@ _CONTROLLER = {ControllerState.PASSIVE: EventCode.ERROR_PASSIVE, ControllerState
 
 
 class BusCodec:
-    """The drives of one bus.
+    """Encode and decode the frames of the drives of one bus.
 
     Attributes:
-        profile: what flows.
+        profile: frames of the bus.
         drives: the state of each, in the order of `profile.drives`.
         controller: state of the host's CAN controller.
-        counters: what was not used.
+        counters: frames that were not used.
     """
 
     def __init__(self, profile: BusProfile) -> None:
@@ -195,7 +195,7 @@ class BusCodec:
         self._ours |= {frame.cob_id for frame in profile.torque_frames}
 
     def torque_frames(self, counts: Sequence[int]) -> list[Frame]:
-        """The frames that carry a torque to every drive of this bus.
+        """Return the frames that carry a torque to every drive of this bus.
 
         Args:
             counts: of all drives of the arm [per mille of rated torque], in the arm's order.
@@ -209,26 +209,26 @@ class BusCodec:
             raise DriverError(f"bus {self.profile.number}: torques {list(counts)} cannot be sent: {error}") from None
 
     def sync(self) -> Frame:
-        """What starts a cycle: drives latch torques and sample positions."""
+        """Return the SYNC frame, which starts a cycle: drives latch torques and sample positions."""
         return self._sync
 
     def heartbeat(self, state: NmtState = NmtState.OPERATIONAL) -> Frame:
-        """Our own heartbeat, which keeps the drives' watchdogs quiet."""
+        """Return the host's own heartbeat, which keeps the drives' watchdogs quiet."""
         return Frame(HEARTBEAT + self.profile.host, bytes([state]))
 
     def control_word(self, node: int, word: int, mode: int) -> Frame:
-        """A control word (6040h) and a mode of operation (6060h) for one drive (RPDO2)."""
+        """Return the frame with a control word (6040h) and a mode of operation (6060h) for one drive (RPDO2)."""
         return Frame(RPDO2 + node, _CONTROL.pack(word, mode))
 
     def nmt(self, command: NmtCommand, node: int = 0) -> Frame:
-        """An NMT command for one node, or for all (0)."""
+        """Return the frame with an NMT command for one node, or for all (0)."""
         return Frame(NMT, bytes([command, node]))
 
     def begin_cycle(self, now_ns: int = 0) -> None:
-        """SYNC has been sent: from now on each drive may answer once.
+        """Open a cycle after SYNC has been sent: from now on each drive may answer once.
 
         Args:
-            now_ns: when [ns of the link's clock], for frames that nobody stamped.
+            now_ns: time of SYNC [ns of the link's clock], for frames without a stamp.
         """
         self._open, self._now_ns, self._missing = True, now_ns, len(self.drives)
         for drive in self.drives:
@@ -237,16 +237,16 @@ class BusCodec:
             drive.status_age += 1
 
     def end_cycle(self) -> None:
-        """The deadline has passed: what answers from now on is late."""
+        """Close the cycle at its deadline: answers from now on are late."""
         self._open = False
 
     @property
     def complete(self) -> bool:
-        """Whether every drive has answered in this cycle."""
+        """Return whether every drive has answered in this cycle."""
         return self._missing == 0
 
     def silent(self, now_ns: int) -> list[int]:
-        """Nodes whose heartbeat has been missing for longer than the configured time, those never heard included."""
+        """Return the nodes whose heartbeat has been missing for longer than configured, or was never received."""
         oldest = now_ns - round(self.profile.heartbeat_timeout * 1e9)
         return [drive.node for drive in self.drives if drive.nmt is None or drive.heartbeat_ns < oldest]
 
@@ -255,14 +255,14 @@ class BusCodec:
         return [drive.node for drive in self.drives if drive.status_age > self._status_cycles]
 
     def take_events(self) -> list[Event]:
-        """What happened since the last time, oldest first."""
+        """Return the events since the last call, oldest first, and forget them."""
         if not self._events:
             return []
         taken, self._events = self._events, []
         return taken
 
     def forget_events(self) -> None:
-        """What happened until now was expected, or told otherwise; who disturbs the bus still is told of anew."""
+        """Discard the events so far, expected or reported otherwise; nodes that still disturb the bus report anew."""
         self._events = []
         self._strangers.clear()
         self._foreign.clear()
@@ -355,7 +355,7 @@ class BusCodec:
         drive.nmt, drive.heartbeat_ns = state, frame.stamp_ns or self._now_ns
         if state == NmtState.BOOT_UP:
             drive.boots += 1
-            drive.status = None  # what it was told is forgotten; what it said before is no longer true
+            drive.status = None  # the drive has lost its configuration; its last status is no longer true
             self._tell(EventCode.BOOT_UP, drive.node, "has booted")
         elif before != state and before is not None:
             words = f"NMT state {nmt_words(state)}, was {nmt_words(before)}"

@@ -1,7 +1,4 @@
-"""What the host's own CAN controller says of itself in error frames (linux/can/error.h).
-
-Boundary: one error frame in, the controller's state and words out.
-"""
+"""Decode the state of the host's own CAN controller from error frames (linux/can/error.h)."""
 
 from __future__ import annotations
 
@@ -24,7 +21,7 @@ _OVERFLOW, _WARNING, _PASSIVE, _ACTIVE = 0x03, 0x0C, 0x30, 0x40
 
 
 class ControllerState(IntEnum):
-    """How far the controller still takes part in the bus (ISO 11898-1, fault confinement)."""
+    """Name the states of a CAN controller (ISO 11898-1, fault confinement)."""
 
     ACTIVE = 0
     WARNING = 1
@@ -33,7 +30,7 @@ class ControllerState(IntEnum):
 
 
 def controller_state(frame: Frame, before: ControllerState) -> ControllerState:
-    """The state after an error frame; from bus-off only a restart leads back."""
+    """Return the controller's state after an error frame; from bus-off only a restart leads back."""
     kind, detail = frame.identifier, frame.data[1] if len(frame.data) > 1 else 0
     if kind & _BUS_OFF:
         return ControllerState.BUS_OFF
@@ -49,10 +46,10 @@ def controller_state(frame: Frame, before: ControllerState) -> ControllerState:
 
 
 def overflowed(frame: Frame) -> bool:
-    """Whether an error frame says that frames were lost in this controller."""
+    """Return whether an error frame says that frames were lost in this controller."""
     return bool(frame.identifier & _CONTROLLER and len(frame.data) > 1 and frame.data[1] & _OVERFLOW)
 
 
 def error_words(frame: Frame) -> str:
-    """What an error frame says, for people; empty where it only tells the controller's state."""
+    """Describe an error frame for people; empty where it only tells the controller's state."""
     return ", ".join(words for bit, words in _CLASSES.items() if frame.identifier & bit)

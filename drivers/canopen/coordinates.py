@@ -1,4 +1,4 @@
-"""Joints, motors, and the whole numbers that drives speak: counts and thousandths of a rated torque.
+"""Convert between joints, motors, and the integers that drives use: counts and thousandths of a rated torque.
 
 With the gear ratios r, the coupling C and the offsets q0 of the arm's transmission (`config/recording.py`):
 
@@ -11,7 +11,7 @@ Clipping. Motors that share joints (a differential) are one group. Where one of 
 give, all joint torques of its group are scaled by the same factor: the direction is kept, so that no joint of the
 group is pushed the other way, and joints outside the group get all they asked for.
 
-Boundary: pure computation; joints as arrays, what goes over the bus as plain whole numbers.
+Joints are arrays here, values that go over the bus plain integers.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _ABSURD = 1e12  # N m; beyond, scaling down would not be exact, and no machine m
 
 @dataclass(frozen=True)
 class Coordinates:
-    """Between n joints and their n motors.
+    """Convert between n joints and their n motors.
 
     Attributes:
         joint_per_count: position [rad or m] per count of each motor, shape (n joints, n motors).
@@ -60,37 +60,37 @@ class Coordinates:
 
     @property
     def motors_of(self) -> list[tuple[int, ...]]:
-        """The motors that each joint's position is worked out from, by number."""
+        """Return the motors that each joint's position is computed from, by number."""
         return [next(motors for motors, joints in self.groups if j in joints) for j in range(len(self.offset))]
 
     @property
     def torque_limit(self) -> Vector:
-        """The most each joint can be given while the others are given nothing [N m or N], shape (n,)."""
+        """Return the most each joint can be given while the others are given nothing [N m or N], shape (n,)."""
         with np.errstate(divide="ignore"):
             alone = np.array(self.limit)[:, None] / np.abs(self.count_per_torque)
         return np.asarray(alone.min(axis=0))
 
     @property
     def torque_resolution(self) -> Vector:
-        """Largest change of each joint's torque by one thousandth of one motor [N m or N], shape (n,)."""
+        """Return the largest change of each joint's torque by one thousandth of one motor [N m or N], shape (n,)."""
         return np.asarray(np.abs(self.torque_per_count).max(axis=1))
 
     @property
     def position_resolution(self) -> Vector:
-        """Largest change of each joint's position by one count of one motor [rad or m], shape (n,)."""
+        """Return the largest change of each joint's position by one count of one motor [rad or m], shape (n,)."""
         return np.asarray(np.abs(self.joint_per_count).max(axis=1))
 
     def positions(self, counts: Sequence[int]) -> Vector:
-        """Joint positions [rad or m], shape (n,), of motors at these counts, which do not wrap around (`unwrapped`)."""
+        """Return the joint positions [rad or m], shape (n,), of motors at these counts, unwrapped (`unwrapped`)."""
         return self.joint_per_count @ [float(n - zero) for n, zero in zip(counts, self.zero, strict=True)] + self.offset
 
     def counts_at(self, position: Vector) -> list[int]:
-        """The nearest counts of the motors when the joints are at this position [rad or m], shape (n,)."""
+        """Return the nearest counts of the motors when the joints are at this position [rad or m], shape (n,)."""
         motors = np.linalg.solve(self.joint_per_count, position - self.offset)
         return [round(turn) + zero for turn, zero in zip(motors.tolist(), self.zero, strict=True)]
 
     def count_limits(self, lowest: Vector, highest: Vector) -> list[tuple[int, int] | None]:
-        """Between which counts each motor is while all joints are between these positions.
+        """Return the range of counts of each motor while all joints are between these positions.
 
         Args:
             lowest: [rad or m], shape (n,); not finite where a joint has no limit.
@@ -119,7 +119,7 @@ class Coordinates:
         return found
 
     def zeroed(self, counts: Sequence[int], position: Vector) -> Coordinates:
-        """The same for an arm whose motors are at these counts while its joints are at this position.
+        """Return coordinates for an arm whose motors are at these counts while its joints are at this position.
 
         Args:
             counts: of the motors, one each.
@@ -128,7 +128,7 @@ class Coordinates:
         return replace(self, zero=tuple(counts), offset=np.array(position, dtype=float))
 
     def torque_counts(self, torque: Vector) -> tuple[list[int], bool]:
-        """What to ask of the motors for a joint torque.
+        """Convert a joint torque to the motors' torques.
 
         Args:
             torque: of the joints [N m or N], shape (n,).
@@ -157,12 +157,12 @@ class Coordinates:
         return counts, clipped
 
     def joint_torque(self, counts: Sequence[float]) -> Vector:
-        """The joint torque [N m or N], shape (n,), that motors really give which are asked for this."""
+        """Return the joint torque [N m or N], shape (n,), that motors really give at these thousandths."""
         return np.asarray(self.torque_per_count @ [float(n) for n in counts])
 
 
 def coordinates(driver: CanopenDriver, transmission: Transmission) -> Coordinates:
-    """Those of an arm as its description has them: counts of 0 where the transmission has its zero.
+    """Return the coordinates of an arm as described, with counts of 0 where the transmission has its zero.
 
     Args:
         driver: the section `driver`.
@@ -177,7 +177,7 @@ def coordinates(driver: CanopenDriver, transmission: Transmission) -> Coordinate
     coupling = np.eye(size) if transmission.coupling is None else np.array(transmission.coupling)
     motor_per_joint = np.array(transmission.ratios)[:, None] * coupling
     joint_per_motor = np.linalg.inv(motor_per_joint)
-    # An inverse that is only nearly zero where it is zero would couple what is not coupled.
+    # An inverse that is only nearly zero where it should be zero would couple joints that are not coupled.
     groups = _groups(coupling)
     inside = np.zeros((size, size), dtype=bool)
     for motors, joints in groups:
@@ -197,28 +197,28 @@ def coordinates(driver: CanopenDriver, transmission: Transmission) -> Coordinate
 
 
 def torque_limit_counts(max_torque: float, rated_torque: float) -> int:
-    """A motor's largest torque as thousandths of its rated torque, rounded down; at most what 6071h can hold."""
+    """Return a motor's largest torque as thousandths of its rated torque, rounded down; at most what 6071h holds."""
     # 1.8/0.2 is a little below 9 in floating point.
     return min(int(_PER_MILLE * max_torque / rated_torque + 1e-6), MOST_COUNTS)
 
 
 def signed(value: int) -> int:
-    """A number of 32 bits without sign as the one with sign that has the same bits."""
+    """Convert an unsigned number of 32 bits to the signed one with the same bits."""
     return (value + _TURN // 2) % _TURN - _TURN // 2
 
 
 def unwrapped(before: int, counts: int) -> int:
-    """A position of 32 bits as one that does not wrap around: the nearest to the one before.
+    """Return a position of 32 bits without wrap-around: the value nearest to the one before.
 
     Args:
         before: the last position, unwrapped [counts].
-        counts: what the drive says now, a signed number of 32 bits.
+        counts: present position of the drive, a signed number of 32 bits.
     """
     return before + (counts - before + _TURN // 2) % _TURN - _TURN // 2
 
 
 def _groups(coupling: Matrix) -> tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]:
-    """Motors (rows) and joints (columns) that hang together through numbers that are not zero."""
+    """Return motors (rows) and joints (columns) connected through elements that are not zero."""
     size, left = len(coupling), set(range(len(coupling)))
     found = []
     while left:

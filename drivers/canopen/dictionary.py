@@ -1,7 +1,6 @@
-"""The entries of an object dictionary that this room reads and writes: index, type, unit.
+"""Define the object dictionary entries that this driver reads and writes: index, type, unit.
 
-From CiA 301 (communication, 1000h to 1FFFh) and CiA 402 (drives, 6000h to 67FFh). Boundary: names and how a value lies
-in bytes; what is written when is the driver's.
+From CiA 301 (communication, 1000h to 1FFFh) and CiA 402 (drives, 6000h to 67FFh).
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from enum import Enum
 
 
 class Kind(Enum):
-    """Types of CiA 301, table 44, as `struct` codes, little-endian."""
+    """Name the types of CiA 301, table 44, with their `struct` codes, little-endian."""
 
     I8 = "<b"
     I16 = "<h"
@@ -23,13 +22,13 @@ class Kind(Enum):
 
     @property
     def size(self) -> int:
-        """Bytes of one value."""
+        """Return the size of one value [bytes]."""
         return struct.calcsize(self.value)
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One entry.
+    """Represent one entry of an object dictionary.
 
     Attributes:
         index: 1000h to 9FFFh; below, the dummies of PDO mapping.
@@ -47,27 +46,27 @@ class Entry:
 
     @property
     def mapping(self) -> int:
-        """The word that maps it into a PDO: index, sub-index, bits (CiA 301, 1600h)."""
+        """Return the word that maps the entry into a PDO: index, sub-index, bits (CiA 301, 1600h)."""
         return self.index << 16 | self.sub << 8 | 8 * self.kind.size
 
     @property
     def key(self) -> int:
-        """Index and sub-index in one number."""
+        """Return index and sub-index in one number."""
         return self.index << 8 | self.sub
 
     def at(self, sub: int) -> Entry:
-        """The same entry at another sub-index."""
+        """Return the same entry at another sub-index."""
         return replace(self, sub=sub)
 
     def pack(self, value: int) -> bytes:
-        """A value as bytes; raises ValueError where the type does not hold it."""
+        """Encode a value as bytes; raises ValueError where the type does not hold it."""
         try:
             return struct.pack(self.kind.value, value)
         except struct.error:
             raise ValueError(f"{self}: {value} is no {self.kind.name}") from None
 
     def unpack(self, data: bytes) -> int:
-        """The value of some bytes; raises ValueError for another number of bytes than the type has."""
+        """Decode a value from bytes; raises ValueError for another number of bytes than the type has."""
         if len(data) != self.kind.size:
             raise ValueError(f"{self}: {len(data)} bytes, but {self.kind.name} has {self.kind.size}")
         value: int = struct.unpack(self.kind.value, data)[0]
@@ -98,7 +97,7 @@ PRODUCT = Entry(0x1018, 2, Kind.U32, "product")
 REVISION = Entry(0x1018, 3, Kind.U32, "revision")
 SERIAL = Entry(0x1018, 4, Kind.U32, "serial number")
 SYNC_OVERFLOW = Entry(0x1019, 0, Kind.U8, "counter in SYNC, 0 for none")
-# A host may keep two numbers of its own here (CiA 301, "verify configuration"); ours are `zero.py`'s.
+# A host may store two numbers of its own here (CiA 301, "verify configuration"); see `zero.py`.
 STORED = Entry(0x1010, 1, Kind.U32, "what is stored when")
 ZERO_COUNTS = Entry(0x1020, 1, Kind.U32, "counts at home", "counts, as 32 bits")
 ZERO_MARK = Entry(0x1020, 2, Kind.U32, "mark of the counts at home")
@@ -160,5 +159,5 @@ CST_SUPPORTED = 1 << 9  # in 6502h
 
 
 def pdo_entry(entry: Entry, number: int, sub: int | None = None) -> Entry:
-    """An entry of PDO 1 as that of PDO `number` (from 1), at another sub-index if one is given."""
+    """Return an entry of PDO 1 as that of PDO `number` (from 1), at another sub-index if one is given."""
     return replace(entry, index=entry.index + number - 1, sub=entry.sub if sub is None else sub)

@@ -1,12 +1,10 @@
-"""All drives of an arm through the states of CiA 402 at once, cycle by cycle.
+"""Lead all drives of an arm through the states of CiA 402 at once, cycle by cycle.
 
-Ready, switched on, a few cycles with zero torque and everybody's position, enabled: each step has one deadline for all
-drives. Commands go to those who have not come so far, and again where one was lost.
+Ready, switched on, a few cycles with zero torque and every position received, enabled: each step has one deadline for
+all drives. Commands go to the drives that have not come so far, and again where one was lost.
 
-The last step is taken when the drives may tell it at once: a status report is not sent within the inhibit time of the
+The last step is taken when the drives may report it at once: a status report is not sent within the inhibit time of the
 one before, and an arm without brakes would sink unnoticed, and without torque, until it is.
-
-Boundary: which command to whom; who sends it, and the cycles themselves, are `arm.py`'s.
 """
 
 from __future__ import annotations
@@ -32,7 +30,7 @@ _FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION)
 
 
 class Enabling:
-    """From switched off to `operation enabled`."""
+    """Lead drives from switched off to `operation enabled`."""
 
     def __init__(
         self,
@@ -43,11 +41,11 @@ class Enabling:
         reports: tuple[float, float],
         quick_stop: int,
     ) -> None:
-        """Begin.
+        """Start with drives that are switched off.
 
         Args:
             drives: of all buses, as their codecs know them.
-            names: what people call them.
+            names: of the drives, for people.
             step: how long all drives together may take for one step [s].
             now_ns: of the link's clock.
             reports: least and longest time between two status reports of a drive [s].
@@ -66,11 +64,11 @@ class Enabling:
 
     @property
     def done(self) -> bool:
-        """Whether all drives are enabled."""
+        """Return whether all drives are enabled."""
         return self._target == len(_WAY)
 
     def commands(self, now_ns: int) -> list[tuple[int, int]]:
-        """What to send in this cycle: numbers of drives and control words.
+        """Return the control words to send in this cycle, with the numbers of their drives.
 
         Raises:
             DriverError: a drive has a fault, or the step's time is over; who, and why as far as it is known.
@@ -109,7 +107,7 @@ class Enabling:
         return words
 
     def _may_enable(self, now_ns: int) -> bool:
-        """Whether the seed is sown and no drive's next report would have to wait; the latter not for ever."""
+        """Check that seed cycles have passed and no drive's next report would be held back; the latter not for ever."""
         if self._seeded < SEEDED:
             return False
         self._ready_ns = now_ns if self._ready_ns is None else self._ready_ns
@@ -126,7 +124,7 @@ class Enabling:
 
 
 class Resetting:
-    """Out of the state `fault`: a rising edge of bit 7, nothing else; the drives stay off."""
+    """Lead drives out of the state `fault`: a rising edge of bit 7, nothing else; the drives stay off."""
 
     def __init__(self, drives: Sequence[Drive], names: Sequence[str], step: float, now_ns: int) -> None:
         """Begin; arguments as for `Enabling`."""
@@ -136,11 +134,11 @@ class Resetting:
 
     @property
     def done(self) -> bool:
-        """Whether no drive is in a fault any more, nor in a state that nobody knows."""
+        """Return whether no drive is in a fault any more, nor in an unknown state."""
         return all(drive.state not in (*_FAULTS, DriveState.UNKNOWN) for drive in self._drives)
 
     def commands(self, now_ns: int) -> list[tuple[int, int]]:
-        """What to send in this cycle; raises DriverError when the time is over and a fault is still there."""
+        """Return the control words to send in this cycle; DriverError when the time is over and a fault persists."""
         if self.done:
             return []
         if now_ns > self._deadline_ns:
@@ -157,12 +155,12 @@ class Resetting:
 
 
 def hold(drives: Sequence[Drive]) -> bool:
-    """Tell whether some of the drives have said that they are in quick stop."""
+    """Return whether some of the drives have reported that they are in quick stop."""
     return any(drive.state is DriveState.QUICK_STOP for drive in drives)
 
 
 def _told(drives: Sequence[Drive], names: Sequence[str], chosen: Sequence[Drive]) -> str:
-    """What some of the drives say."""
+    """Describe the states and emergencies of the chosen drives."""
     words = []
     for name, drive in zip(names, drives, strict=True):
         if drive in chosen:

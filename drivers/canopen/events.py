@@ -1,7 +1,4 @@
-"""What happened on a bus, in the words that every fieldbus shares; what only a person wants to know is left out.
-
-Boundary: from one bus's events to an arm's; what follows from them is the guard's table.
-"""
+"""Translate the events of CANopen buses to events common to all fieldbuses; those for people only are left out."""
 
 from __future__ import annotations
 
@@ -37,7 +34,7 @@ _ERROR_PASSIVE = "8120h"
 def axis_events(events: Iterable[Event], codec: BusCodec, joint_of: Mapping[int, int]) -> list[AxisEvent]:
     """Translate the events of one bus.
 
-    Args:
+    events: as the codec reports them. States of drives, errors that were reset and a return to normal are not among
         events: as the codec tells them. States of drives, errors that were reset and a return to normal are not among
             the results.
         codec: of the bus.
@@ -59,19 +56,19 @@ class Reports:
     """Collect the events of all buses of an arm, cycle by cycle."""
 
     def __init__(self, driver: CanopenDriver, joints: Mapping[int, int], look_every: int) -> None:
-        """Begin.
+        """Start with nothing reported missing.
 
         Args:
             driver: the section `driver`.
             joints: first joint that each drive moves, by number.
-            look_every: cycles between two looks at who is missing.
+            look_every: cycles between two checks for missing reports.
         """
         self._joints = [{d.node: joints[k] for k, d in enumerate(driver.drives) if d.bus == bus} for bus in range(4)]
         self._look_every = look_every
         self._missed = MissedReports()
 
     def new(self, codecs: Iterable[BusCodec], cycle: int, now_ns: int) -> list[AxisEvent]:
-        """Return what has happened since the last time; `cycle` is its number, `now_ns` of the links' clock [ns]."""
+        """Return the events since the last call; `cycle` is the cycle's number, `now_ns` of the links' clock [ns]."""
         found: list[AxisEvent] = []
         look = cycle % self._look_every == 0
         for codec in codecs:
@@ -83,13 +80,13 @@ class Reports:
 
 
 class MissedReports:
-    """Drives of all buses whose heartbeat or status report is missing, each told once until it is heard again."""
+    """Report drives whose heartbeat or status report is missing, each once until it is received again."""
 
     def __init__(self) -> None:
         self._told: set[tuple[int, int, AxisEventCode]] = set()
 
     def new(self, codec: BusCodec, now_ns: int, joint_of: Mapping[int, int]) -> list[AxisEvent]:
-        """Return what has been missing on one bus since this was asked last.
+        """Return the reports that have gone missing on one bus since the last call.
 
         Args:
             codec: of the bus.

@@ -1,4 +1,4 @@
-"""Which family a drive belongs to: the data files beside this module, and those of an arm's description before them."""
+"""Determine a drive's family, from the arm's description or else from the data files beside this module."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def family_of(identity: Mapping[str, int], own: Sequence[Family] = ()) -> Family
     """Return the family of a drive, with what it leaves open as in `generic402`.
 
     Args:
-        identity: what 1018h answers, by the keys `vendor` and `product`.
+        identity: values of 1018h, by the keys `vendor` and `product`.
         own: families of the arm's description, which count before the shipped ones.
     """
     vendor, product = identity.get("vendor"), identity.get("product")

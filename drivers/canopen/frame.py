@@ -1,4 +1,4 @@
-"""One CAN frame, as every layer of this room hands it on."""
+"""Define the CAN frame that every layer of this package passes on."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class Frame(NamedTuple):
-    """A data frame with an 11-bit identifier, unless a flag says otherwise (ISO 11898-1).
+    """Represent a data frame with an 11-bit identifier, unless a flag says otherwise (ISO 11898-1).
 
     Attributes:
         identifier: COB-ID.
@@ -15,7 +15,7 @@ class Frame(NamedTuple):
         error: an error frame of the controller, not of the wire; `identifier` holds the error class bits of
             linux/can/error.h and `data` its details.
         extended: a 29-bit identifier, which CANopen never uses.
-        stamp_ns: when it was received, monotonic [ns]; 0 where nobody knows.
+        stamp_ns: when it was received, monotonic [ns]; 0 where unknown.
         fd: a CAN FD frame with its bit rate switched. What a driver sends is one where its link's bus is configured so,
             whatever stands here.
     """

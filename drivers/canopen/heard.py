@@ -1,16 +1,14 @@
-"""Which frames a link hears: every one of CANopen, whose identifiers have 11 bits (CiA 301, 7.3.5).
+"""Define the receive filter of a link: all CANopen frames, whose identifiers have 11 bits (CiA 301, 7.3.5).
 
-SDO is among them, since drives are configured over the same link before anything streams. All else matters, of foreign
-nodes too: a second master's SYNC or torque is a fault.
-
-Boundary: identifiers only.
+SDO is among them, since drives are configured over the same link before anything streams. Frames of foreign nodes are
+received too: a second master's SYNC or torque is a fault.
 """
 
 from __future__ import annotations
 
 from typing import Final
 
-# Identifier and mask; a frame with 11 bits of identifier is heard when any fits.
+# Identifier and mask; a frame with 11 bits of identifier is received when any pair fits.
 HEARD: Final = ((0x000, 0x000),)
 
 

@@ -1,9 +1,8 @@
-"""Convert frames to bytes: those of the kernel's CAN sockets (linux/can.h), and packets between our processes.
+"""Convert frames to bytes: those of the kernel's CAN sockets (linux/can.h), and packets between processes.
 
 `struct can_frame` has 16 bytes: identifier and flags (32 bit, native order), length, 3 bytes of padding, 8 of data.
 `struct canfd_frame` has 72: the same with a byte of flags after the length and 64 of data.
-
-Boundary: bytes in, values out; no socket.
+`struct canfd_frame` has 72: the same with a byte of flags after the length and 64 of data.
 """
 
 from __future__ import annotations
@@ -25,12 +24,12 @@ _FD: Final = struct.Struct("=IBB2x64s")
 MAX_PACKET_BYTES: Final = 8192
 MAX_PACKET_FRAMES: Final = 64  # fits with 64 bytes each
 _PACKED: Final = struct.Struct("<qIBB2x")
-_OWN_FLAG: Final = 1  # it is an echo, or was sent rather than heard
+_OWN_FLAG: Final = 1  # the frame is an echo, or was sent rather than received
 _FD_FLAG: Final = 2
 
 
 def to_kernel(frame: Frame, *, fd: bool = False) -> bytes:
-    """Bytes to write to a socket.
+    """Return the bytes of a frame to write to a socket.
 
     Args:
         frame: one that `check_sendable` accepts.
@@ -45,7 +44,7 @@ def to_kernel(frame: Frame, *, fd: bool = False) -> bytes:
 
 
 def from_kernel(data: bytes, stamp_ns: int = 0) -> Frame:
-    """The frame that was read from a socket.
+    """Return the frame that was read from a socket as bytes.
 
     Raises:
         DriverError: bytes that are neither of the two structures, or a length that exceeds the structure's.
@@ -70,7 +69,8 @@ def pack_frames(frames: Iterable[tuple[Frame, bool]]) -> bytes:
     A frame is a header of 16 bytes (stamp [ns], the kernel's identifier word, length, flags) and its data.
 
     Args:
-        frames: at most `MAX_PACKET_FRAMES` that exist on a bus, and whether each was sent by whom the packet is for.
+        frames: at most `MAX_PACKET_FRAMES` that can exist on a bus, each with whether the recipient of the packet sent
+            it.
     """
     parts = []
     for (identifier, data, remote, error, extended, stamp_ns, fd), own in frames:
@@ -81,7 +81,7 @@ def pack_frames(frames: Iterable[tuple[Frame, bool]]) -> bytes:
 
 
 def unpack_frames(data: bytes) -> list[tuple[Frame, bool]]:
-    """Unpack the frames of one packet, and whether each was sent by whom the packet is for.
+    """Unpack the frames of one packet, each with whether the recipient of the packet sent it.
 
     Raises:
         DriverError: a packet that is empty, too long, torn, or has a frame that cannot exist.

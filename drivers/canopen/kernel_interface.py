@@ -1,7 +1,4 @@
-"""What the kernel says of a CAN interface, asked in the network namespace of this process (netdevice(7)).
-
-Boundary: no frame is sent or received here.
-"""
+"""Query the kernel about a CAN interface, in the network namespace of this process (netdevice(7))."""
 
 from __future__ import annotations
 
@@ -21,7 +18,7 @@ _REQUEST, _LONGEST_NAME = struct.Struct("16si20x"), 15  # struct ifreq, IFNAMSIZ
 
 
 def check_interface(bus: CanBus) -> None:
-    """Refuse what opening would only find out by half: python-can leaves a socket open, CAN FD fails in a cycle.
+    """Refuse an interface whose defect would show late: python-can would leave a socket open, CAN FD fail in a cycle.
 
     Where the kernel has no CAN sockets nothing is refused; opening says so.
 
@@ -43,7 +40,7 @@ def check_interface(bus: CanBus) -> None:
 
 
 def _largest_packet(channel: str) -> int:
-    """Bytes; raises OSError where the kernel does not say."""
+    """Return the largest packet of an interface [bytes]; raises OSError where the kernel does not say."""
     with socket.socket(AF_CAN, socket.SOCK_RAW, CAN_RAW) as sock:
         request = _REQUEST.pack(channel.encode()[:_LONGEST_NAME], 0)
         return int(_REQUEST.unpack(fcntl.ioctl(sock, _SIOCGIFMTU, request))[1])

@@ -1,8 +1,8 @@
-"""What the driver needs of a bus: send, receive until a deadline, drain; nothing of any interface.
+"""Define the interface to one CAN bus: send, receive until a deadline, drain; and open the links of an arm.
 
-A link belongs to one bus and one user: it hears what others send, never its own frames. It may be python-can, a CAN
+A link belongs to one bus and one user: it receives what others send, never its own frames. It may be python-can, a CAN
 socket of the kernel, or emulated drives in this process; which, `open_links` finds by the configured interface in the
-entry-point group `ident_service.can_links`, so that this room does not know the emulator.
+entry-point group `ident_service.can_links`, so that this package does not know the emulator.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ GROUP = "ident_service.can_links"
 
 
 class Link(Protocol):
-    """One bus. Every method raises DriverError when the bus is gone (bus-off, interface down, adapter pulled out)."""
+    """Define a link to one bus; every method raises DriverError when the bus is gone (bus-off, interface down)."""
 
     @property
     def clock(self) -> Clock:
-        """The clock that `stamp_ns` and deadlines are of; virtual where time waits for the drives."""
+        """Return the clock of `stamp_ns` and deadlines; virtual where time waits for the drives."""
 
     def send(self, frame: Frame) -> None:
-        """Hand one frame over for transmission, in the order of the calls; never waits for the wire."""
+        """Queue one frame for transmission, in the order of the calls; never waits for the wire."""
 
     def receive(self, deadline_ns: int) -> Frame | None:
-        """The next frame that was heard, None when there is none until the deadline [ns of the clock]."""
+        """Return the next received frame, None when there is none until the deadline [ns of the clock]."""
 
     def drain(self) -> Sequence[Frame]:
-        """All frames that were heard and not received yet; never waits."""
+        """Return all frames that have been received and not returned yet; never waits."""
 
     def close(self) -> None:
-        """Give the bus back; any number of times."""
+        """Close the link; any number of times."""
 
 
 def open_links(config: ArmConfig) -> list[Link]:

@@ -1,4 +1,4 @@
-"""One driver a bus: a socket address that only one process can have, named after the bus.
+"""Lock a bus for one driver, by a socket address that only one process can have, named after the bus.
 
 The address is abstract (unix(7)): it has no file, so no folder and no permissions, and processes of all users meet at
 it, under systemd too. It belongs to the network namespace, as the names of CAN interfaces do. It vanishes with the
@@ -22,10 +22,10 @@ _LONGEST = 64  # of a name that stands in the address as it is, of the 107 bytes
 
 
 class BusLock:
-    """Held from construction to `close`."""
+    """Hold the lock of one bus from construction to `close`."""
 
     def __init__(self, bus: CanBus) -> None:
-        """Take the bus.
+        """Lock the bus.
 
         Raises:
             DriverError: another process has it, or no lock can be made.
@@ -42,7 +42,7 @@ class BusLock:
             raise DriverError(f"the bus {bus.channel} is in use by process {_owner(address)}") from None
 
     def close(self) -> None:
-        """Give the bus back; any number of times."""
+        """Release the lock; any number of times."""
         self._socket.close()
 
 
@@ -56,10 +56,10 @@ def _address(bus: CanBus) -> bytes:
 
 
 def _owner(address: bytes) -> str:
-    """The number of the process that holds an address; `unknown` where the kernel does not tell."""
+    """Return the id of the process that holds an address; `unknown` where the kernel does not tell."""
     with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
         asking.setblocking(False)
         asking.connect(address)
         pid = _CREDENTIALS.unpack(asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))[0]
-        return str(pid) if pid > 0 else "unknown"  # 0: of a container that we do not see into
+        return str(pid) if pid > 0 else "unknown"  # 0: of a container whose processes are not visible here
     return "unknown"

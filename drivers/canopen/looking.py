@@ -1,12 +1,10 @@
-"""The arm of CANopen drives as one that only looks: SDO uploads and open ears, nothing else.
+"""Observe an arm of CANopen drives without commanding it: SDO uploads and received frames, nothing else.
 
 No NMT command, no SYNC, no PDO, no write, no heartbeat leaves the host, so that drives stay in whatever state they are,
 pre-operational or operational, with their watchdogs as they were. Each cycle asks all drives for position (6064h),
 status word (6041h) and error register (1001h), and those with an error for its code (603Fh). Four uploads cost far
 more than a cycle of torques, and stopped drives answer none: hence `look_rate`, and drives that do not answer are
 shown as such.
-
-Boundary: the contract of an arm, as far as looking goes.
 """
 
 from __future__ import annotations
@@ -46,7 +44,7 @@ _SDO_BYTES = 8
 
 @dataclass
 class _Seen:
-    """What is known of one drive: last answers, and cycles since it told its position."""
+    """Hold what is known of one drive: last answers, and cycles since its last position."""
 
     position: int | None = None
     unwrapped: int = 0
@@ -56,7 +54,7 @@ class _Seen:
 
 
 def look_rate(driver: CanopenDriver) -> float:
-    """How often all drives can be asked [Hz]: `RATE`, or what takes `SHARE` of the fullest bus."""
+    """Return how often all drives can be asked [Hz]: `RATE`, or the rate that takes `SHARE` of the fullest bus."""
     frames = 2 * len(_QUESTIONS) * sum(worst(_SDO_BYTES))
     loads = [
         frames * sum(drive.bus == number for drive in driver.drives) / bus.bitrate
@@ -66,10 +64,10 @@ def look_rate(driver: CanopenDriver) -> float:
 
 
 class LookingArm(Arm):
-    """Drives on one or more buses, looked at."""
+    """Implement an arm whose drives, on one or more buses, are only observed."""
 
     def __init__(self, config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]]) -> None:
-        """Take the description; nothing is opened.
+        """Use the arm's description; nothing is opened.
 
         Args:
             config: with a CANopen driver and a transmission.
@@ -99,7 +97,7 @@ class LookingArm(Arm):
         self._next_ns: int | None = None
 
     def open(self) -> None:
-        """Lock and open every bus, listen for a moment, and ask every drive who it is.
+        """Lock and open every bus, listen for a moment, and ask every drive for its identity.
 
         Raises:
             DriverError: a bus is in use, by another host too, or cannot be had; no drive answers, or one is another
@@ -123,7 +121,7 @@ class LookingArm(Arm):
             raise
 
     def describe(self) -> ArmDescription:
-        """Say what is open; raises DriverError when nothing is."""
+        """Return the description of the open arm; raises DriverError when it is not open."""
         self._require_open()
         found = self._coordinates
         limits = np.array([np.inf if joint.torque is None else joint.torque for joint in self._config.joints.values()])
@@ -138,19 +136,19 @@ class LookingArm(Arm):
         )
 
     def zero(self) -> tuple[str, ...]:
-        """Never; raises DriverError."""
+        """Refuse to set a zero; raises DriverError."""
         raise DriverError("an arm that is only looked at cannot be zeroed")
 
     def enable(self) -> None:
-        """Never; raises DriverError."""
+        """Refuse to enable the arm; raises DriverError."""
         raise DriverError("an arm that is only looked at cannot be enabled")
 
     def reset(self) -> None:
-        """Never; raises DriverError."""
+        """Refuse to reset the drives; raises DriverError."""
         raise DriverError("an arm that is only looked at cannot be reset")
 
     def exchange(self, torque: Vector | None) -> Sample:
-        """Ask every drive once.
+        """Ask every drive once for its position, status and errors.
 
         Raises:
             DriverError: not open, a torque, a bus is gone, or another host has begun to stream: it must not be delayed.
@@ -178,10 +176,10 @@ class LookingArm(Arm):
         return sample
 
     def stop(self, kind: StopKind) -> None:
-        """Nothing: what was not started here is not stopped here."""
+        """Do nothing: an arm that is only observed was not started here."""
 
     def close(self) -> None:
-        """Give the buses back; drives stay as they are."""
+        """Close the buses; drives stay as they are."""
         for link in self._links:
             with suppress(Exception):
                 link.close()
@@ -204,7 +202,7 @@ class LookingArm(Arm):
         return poll(self._links, places, entry, deadline_ns, self._heard.take)
 
     def _identified(self) -> tuple[str, ...]:
-        """Who every drive is; raises DriverError when nobody answers, or one is another than configured."""
+        """Return the identity of every drive; DriverError when none answers, or one is another than configured."""
         missing, last = set(self._places), self.clock.now_ns() + round(AWAKE * 1e9)
         while missing and (now_ns := self.clock.now_ns()) < last:
             answers = self._ask(sorted(missing), od.DEVICE_TYPE, now_ns + round(TIMEOUT * 1e9))
@@ -223,7 +221,7 @@ class LookingArm(Arm):
         return tuple(words)
 
     def _find_zero(self) -> None:
-        """Coordinates by what the drives vouch for, where their encoders need it."""
+        """Find the zero that the drives confirm, where their encoders need it."""
         if self._zeros is None:
             return
         self._heard.restarted.clear()
@@ -247,7 +245,7 @@ class LookingArm(Arm):
         return lambda frame: self._heard.take(bus, frame)
 
     def _wait(self) -> int:
-        """Until the next cycle; periods that are over are skipped."""
+        """Wait until the next cycle; periods that are over are skipped. Returns the time [ns]."""
         now_ns = self.clock.now_ns()
         begin_ns = now_ns if self._next_ns is None else self._next_ns
         self.clock.sleep_until_ns(begin_ns)
@@ -284,7 +282,7 @@ class LookingArm(Arm):
 
 
 def _take(seen: _Seen, position: int | None, status: int | None) -> None:
-    """The answers of one cycle; None for none."""
+    """Store the answers of one drive in one cycle; None for a missing answer."""
     seen.age += 1
     if position is not None:
         seen.unwrapped = position if seen.position is None else unwrapped(seen.unwrapped, position)

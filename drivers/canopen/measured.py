@@ -1,10 +1,8 @@
-"""The torque that drives measure (6077h), at the joints, and how far it is from what they were told.
+"""Convert the torque that drives measure (6077h) to the joints, and compare it with the commanded torque.
 
-A drive's torque follows its command within a millisecond or two, and many drives average what they tell over some
-more. So a measured torque is held against all that the drive was told within the last `WINDOW`. Only what lies outside
+A drive's torque follows its command within a millisecond or two, and many drives average what they report over some
+more. So a measured torque is compared with all that the drive was told within the last `WINDOW`. Only what lies outside
 of that, in two reports in a row, is a difference.
-
-Boundary: counts to torques; who judges them is `motion/`, who records them too.
 """
 
 from __future__ import annotations
@@ -31,7 +29,7 @@ class MeasuredTorque:
     """
 
     def __init__(self, coordinates: Coordinates, rate: float) -> None:
-        """Begin with drives that are told nothing; `rate` is in cycles per second."""
+        """Start with drives without a commanded torque; `rate` is in cycles per second."""
         self._coordinates = coordinates
         self._told = np.zeros((max(2, round(WINDOW * rate)), len(coordinates.limit)))
         self._cycle = 0
@@ -41,7 +39,7 @@ class MeasuredTorque:
         self.difference: Vector | None = None
 
     def cycle(self, counts: Sequence[int], drives: Sequence[Drive]) -> None:
-        """Take what was sent and heard in a cycle.
+        """Process the torques sent and the reports received in a cycle.
 
         Args:
             counts: sent with its SYNC [per mille of rated torque], by drive.

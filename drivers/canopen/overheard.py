@@ -1,7 +1,4 @@
-"""What others say on the buses of an arm while nobody commands it: NMT states from heartbeats, and another host.
-
-Boundary: frames in, facts out; nothing is ever sent.
-"""
+"""Listen on the buses of an arm without sending: NMT states from heartbeats, restarts, and another host."""
 
 from __future__ import annotations
 
@@ -17,14 +14,14 @@ LONGER = 1.2  # times a heartbeat's period, in which one must come
 
 
 class Overheard:
-    """Ears on every bus of an arm.
+    """Listen on every bus of an arm.
 
     Attributes:
-        nmt: what each node's last heartbeat said, and when it came [ns of the links' clock].
-        booted: nodes whose last word was a boot-up message, which makes them pre-operational.
-        restarted: nodes that sent a boot-up message since somebody cleared this.
-        answered: nodes that sent an SDO reply which nobody waited for.
-        streaming: buses on which somebody sends SYNC.
+        nmt: state of each node's last heartbeat, and when it came [ns of the links' clock].
+        booted: nodes whose last heartbeat was a boot-up message, which makes them pre-operational.
+        restarted: nodes that sent a boot-up message since this was last cleared.
+        answered: nodes that sent an SDO reply for which no request waited.
+        streaming: buses on which another host sends SYNC.
     """
 
     def __init__(self) -> None:
@@ -35,7 +32,7 @@ class Overheard:
         self.streaming: set[int] = set()
 
     def take(self, bus: int, frame: Frame) -> None:
-        """A frame of somebody; any frame whatever."""
+        """Process one received frame of any kind."""
         if frame.error or frame.remote or frame.extended:
             return
         node = frame.identifier - HEARTBEAT
@@ -60,13 +57,13 @@ class Overheard:
                 self.take(bus, frame)
 
     def drain(self, links: Sequence[Link]) -> None:
-        """Take what waits; raises DriverError when a bus is gone."""
+        """Process the frames that wait; raises DriverError when a bus is gone."""
         for bus, link in enumerate(links):
             for frame in link.drain():
                 self.take(bus, frame)
 
     def nmt_words(self, place: Place, now_ns: int, patience_ns: int) -> str:
-        """A node's NMT state for people, as of now.
+        """Describe a node's NMT state for people, as of now.
 
         Args:
             place: bus and node.

@@ -1,4 +1,4 @@
-"""Have a drive's PDOs be those of a bus profile (CiA 301, 7.5.2.36): compared first, and written as far as they differ.
+"""Configure a drive's PDOs as a bus profile wants them (CiA 301, 7.5.2.36): compare first, write where they differ.
 
 All that differ are switched off before one of them is written, so that no two share a COB-ID even for a moment. Some
 drives have fixed COB-IDs, which must then be the wanted ones. Two dummies of 8 bits take the room of one of 16.
@@ -54,11 +54,13 @@ def configure_pdos(objects: Objects, pdos: Sequence[Pdo], unused: Sequence[Pdo],
             raise SdoRefused(f"{refused}; {words}", refused.code) from None
     for pdo in pdos:
         if not pdo.sent and not pdo.timer:
-            objects.ensure_if_there(pdo.timing)  # a deadline of somebody else's would end a silence that is none
+            objects.ensure_if_there(
+                pdo.timing
+            )  # a deadline left by another host could report a silence where there is none
 
 
 def _variants(pdo: Pdo, dummies: Sequence[int]) -> list[Pdo]:
-    """Return a PDO with each kind of dummy in the slots of others."""
+    """Return a PDO with each kind of dummy in the slots of other drives."""
     if od.DUMMY_INT16 not in pdo.slots:
         return [pdo]
     return [
@@ -96,7 +98,7 @@ def _off(objects: Objects, pdo: Pdo) -> None:
 
 
 def _map(objects: Objects, variants: Sequence[Pdo]) -> None:
-    """Map the first variant that the drive takes."""
+    """Map the first variant of a PDO that the drive takes."""
     refusals = []
     for pdo in variants:
         if _is_mapped(objects, pdo):

@@ -1,9 +1,7 @@
-"""One entry of many nodes asked for at a time: SDO uploads that run beside each other (CiA 301, 7.2.4.3.5).
+"""Ask many nodes for one entry at a time, by SDO uploads that run in parallel (CiA 301, 7.2.4.3.5).
 
 Each node serves its own requests, so that all of them may be asked before the first has answered. Only what one frame
-holds is read, and nothing is ever written.
-
-Boundary: numbers of an object dictionary. Texts, and what is written, go through `sdo.py`.
+holds is read, and nothing is ever written; texts, and what is written, go through `sdo.py`.
 """
 
 from __future__ import annotations
@@ -25,13 +23,13 @@ _ABORT, _UPLOAD, _EXPEDITED, _SIZED = 0x80, 0x40, 0x02, 0x01
 
 
 def upload_request(entry: Entry) -> bytes:
-    """The eight bytes that ask for an entry."""
+    """Return the eight bytes that ask for an entry."""
     return struct.pack("<BHB4x", _UPLOAD, entry.index, entry.sub)
 
 
 @dataclass
 class Answers:
-    """What nodes said of one entry.
+    """Hold the answers of nodes to the upload of one entry.
 
     Attributes:
         values: by node.
@@ -42,7 +40,7 @@ class Answers:
     aborts: dict[Place, int] = field(default_factory=dict)
 
     def take(self, place: Place, entry: Entry, data: bytes) -> bool:
-        """Whether eight bytes of a node are its answer, which is then kept."""
+        """Store eight bytes of a node if they are its answer; returns whether they are."""
         first, index, sub = struct.unpack_from("<BHB", data)
         if (index, sub) != (entry.index, entry.sub):
             return False
@@ -70,9 +68,9 @@ def poll(
 
     Args:
         links: of the arm's buses.
-        places: whom; `BURST` of a bus at a time.
-        entry: what for.
-        deadline_ns: when whoever has not answered is given up [ns of the links' clock]; each burst has its share.
+        places: nodes to ask; `BURST` of a bus at a time.
+        entry: to upload.
+        deadline_ns: when nodes that have not answered are given up [ns of the links' clock]; each burst has its share.
         others: takes the frames that are no answers, with the number of their bus.
 
     Raises:
@@ -96,7 +94,7 @@ def _ask(
     found: Answers,
     others: Callable[[int, Frame], None],
 ) -> None:
-    """One burst on every bus."""
+    """Ask one burst of nodes on every bus."""
     for link, places in zip(links, asked, strict=True):
         for _, node in places:
             link.send(Frame(SDO_REQUEST + node, upload_request(entry)))

@@ -1,12 +1,10 @@
-"""Which frames an arm's drives and their host exchange: COB-IDs, contents, and when each is sent.
+"""Derive the frames between an arm's drives and their host: COB-IDs, contents, and when each is sent.
 
 The communication profile of WAM-style drives in cyclic synchronous torque mode: SYNC starts a cycle, each drive answers
 it with its position (TPDO1) and lets the torque of the frames before it act (RPDO1, synchronous). Up to four drives
 share a torque frame: in each of them the slots of the others are mapped to a dummy (CiA 301, 0003h), so that the
 mapped length is the frame's. Control words (RPDO2), status reports (TPDO2, on change), emergencies and heartbeats come
 as they must; SDOs flow before streaming only.
-
-Boundary: data about one bus, worked out once from the configuration. Bytes are `codec.py`, costs are `budget.py`.
 """
 
 from __future__ import annotations
@@ -49,13 +47,13 @@ GUARD_EARLY = 0.7  # of the guard time, after which a drive is asked again: ques
 
 
 def restricted(cob_id: int) -> bool:
-    """Whether CiA 301 keeps this COB-ID for itself."""
+    """Return whether CiA 301 reserves this COB-ID."""
     return any(low <= cob_id <= high for low, high in _RESTRICTED)
 
 
 @dataclass(frozen=True)
 class Write:
-    """One SDO download: the value of an entry, and the bits of it in which another value is as good."""
+    """Represent one SDO download: the value of an entry, and the bits in which another value is as good."""
 
     entry: Entry
     value: int
@@ -67,13 +65,13 @@ class Write:
 
     @property
     def data(self) -> bytes:
-        """The value's bytes."""
+        """Return the value's bytes."""
         return self.entry.pack(self.value)
 
 
 @dataclass(frozen=True)
 class TorqueFrame:
-    """A frame with the torques of some drives.
+    """Represent a frame with the torques of some drives.
 
     Attributes:
         cob_id: of the frame.
@@ -87,20 +85,20 @@ class TorqueFrame:
 
     @property
     def length(self) -> int:
-        """Bytes."""
+        """Return the frame's length [bytes]."""
         return 2 * len(self.drives)
 
 
 @dataclass(frozen=True)
 class Pdo:
-    """One PDO of one drive, as the drive has to be told.
+    """Represent one PDO of one drive as it is to be configured.
 
     Attributes:
         number: from 1.
         sent: by the drive (TPDO), else to it (RPDO).
         cob_id: of its frame.
         type: transmission type.
-        slots: what it maps, in order.
+        slots: entries that it maps, in order.
         inhibit: least time between two [100 us]; of TPDOs.
         timer: of a TPDO its event timer, of an RPDO its deadline [ms]; 0 for none.
     """
@@ -114,7 +112,10 @@ class Pdo:
     timer: int = 0
 
     def writes(self) -> list[Write]:
-        """What to write, in this order (CiA 301, 7.5.2.36): off, no mapping, mapping, type and times, on."""
+        """Return the downloads that configure the PDO, in order: off, no mapping, mapping, type and times, on.
+
+        The order is that of CiA 301, 7.5.2.36.
+        """
         clear, *mapping = self.mapping
         return [self.off, clear, *mapping, *self.parameters, self.on]
 
@@ -130,13 +131,13 @@ class Pdo:
 
     @property
     def mapping(self) -> list[Write]:
-        """No entries, the entries, their number."""
+        """Return the downloads of the mapping: no entries, the entries, their number."""
         slots = [Write(self._entry(3, sub), mapped.mapping) for sub, mapped in enumerate(self.slots, 1)]
         return [Write(self._entry(2), 0), *slots, Write(self._entry(2), len(self.slots))]
 
     @property
     def parameters(self) -> list[Write]:
-        """Type and times."""
+        """Return the downloads of transmission type and times."""
         todo = [Write(self._entry(1), self.type)]
         if self.sent and self.type == _ON_CHANGE:
             todo.append(Write(pdo_entry(od.TPDO_INHIBIT, self.number), self.inhibit))
@@ -144,7 +145,7 @@ class Pdo:
 
     @property
     def timing(self) -> Write:
-        """The timer, which may be left at 0 where the drive has none."""
+        """Return the download of the timer, which may be left at 0 where the drive has none."""
         return Write(self._entry(4), self.timer)
 
     def _entry(self, which: int, sub: int | None = None) -> Entry:
@@ -157,7 +158,7 @@ _TPDO = (od.TPDO_COB_ID, od.TPDO_TYPE, od.TPDO_COUNT, od.TPDO_MAPPING, od.TPDO_P
 
 @dataclass(frozen=True)
 class BusProfile:
-    """One bus of an arm.
+    """Describe the frames on one bus of an arm.
 
     Attributes:
         number: of the bus, from 0.
@@ -167,18 +168,18 @@ class BusProfile:
         drives: which of the arm's drives are on it, in the arm's order.
         nodes: the same drives as node numbers.
         notices: of each of them, emergency codes by which it only informs.
-        torque_frames: what carries their torques.
+        torque_frames: that carry their torques.
         heartbeat_host: period of the host's heartbeat [s].
         heartbeat_drives: period of each drive's [s].
         heartbeat_timeout: how long the host waits for a drive's [s].
         heartbeat_wait: how long drives wait for the host's whose watchdog it is [s]; None for as long.
-        watchdogs: of each drive, what it watches (`CanopenDrive.watchdog`).
+        watchdogs: of each drive, the signal that it watches (`CanopenDrive.watchdog`).
         guarding: guard time [s] and life time factor of drives that are guarded.
         torque_deadline: after which a drive without torque frames stops by itself [s].
         status_period: of a drive's status report without a change [s].
         status_inhibit: least time between two of them [s].
-        position_slots: what a drive tells at every SYNC.
-        status_slots: what its status report tells.
+        position_slots: entries that a drive sends at every SYNC.
+        status_slots: entries of its status report.
     """
 
     number: int
@@ -202,31 +203,31 @@ class BusProfile:
     heartbeat_wait: float | None = None
 
     def watchdog(self, node: int) -> WatchdogKind:
-        """Return what the watchdog of a drive watches."""
+        """Return the signal that a drive's watchdog watches."""
         return self.watchdogs[self.nodes.index(node)] if self.watchdogs else "rpdo_timer"
 
     @property
     def guarded(self) -> tuple[int, ...]:
-        """Nodes of the drives that are guarded."""
+        """Return the nodes of the drives that are guarded."""
         return tuple(node for node in self.nodes if self.watchdog(node) == "node_guarding")
 
     @property
     def fd(self) -> bool:
-        """Whether frames are those of CAN FD."""
+        """Return whether frames are those of CAN FD."""
         return self.bus.data_bitrate is not None
 
     @property
     def status_timeout(self) -> float:
-        """Return how long a drive's status report is waited for [s]: one may be lost, and the next be delayed."""
+        """Return how long to wait for a drive's status report [s]: one may be lost, and the next be delayed."""
         return _STATUS_PATIENCE * max(self.status_period, self.status_inhibit)
 
     @cached_property
     def position_ids(self) -> dict[int, int]:
-        """COB-ID of each drive's position to its node."""
+        """Return the node of each COB-ID of a position."""
         return {TPDO1 + node: node for node in self.nodes}
 
     def pdos(self, node: int) -> list[Pdo]:
-        """The PDOs of one drive; raises KeyError for a node that is not on this bus."""
+        """Return the PDOs of one drive; raises KeyError for a node that is not on this bus."""
         frame = next((frame for frame in self.torque_frames if node in frame.nodes), None)
         if frame is None:
             raise KeyError(node)
@@ -241,7 +242,7 @@ class BusProfile:
         ]
 
     def identifiers(self, node: int) -> list[Write]:
-        """Return the COB-IDs of SYNC and emergencies; where a drive lacks an entry, it is so by CiA 301."""
+        """Return the downloads of the COB-IDs of SYNC and emergencies; a drive that lacks an entry follows CiA 301."""
         return [
             Write(od.SYNC_COB_ID, SYNC, _NO_REMOTE),
             Write(od.EMERGENCY_COB_ID, EMERGENCY + node, _NO_REMOTE),
@@ -249,20 +250,20 @@ class BusProfile:
         ]
 
     def heartbeat(self, node: int) -> Write:
-        """How often a drive says that it lives; one that is guarded cannot (CiA 301, 7.2.8.3.1)."""
+        """Return the download of a drive's heartbeat period; a guarded drive cannot send one (CiA 301, 7.2.8.3.1)."""
         return Write(od.HEARTBEAT_PRODUCER, 0 if node in self.guarded else _whole(self.heartbeat_drives, 1e-3))
 
     @property
     def status_syncs(self) -> int:
-        """SYNCs from one status report to the next, of drives without a timer for it (1801h:05)."""
+        """Return the SYNCs from one status report to the next, of drives without a timer for it (1801h:05)."""
         return min(max(1, round(self.status_inhibit * self.rate)), _MOST_SYNCS)
 
     def watched(self, node: int) -> list[Write]:
-        """Return what makes the drive miss its host, by heartbeat and by guarding; torque frames are in `pdos`."""
+        """Return the downloads that make a drive supervise its host by heartbeat and guarding, not by torque frames."""
         own = self.heartbeat_wait if self.watchdog(node) == "heartbeat" else None  # of the others it is a second one
         wait = self.host << 16 | _whole(own or self.heartbeat_timeout, 1e-3)
         todo = [Write(od.HEARTBEAT_CONSUMER, wait)]
-        if self.watchdog(node) in ("heartbeat", "node_guarding"):  # or what it does then could not be heard
+        if self.watchdog(node) in ("heartbeat", "node_guarding"):  # or its reaction could not be received
             todo.append(Write(od.ERROR_BEHAVIOUR, _STAYS_OPERATIONAL))
         if node in self.guarded:
             period, factor = self.guarding
@@ -270,7 +271,7 @@ class BusProfile:
         return todo
 
     def silenced(self, node: int) -> list[Pdo]:
-        """The PDOs that this profile does not use, with COB-IDs that they have by default."""
+        """Return the PDOs that this profile does not use, with the COB-IDs that they have by default."""
         return [
             Pdo(number, sent, (TPDO1 if sent else RPDO1) + (number - 1) * 0x100 + node, _ON_RECEPTION, ())
             for number in _UNUSED
@@ -279,7 +280,7 @@ class BusProfile:
 
 
 def bus_profiles(driver: CanopenDriver, rate: float) -> list[BusProfile]:
-    """What flows on each bus of an arm.
+    """Return the profile of the frames on each bus of an arm.
 
     Args:
         driver: the arm's section `driver`.
@@ -328,5 +329,5 @@ def _nodes(drives: Sequence[CanopenDrive], chosen: Sequence[int]) -> tuple[int, 
 
 
 def _whole(seconds: float, unit: float) -> int:
-    """A time as a whole number of units, at least one and at most what 16 bits hold."""
+    """Convert a time to a whole number of units, at least one and at most what 16 bits hold."""
     return min(max(1, round(seconds / unit)), _MOST_16)

@@ -1,8 +1,8 @@
-"""Any interface of python-can as a Link; its interfaces differ, so what they promise is made sure of here.
+"""Implement a Link on any interface of python-can, and even out the differences between its interfaces.
 
 Stamps of python-can are seconds since 1970, of a controller's own clock, or missing; they are turned into monotonic
 time by their age, and replaced by the time of reception where that age cannot be. Its `udp_multicast` always hears its
-own frames: ours carry a mark that it hands through, by which they are told apart from a foreign frame of the same
+own frames: the link's carry a mark that it passes on, which distinguishes them from a foreign frame of the same
 content.
 """
 
@@ -35,7 +35,7 @@ _PLAUSIBLE_S = 1.0
 
 
 def from_config(config: ArmConfig, bus_number: int) -> PythonCanLink:
-    """The link of one bus of an arm; entry point `python_can`.
+    """Open the link of one bus of an arm; entry point `python_can`.
 
     Raises:
         BusError: no such interface, it is down or without the CAN FD asked for, or it cannot be opened.
@@ -86,7 +86,7 @@ def open_bus(bus: CanBus, **more: Any) -> can.BusABC:
 
 
 def bus_error(error: Exception, bus: CanBus, otherwise: Kind = "gone") -> BusError:
-    """What an error of python-can or of the system means, in our words and its own."""
+    """Convert an error of python-can or of the system to a BusError with a remedy."""
     code = getattr(error, "error_code", None) or getattr(error, "errno", None)
     if code is None and isinstance(error.__cause__, OSError):
         code = error.__cause__.errno
@@ -101,14 +101,14 @@ def _filters() -> list[dict[str, Any]]:
 
 
 class PythonCanLink:
-    """A Link on a bus of python-can; the thread that opened it is its only user."""
+    """Implement a Link on a bus of python-can; the thread that opened it is its only user."""
 
     def __init__(self, bus: can.BusABC, config: CanBus) -> None:
-        """Take a bus over.
+        """Use an open bus, and close it with the link.
 
         Args:
             bus: opened by `open_bus`; shut down with the link.
-            config: what it was opened from.
+            config: that it was opened from.
         """
         self.clock = RealClock()
         self._bus, self._config = bus, config
@@ -143,7 +143,7 @@ class PythonCanLink:
             raise self._failure(error) from error
 
     def receive(self, deadline_ns: int) -> Frame | None:
-        """The next frame, None when there is none until the deadline [ns of the clock].
+        """Return the next frame, None when there is none until the deadline [ns of the clock].
 
         Raises:
             BusError: interface down or gone.
@@ -157,7 +157,7 @@ class PythonCanLink:
                 return frame
 
     def drain(self) -> Sequence[Frame]:
-        """All frames that wait, at most `MOST_AT_ONCE`; returns at once.
+        """Return all frames that wait, at most `MOST_AT_ONCE`; does not wait.
 
         Raises:
             BusError: interface down or gone.
@@ -191,7 +191,7 @@ class PythonCanLink:
             raise self._failure(error) from error
 
     def _frame(self, message: can.Message) -> Frame | None:
-        """What was heard; None for our own frames and what is no frame of this bus."""
+        """Convert a message to a frame; None for the link's own frames."""
         if self._mark is not None and message.channel == self._mark:
             return None
         now, age = time.monotonic_ns(), time.time() - message.timestamp

@@ -1,7 +1,7 @@
-"""Interface `raw`: a CAN socket of the kernel, without python-can (Documentation/networking/can.rst).
+"""Implement a Link on a CAN socket of the kernel (interface `raw`, Documentation/networking/can.rst).
 
 One system call a frame. Stamps are the kernel's, taken when the frame arrived, turned from wall-clock to monotonic time
-by their age. Frames that the kernel dropped because nobody read them are told as an error frame of receive overflow.
+by their age. Frames that the kernel dropped are reported as an error frame of receive overflow.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ _SOL_CAN_RAW = 101
 _RAW_FILTER, _RAW_ERR_FILTER, _RAW_LOOPBACK, _RAW_RECV_OWN, _RAW_FD_FRAMES = 1, 2, 3, 4, 5
 _SO_TIMESTAMPNS, _SO_RXQ_OVFL = 35, 40
 _ALL_ERRORS = 0x1FFF_FFFF
-_RECEIVE_BUFFER = 1 << 20  # some hundred frames more than the default, while nobody reads
+_RECEIVE_BUFFER = 1 << 20  # some hundred frames more than the default, while the loop does not read
 _TIMESPEC, _COUNT = struct.Struct("@ll"), struct.Struct("=I")
 _ANCILLARY = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(_COUNT.size)
 _PLAUSIBLE_NS = 10_000_000_000  # a stamp older than this, or in the future, comes from a clock that was set
 
 
 def from_config(config: ArmConfig, bus_number: int) -> RawLink:
-    """The link of one bus of an arm; entry point `raw`.
+    """Open the link of one bus of an arm; entry point `raw`.
 
     Raises:
         BusError: the interface is missing, down, or without the CAN FD asked for, or this kernel has no CAN sockets.
@@ -55,11 +55,11 @@ def from_config(config: ArmConfig, bus_number: int) -> RawLink:
 
 
 def open_socket(channel: str, bitrate: int = 1_000_000, *, fd: bool = False) -> socket.socket:
-    """A CAN socket that hears all of CANopen, errors of the controller, and never its own frames.
+    """Open a CAN socket that receives all of CANopen and errors of the controller, but not its own frames.
 
     Args:
         channel: network interface, as `ip link` names it.
-        bitrate: for the remedy in messages only; whoever brings the interface up sets it.
+        bitrate: for the remedy in messages only; the interface is configured outside.
         fd: whether CAN FD frames may come and go.
 
     Raises:
@@ -94,10 +94,10 @@ def open_socket(channel: str, bitrate: int = 1_000_000, *, fd: bool = False) -> 
 
 
 class RawLink:
-    """A Link on a socket of kernel frames; the thread that opened it is its only user."""
+    """Implement a Link on a socket of kernel frames; the thread that opened it is its only user."""
 
     def __init__(self, sock: socket.socket, name: str, bitrate: int = 1_000_000, *, fd: bool = False) -> None:
-        """Take a socket over.
+        """Use a bound socket, and close it with the link.
 
         Args:
             sock: bound; closed with the link.
@@ -128,7 +128,7 @@ class RawLink:
             raise self._failure(error) from None
 
     def receive(self, deadline_ns: int) -> Frame | None:
-        """The next frame, None when there is none until the deadline [ns of the clock].
+        """Return the next frame, None when there is none until the deadline [ns of the clock].
 
         Raises:
             BusError: interface down or gone.
@@ -148,7 +148,7 @@ class RawLink:
                 raise self._failure(error) from None
 
     def drain(self) -> Sequence[Frame]:
-        """All frames that wait, at most `MOST_AT_ONCE`; returns at once.
+        """Return all frames that wait, at most `MOST_AT_ONCE`; does not wait.
 
         Raises:
             BusError: interface down or gone.

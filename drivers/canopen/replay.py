@@ -1,8 +1,8 @@
-"""A logged session played into a driver, in virtual time: what the drives said then, they say again.
+"""Replay a logged session to a driver, in virtual time: the logged answers of the drives are received again.
 
-What was heard after the k-th SYNC of the log is heard after the driver's k-th SYNC, as much later as it was then; what
-was heard before all SYNCs, so much after the first frame that was sent. So a driver that computes faster or slower than
-the logged one still meets every answer in its cycle.
+What was received after the k-th SYNC of the log is received after the driver's k-th SYNC, with the same delay; what
+came before all SYNCs, with its delay from the first frame that was sent. So a driver that computes faster or slower
+than the logged one still receives every answer in its cycle.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _LINE = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class LoggedFrame:
-    """One frame of a log: on which bus, whether we sent it, and when [ns after the first one]."""
+    """Represent one frame of a log: its bus, whether the host sent it, and the frame, stamped from the first one on."""
 
     bus: int
     sent: bool
@@ -39,7 +39,7 @@ class LoggedFrame:
 
 
 def read_session(path: Path | str) -> list[LoggedFrame]:
-    """All frames of a log, stamped from the first one on.
+    """Read all frames of a log, stamped from the first one on.
 
     Args:
         path: a `.log` of candump or of this package, an `.asc` or `.blf`.
@@ -119,15 +119,15 @@ def _read_other(path: Path) -> Iterator[LoggedFrame]:
 
 
 class ReplayLink:
-    """A Link that plays one bus of a log.
+    """Implement a Link that replays one bus of a log.
 
     Attributes:
-        sent: what the driver sent, stamped.
-        logged: what was sent in the log, to compare with.
+        sent: frames that the driver sent, stamped.
+        logged: frames that were sent in the log, to compare with.
     """
 
     def __init__(self, session: Sequence[LoggedFrame], bus: int = 0, clock: Clock | None = None) -> None:
-        """Rewind.
+        """Start before the log's first frame.
 
         Args:
             session: from `read_session`.
@@ -148,15 +148,15 @@ class ReplayLink:
                 passed += _marks(sent, logged.frame)
                 sent += 1
         self._next = 0
-        self._shift_ns = [self.clock.now_ns()]  # from the log's time to ours, by marks passed
+        self._shift_ns = [self.clock.now_ns()]  # from the log's time to the clock's, by marks passed
 
     @property
     def finished(self) -> bool:
-        """Whether everything that was heard has been heard again."""
+        """Return whether all received frames of the log have been replayed."""
         return self._next >= len(self._heard)
 
     def send(self, frame: Frame) -> None:
-        """Keep the frame; a SYNC releases the answers to it.
+        """Record the sent frame; a SYNC releases the answers to it.
 
         Raises:
             DriverError: a frame that cannot exist.
@@ -168,20 +168,20 @@ class ReplayLink:
         self.sent.append(frame._replace(stamp_ns=now))
 
     def receive(self, deadline_ns: int) -> Frame | None:
-        """The next frame of the log, None when none is due until the deadline [ns of the clock]."""
+        """Return the next frame of the log, None when none is due until the deadline [ns of the clock]."""
         frame = self._due(deadline_ns)
         self.clock.sleep_until_ns(deadline_ns if frame is None else frame.stamp_ns)
         return frame
 
     def drain(self) -> Sequence[Frame]:
-        """All frames that are due."""
+        """Return all frames that are due."""
         frames = []
         while (frame := self._due(self.clock.now_ns())) is not None:
             frames.append(frame)
         return frames
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Do nothing: the link holds no resource."""
 
     def _due(self, until_ns: int) -> Frame | None:
         if self.finished:
@@ -194,5 +194,5 @@ class ReplayLink:
 
 
 def _marks(number: int, frame: Frame) -> bool:
-    """Whether this frame, after so many others that were sent, tells how the log's time and ours go together."""
+    """Return whether this sent frame, counted from 0, aligns the log's time with the clock's."""
     return number == 0 or (frame.identifier == SYNC and not frame.extended)

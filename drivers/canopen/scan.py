@@ -1,9 +1,7 @@
-"""Who is on the buses of an arm: heartbeats overheard, then SDO uploads from every node number there is; nothing else.
+"""Scan the buses of an arm for nodes: heartbeats, then SDO uploads from every node number; nothing else is sent.
 
-No NMT command, no write: a scan changes nothing. It takes the buses for itself, and asks nobody while another host
-streams, whose frames it would delay.
-
-Boundary: what nodes say. Whether they are the configured ones is the service's to judge.
+No NMT command, no write: a scan changes nothing. It takes the buses for itself, and asks no node while another host
+streams, whose frames it would delay. Whether the nodes are the configured ones is judged elsewhere.
 """
 
 from __future__ import annotations
@@ -30,15 +28,15 @@ from ident_service.errors import DriverError
 
 T = TypeVar("T")
 NODES = range(1, 128)
-LISTEN = 1.0  # s: longest period of a heartbeat that is heard for sure
-PATIENCE = 0.05  # s for an answer, besides the time on the wire; those who are late are asked again with `TIMEOUT`
+LISTEN = 1.0  # s: longest period of a heartbeat that is received for sure
+PATIENCE = 0.05  # s for an answer, besides the time on the wire; late nodes are asked again with `TIMEOUT`
 _HISTORY = 8  # entries of 1003h that are read
 _SDO_BYTES = 8
 
 
 @dataclass
 class FoundNode:
-    """What one node says of itself; None for what it does not have.
+    """Describe one node by its heartbeat and uploads; None for what it does not have.
 
     Attributes:
         bus: number of its bus, from 0.
@@ -53,7 +51,7 @@ class FoundNode:
         history: 1003h, the latest first; the error code is in the lower 16 bits.
         status: 6041h, of drives.
         last_error: 603Fh, of drives.
-        unread: what could not be read, and why, in words.
+        unread: entries that could not be read, and why, in words.
     """
 
     bus: int
@@ -72,12 +70,12 @@ class FoundNode:
 
     @property
     def is_drive(self) -> bool:
-        """Whether it says that it is a drive of CiA 402."""
+        """Return whether the node says that it is a drive of CiA 402."""
         return self.device_type is not None and self.device_type & 0xFFFF == DRIVE_PROFILE
 
 
 def scan(config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_links) -> list[FoundNode]:
-    """Everybody who is heard or answers, by bus and node number.
+    """Return every node that sends heartbeats or answers, by bus and node number.
 
     Args:
         config: with a CANopen driver.
@@ -94,7 +92,7 @@ def scan(config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_l
 def asking(
     config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_links
 ) -> Iterator[tuple[CanopenDriver, list[Link], Overheard]]:
-    """Have the buses for oneself, to ask on; who is heard in a second has been heard then.
+    """Open the buses of an arm exclusively, to ask nodes on them, after a second of listening for heartbeats.
 
     Args:
         config: with a CANopen driver.
@@ -153,12 +151,12 @@ def _found(driver: CanopenDriver, links: list[Link], heard: Overheard) -> list[F
 
 
 def hearing(heard: Overheard, bus: int) -> Callable[[Frame], None]:
-    """Return what takes the frames of a bus that are no answers."""
+    """Return the function that takes the frames of a bus that are not answers."""
     return lambda frame: heard.take(bus, frame)
 
 
 def _read(node: FoundNode, objects: Objects) -> None:
-    """What a node says of itself; one that falls silent in the middle keeps what it has said."""
+    """Read identity, names and errors of a node; one that falls silent in the middle keeps what was read."""
 
     def tried(read: Callable[[], T]) -> T | None:
         try:

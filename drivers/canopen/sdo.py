@@ -1,8 +1,8 @@
-"""The configuration plane: one node's object dictionary over SDO, with the client of the canopen library.
+"""Read and write one node's object dictionary over SDO, with the client of the canopen library.
 
 The library listens in a thread and waits in real time. Here its client is given a network that hands each request to
 the link and receives until the reply has come, so that the same code configures drives over every link, in virtual
-time too, and no thread is left when streaming begins. What else is heard meanwhile goes to whoever decodes it.
+time too, and no thread is left when streaming begins. Other frames received meanwhile go to a given function.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ WRITE_ONLY = (0x06010001,)
 
 
 class SdoRefused(DriverError):
-    """A drive answered with an abort; `code` is that of CiA 301, table 22."""
+    """Report that a drive answered with an abort; `code` is that of CiA 301, table 22."""
 
     def __init__(self, message: str, code: int) -> None:
         super().__init__(message)
@@ -41,11 +41,11 @@ class SdoRefused(DriverError):
 
 
 class NotHeld(DriverError):
-    """An entry was set without an abort, and holds something else."""
+    """Report that an entry was set without an abort, but holds something else."""
 
 
 def optional(do: Callable[[Any], T], what: Any) -> T | None:
-    """Do something about an entry, and return what that gives; None where the drive has no such entry."""
+    """Return the result of an action on an entry; None where the drive has no such entry."""
     try:
         return do(what)
     except SdoRefused as refused:
@@ -55,10 +55,10 @@ def optional(do: Callable[[Any], T], what: Any) -> T | None:
 
 
 class Objects:
-    """The object dictionary of one node; usable while nothing streams."""
+    """Access the object dictionary of one node, while nothing streams."""
 
     def __init__(self, link: Link, node: int, others: Callable[[Frame], None] = lambda frame: None) -> None:
-        """Take the link, which stays the caller's.
+        """Use the given link, which stays the caller's.
 
         Args:
             link: of the node's bus.
@@ -89,16 +89,16 @@ class Objects:
             self._others(frame)
 
     def read_bytes(self, index: int, sub: int, name: str) -> bytes:
-        """What an entry holds, as bytes.
+        """Return the value of an entry as bytes.
 
         Raises:
-            SdoRefused: the drive says why not.
+            SdoRefused: the drive aborts the upload.
             DriverError: it does not answer, or the bus is gone.
         """
         return bytes(self._asked(f"reading {index:04X}h:{sub:02X} {name}", self._client.upload, index, sub))
 
     def read(self, entry: Entry) -> int:
-        """What an entry holds; raises as `read_bytes`, and DriverError for a value of another length."""
+        """Return the value of an entry; raises as `read_bytes`, and DriverError for a value of another length."""
         data = self.read_bytes(entry.index, entry.sub, entry.name)
         try:
             return entry.unpack(data)
@@ -112,7 +112,7 @@ class Objects:
         self._asked(what, self._client.download, entry.index, entry.sub, write.data)
 
     def holds(self, write: Write) -> bool:
-        """Tell whether an entry holds a value already; one that can only be written does not. Raises as `read`."""
+        """Return whether an entry holds a value already; one that can only be written does not. Raises as `read`."""
         try:
             return write.same(self.read(write.entry))
         except SdoRefused as refused:
@@ -121,8 +121,8 @@ class Objects:
             return False
 
     def ensure(self, write: Write) -> None:
-        """Have an entry hold a value: it is compared, written where it differs, and read back; raises as `set`."""
-        if not optional(self.holds, write):  # setting one that is missing says so
+        """Compare an entry with a value, write it where it differs, and read it back; raises as `set`."""
+        if not optional(self.holds, write):  # setting a missing entry raises the error
             self.set(write)
 
     def ensure_if_there(self, write: Write) -> None:

@@ -1,4 +1,4 @@
-"""Whether a frame can exist on a bus at all (ISO 11898-1): refused here, not by a drive that makes no sense of it."""
+"""Check that a frame can exist on a bus at all (ISO 11898-1), so that it is refused here and not by a drive."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ FD_LENGTHS: Final = frozenset((*range(9), 12, 16, 20, 24, 32, 48, 64))
 
 
 def check_sendable(frame: Frame, *, fd: bool) -> None:
-    """Refuse what no controller would send.
+    """Raise DriverError for a frame that no controller would send.
 
     Args:
         frame: to be sent.

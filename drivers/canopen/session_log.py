@@ -1,11 +1,9 @@
-"""Every frame of a session in a file that other tools read: candump's `.log`, Vector's `.asc` and `.blf`.
+"""Log every frame of a session to a file that other tools read: candump's `.log`, Vector's `.asc` and `.blf`.
 
 The file is written by a process of its own. A thread would be simpler, but it shares Python's interpreter lock: while
 it formats, the loop waits, at worst a switch interval of 5 ms. What the loop pays is appending to a list, and one
 system call per 16 frames, which never waits: what the process is too slow for is lost and counted. When this process is
 killed, the other one finishes the file.
-
-Boundary: the loop's side; `session_log_process.py` is the other one.
 """
 
 from __future__ import annotations
@@ -36,27 +34,27 @@ _FINISH_S: Final = 60.0
 
 @dataclass(frozen=True)
 class LogReport:
-    """How a log ended: frames in the file, frames that are not, and what went wrong, if anything."""
+    """Describe how a log ended: frames in the file, frames that are not, and what went wrong, if anything."""
 
     written: int
     lost: int
     error: str = ""
 
     def __str__(self) -> str:
-        """For people."""
+        """Return the report in words."""
         lost = f", {self.lost} LOST" if self.lost else ""
         return f"{self.written} frames{lost}" + (f"; {self.error}" if self.error else "")
 
 
 def require_format(path: Path | str) -> Path:
-    """The path of a log whose suffix names a format; raises DriverError for another one."""
+    """Return the path of a log whose suffix names a format; raises DriverError for another one."""
     if Path(path).suffix.lower() not in SUFFIXES:
         raise DriverError(f"{path}: a log of CAN frames ends in {', '.join(SUFFIXES)}")
     return Path(path)
 
 
 def logged_links(links: Sequence[Link], path: Path, fd: Sequence[bool]) -> tuple[SessionLog, list[Link]]:
-    """Open links whose frames go into a new file from now on, and its log, to be closed after them.
+    """Wrap open links so that their frames go into a new file; returns its log, to be closed after them, and the links.
 
     Args:
         links: of all buses.
@@ -76,7 +74,7 @@ def logged_links(links: Sequence[Link], path: Path, fd: Sequence[bool]) -> tuple
 
 
 class SessionLog:
-    """A log of one or several buses; a context manager.
+    """Write a log of one or several buses; a context manager.
 
     Attributes:
         path: of the file.
@@ -104,7 +102,7 @@ class SessionLog:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "drivers.canopen.session_log_process"],
                 stdin=theirs.fileno(),
-                stdout=subprocess.DEVNULL,  # ours may be a pipe whose end means that we are gone
+                stdout=subprocess.DEVNULL,  # this process' own may be a pipe whose end means that this process is gone
                 start_new_session=True,
             )
         request = {"path": str(self.path.absolute()), "utc_offset_ns": clock.utc_offset_ns}
@@ -117,7 +115,7 @@ class SessionLog:
         self._socket.settimeout(_FINISH_S if clock.lock_step else 0.0)
 
     def __enter__(self) -> Self:
-        """Nothing more to do."""
+        """Return this log."""
         return self
 
     def __exit__(
@@ -127,14 +125,14 @@ class SessionLog:
         self.close()
 
     def write(self, bus: int, frames: Sequence[tuple[Frame, bool]]) -> None:
-        """Give frames of one bus away, with whether each was sent; never waits."""
+        """Send frames of one bus, with whether each was sent, to the writing process; never waits."""
         try:
             self._socket.send(bytes((bus,)) + pack_frames(frames))
         except OSError:
             self.lost += len(frames)
 
     def link(self, link: Link, bus: int = 0, *, fd: bool = False) -> LoggedLink:
-        """A link whose frames are logged.
+        """Return a link whose frames are logged.
 
         Args:
             link: of the bus; closed with what is returned.
@@ -175,29 +173,29 @@ class SessionLog:
 
 
 class LoggedLink:
-    """A link whose frames go into a log as well; sent ones are stamped when they were handed over."""
+    """Log the frames of a link; sent ones are stamped when they were handed over."""
 
     def __init__(self, link: Link, log: SessionLog, bus: int, fd: bool) -> None:
-        """Take a link over."""
+        """Wrap a link."""
         self.clock = link.clock
         self._link, self._log, self._bus, self._fd = link, log, bus, fd
         self._held: list[tuple[Frame, bool]] = []
         self._since_ns = 0
 
     def send(self, frame: Frame) -> None:
-        """As the link's; what it refuses is not logged."""
+        """Send a frame over the link and log it; a frame that the link refuses is not logged."""
         self._link.send(frame)
         self._hold(frame._replace(stamp_ns=self.clock.now_ns(), fd=self._fd and not frame.remote), True)
 
     def receive(self, deadline_ns: int) -> Frame | None:
-        """As the link's."""
+        """Receive a frame from the link and log it."""
         frame = self._link.receive(deadline_ns)
         if frame is not None:
             self._hold(frame, False)
         return frame
 
     def drain(self) -> Sequence[Frame]:
-        """As the link's."""
+        """Drain the link and log its frames."""
         frames = self._link.drain()
         for frame in frames:
             self._hold(frame, False)

@@ -1,4 +1,4 @@
-"""The process that writes a session log: packets of frames on its standard input, a file of python-can's writers out.
+"""Write a session log in a process of its own: packets of frames come on standard input, python-can writes the file.
 
 Frames come in batches per bus, and a received one is stamped before it was read; they are put in the order of their
 stamps over half a second. The end of the input is the end of the file, whoever caused it.
@@ -35,7 +35,7 @@ class _Writer(Protocol):
 
 
 class CandumpWriter(CanutilsLogWriter):
-    """python-can's writer, but error frames keep what they tell, as `candump -L` writes them."""
+    """Write candump logs like python-can, but with the details of error frames, as `candump -L` writes them."""
 
     def on_message_received(self, msg: can.Message) -> None:
         """Write one frame."""
@@ -47,7 +47,7 @@ class CandumpWriter(CanutilsLogWriter):
 
 
 def message(frame: Frame, bus: int, sent: bool, utc_offset_ns: int) -> can.Message:
-    """A frame as python-can's writers take it."""
+    """Convert a frame to the message that python-can's writers take."""
     return can.Message(
         timestamp=(frame.stamp_ns + utc_offset_ns) * 1e-9,
         arbitration_id=frame.identifier,
@@ -63,7 +63,7 @@ def message(frame: Frame, bus: int, sent: bool, utc_offset_ns: int) -> can.Messa
 
 
 class OrderedLog:
-    """A file whose frames are in the order of their stamps.
+    """Write a file whose frames are in the order of their stamps.
 
     Attributes:
         written: frames in the file.
@@ -85,7 +85,7 @@ class OrderedLog:
         self.written = 0
 
     def add(self, bus: int, frames: list[tuple[Frame, bool]]) -> None:
-        """Take frames of one bus, and write what no earlier one can come before."""
+        """Add frames of one bus, and write those that no earlier frame can precede any more."""
         for frame, sent in frames:
             heapq.heappush(self._heap, (frame.stamp_ns, next(self._numbers), frame, bus, sent))
         newest = max(frame.stamp_ns for frame, _ in frames)
@@ -108,14 +108,14 @@ class OrderedLog:
 
 
 def main() -> int:
-    """Write one log; 0 when it is whole."""
+    """Write one log; returns 0 when it is complete."""
     _step_back()
     with socket.socket(fileno=sys.stdin.fileno()) as source:
         return _serve(source)
 
 
 def _step_back() -> None:
-    """Give up what the loop has got for itself and its children inherit: its priority and its core."""
+    """Give up the real-time priority and the core that children of the loop's process inherit."""
     with suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     with suppress(OSError):
@@ -152,7 +152,7 @@ def _serve(source: socket.socket) -> int:
 
 
 def _say(source: socket.socket, answer: dict[str, object]) -> None:
-    with suppress(OSError):  # whoever asked may be gone
+    with suppress(OSError):  # the session's process may be gone
         source.send(json.dumps(answer).encode())
 
 

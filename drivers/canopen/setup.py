@@ -1,4 +1,4 @@
-"""What every drive is told before anything moves: who it must be, what it protects by itself, which frames it speaks.
+"""Configure drives before anything moves: check their identity, their own protection, the frames they exchange.
 
 Everything is compared first, written where it differs, and read back (FIELDBUS.md 2.5; DRIVES.md 2 and 4). What a drive
 lacks of it was judged before (`capabilities.py`): what is indispensable has been refused, what may be missing is left
@@ -36,11 +36,11 @@ from ident_service.config.family import TorquePath
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import AnotherDrive, DriverError
 
-LIMIT_SLACK = 0.05  # rad or m beyond the joints' limits that the drives are told of
+LIMIT_SLACK = 0.05  # rad or m by which the drives' position limits exceed the joints'
 _FIRMWARE = 0x100A
 _COUNTS_PER_LINE = (1.0, 4.0)
 _GENTLER = 0.5  # of the wanted deceleration, that a drive's own may be: the ramp takes twice as long
-_MODE_PATIENCE, _MODE_AGAIN_NS = 5.0, 10_000_000  # s in all, ns between two looks
+_MODE_PATIENCE, _MODE_AGAIN_NS = 5.0, 10_000_000  # s in all, ns between two reads
 _ROUNDING = 1e-6
 _LETS_GO, _STAYS = 2, 6  # values of 605Ah: a ramp, then power off, or hold on
 IDENTITY = {"vendor": od.VENDOR, "product": od.PRODUCT, "revision": od.REVISION, "serial": od.SERIAL}
@@ -63,15 +63,15 @@ class MotorLimits:
 
 @dataclass(frozen=True)
 class Setup:
-    """One drive's part of the configuration.
+    """Hold one drive's part of the configuration.
 
     Attributes:
-        drive: its section.
+        drive: its section of the description.
         profile: of its bus.
-        reactions: to what it finds by itself.
+        reactions: to faults that the drive finds by itself.
         quick_stop: 605Ah, in place of what `reactions` leaves open.
-        motor: what the joints' limits mean for it.
-        can: what it can.
+        motor: the joints' limits converted to this motor.
+        can: its capabilities.
     """
 
     drive: CanopenDrive
@@ -84,7 +84,7 @@ class Setup:
 
     @property
     def torque(self) -> TorquePath:
-        """Return how its torques are streamed."""
+        """Return how torques are streamed to the drive."""
         assert self.can.torque is not None  # noqa: S101 - else it has been refused
         return self.can.torque
 
@@ -94,13 +94,13 @@ class Setup:
         return torque_limit_counts(self.drive.max_torque, self.drive.rated_torque)
 
     def watchdog(self) -> list[Write]:
-        """Return what sets a watchdog of the maker's."""
+        """Return the downloads that set a watchdog of the maker's."""
         if (own := self.drive.watchdog_entry) is None:
             return []
         return [Write(Entry(own.index, own.sub, Kind[own.type.upper()], "watchdog of the drive's maker"), own.value)]
 
     def options(self) -> list[Write]:
-        """Return the reactions, for drives that let them be chosen."""
+        """Return the downloads of the reactions, for drives that let them be chosen."""
         return [
             Write(od.QUICK_STOP_OPTION, self.quick_stop),
             Write(od.FAULT_OPTION, self.reactions.fault),
@@ -108,7 +108,7 @@ class Setup:
         ]
 
     def hints(self) -> list[Write]:
-        """Return the cycle and the position limits, for drives that want to know them.
+        """Return the downloads of the cycle and the position limits, for drives that want to know them.
 
         They protect nothing: drives in torque mode give torque beyond the position limits.
         """
@@ -126,7 +126,7 @@ class Setup:
         return round(1e6 / self.profile.rate)
 
     def pdos(self) -> list[Pdo]:
-        """Return the PDOs that the drive shall have; without a timer it tells its status at every n-th SYNC."""
+        """Return the PDOs that the drive shall have; without a timer it reports its status at every n-th SYNC."""
         target = entry_of(self.torque.target, "target torque", "counts")
         found = []
         for pdo in self.profile.pdos(self.drive.node):
@@ -138,7 +138,7 @@ class Setup:
 
 
 def motor_limits(config: ArmConfig, found: Coordinates) -> list[MotorLimits]:
-    """Return what the limits of an arm's joints mean for each of its motors.
+    """Convert the limits of an arm's joints to each of its motors.
 
     Args:
         config: with a CANopen driver and a transmission.
@@ -155,14 +155,14 @@ def motor_limits(config: ArmConfig, found: Coordinates) -> list[MotorLimits]:
 
 
 def watchdogs_of(driver: CanopenDriver, names: Sequence[str]) -> tuple[Watchdog, ...]:
-    """Return what the watchdog of each drive watches; `names` are what people call the drives."""
+    """Return the watchdog of each drive; `names` are what people call the drives."""
     found, of_torque = zip(names, driver.drives, strict=True), ("rpdo_timer", "vendor")
     seconds = driver.watchdog_seconds
     return tuple(Watchdog(name, one.watchdog, seconds(one), one.watchdog in of_torque) for name, one in found)
 
 
 def differences(found: Mapping[str, int], wanted: DriveIdentity) -> list[str]:
-    """What of an identity (1018h), by the keys of `IDENTITY`, is another than the configuration wants; in words."""
+    """Describe how an identity (1018h), by the keys of `IDENTITY`, differs from the configured one; else empty."""
     return [
         f"{name} is {found[name]:08X}h instead of {value:08X}h" if name in found else f"{name} is not told"
         for name, value in wanted.model_dump(exclude_none=True).items()
@@ -171,7 +171,7 @@ def differences(found: Mapping[str, int], wanted: DriveIdentity) -> list[str]:
 
 
 def quick_stop_option(config: ArmConfig) -> int:
-    """Return what 605Ah is set to: as described, else to stay in quick stop where the arm has no brakes."""
+    """Return the value for 605Ah: as described, else to stay in quick stop where the arm has no brakes."""
     assert isinstance(config.driver, CanopenDriver)  # noqa: S101 - of an arm of CANopen drives
     described = config.driver.reactions.quick_stop
     if described is not None:
@@ -180,7 +180,7 @@ def quick_stop_option(config: ArmConfig) -> int:
 
 
 def identify(objects: Objects, wanted: DriveIdentity) -> str:
-    """Ask a drive who it is.
+    """Read the identity of a drive and compare it with the wanted one.
 
     Returns:
         `node 3: vendor 0000019Eh, product ..., revision ..., serial ..., firmware ...`.
@@ -209,10 +209,10 @@ def identify(objects: Objects, wanted: DriveIdentity) -> str:
 
 
 def configure(objects: Objects, setup: Setup) -> int:
-    """Make a pre-operational drive speak the profile and protect itself; what it has already is not written.
+    """Configure a pre-operational drive for the profile and its own protection; what it has already is not written.
 
     Returns:
-        What 6060h is, which is sent with every control word.
+        The mode of operation (6060h), which is sent with every control word.
 
     Raises:
         DriverError: it lacks, refuses or forgets something; the message names the entry and says why.
@@ -228,7 +228,7 @@ def configure(objects: Objects, setup: Setup) -> int:
     for write in setup.options():
         objects.ensure_if_there(write)
     objects.ensure(setup.profile.heartbeat(setup.drive.node))
-    # What makes it miss its host comes last: from then on somebody must be there.
+    # Supervision of the host comes last: from then on the host must be present.
     spare = (od.ERROR_BEHAVIOUR, *(() if setup.drive.watchdog == "heartbeat" else (od.HEARTBEAT_CONSUMER,)))
     for write in setup.profile.watched(setup.drive.node):
         (objects.ensure_if_there if write.entry in spare else objects.ensure)(write)
@@ -242,7 +242,7 @@ def configure(objects: Objects, setup: Setup) -> int:
 
 
 def _timing(objects: Objects, setup: Setup) -> None:
-    """Have SYNC be without counter and window; 1019h is only written while 1006h is 0 (CiA 301, 7.5.2.22)."""
+    """Configure SYNC without counter and window; 1019h is only written while 1006h is 0 (CiA 301, 7.5.2.22)."""
     for write in setup.profile.identifiers(setup.drive.node):
         objects.ensure_if_there(write)
     counter = Write(od.SYNC_OVERFLOW, 0)
@@ -272,7 +272,7 @@ def _largest_torque(objects: Objects, setup: Setup) -> None:
 
 
 def _mode(objects: Objects, setup: Setup) -> None:
-    """Set the mode of operation, and wait until it is in effect: drives may take their time to say so."""
+    """Set the mode of operation, and wait until the drive reports it, which may take some time."""
     by, clock = setup.torque.by, objects.clock
     entry, display = (od.MODE, od.MODE_DISPLAY) if by is None else map(_mode_entry, (by.entry, by.display))
     if not objects.holds(wanted := Write(entry, setup.torque.mode)):
@@ -290,10 +290,10 @@ def _mode_entry(text: str) -> Entry:
 
 
 def released(objects: Objects, zeros: Zeros | None, number: int, restarted: Callable[[], bool]) -> Iterator[None]:
-    """Let a drive that is off forget that a host will be missed; one that is not shall miss it, and stop.
+    """Disable the supervision of the host in a drive that is off; one that is not shall miss the host, and stop.
 
-    It comes in steps of a few frames each, for cycles between them. What a drive vouches for (`zero.py`) it vouches for
-    afterwards too, and nothing else: one that restarted in the session has lost its zero.
+    It comes in steps of a few frames each, for cycles between them. A zero that the drive has confirmed (`zero.py`) it
+    confirms afterwards too, and nothing else: one that restarted in the session has lost its zero.
 
     Args:
         objects: of the drive.
@@ -319,7 +319,7 @@ def released(objects: Objects, zeros: Zeros | None, number: int, restarted: Call
 
 
 def _encoder(objects: Objects, drive: CanopenDrive) -> None:
-    """Compare the described counts of a motor turn with those that the drive's own scaling says, where it has them.
+    """Compare the described counts of a motor turn with the drive's own scaling, where it has one.
 
     A drive with a gear ratio of its own (6091h) tells positions in another unit. Some give the lines of an encoder, of
     which each has four counts.
@@ -338,7 +338,7 @@ def _encoder(objects: Objects, drive: CanopenDrive) -> None:
 
 
 def _rated_torque(objects: Objects, setup: Setup) -> None:
-    """Set what a thousandth is of where the family lets it be set, or make sure that it is so where it does not."""
+    """Set the rated torque where the family lets it be set, or check that the drive's own is the described one."""
     unit, rated = setup.can.family.unit, setup.drive.rated_torque
     if unit is None or unit.rated is None or not unit.writable:
         return  # compared already
@@ -359,7 +359,7 @@ def _rated_torque(objects: Objects, setup: Setup) -> None:
 
 
 def _max_speed(objects: Objects, setup: Setup) -> None:
-    """Set the motor's largest speed, or make sure that the drive's own leaves the joints their velocities.
+    """Set the motor's largest speed, or check that the drive's own leaves the joints their velocities.
 
     Above it a drive takes its torque back, in the middle of a motion.
     """
@@ -380,7 +380,7 @@ def _max_speed(objects: Objects, setup: Setup) -> None:
 
 
 def _deceleration(objects: Objects, setup: Setup) -> None:
-    """Set the deceleration of quick stops (6085h), where a drive has one; it may have a better one of its own."""
+    """Set the deceleration of quick stops (6085h), where a drive has it; a sufficient one of its own may stay."""
     if setup.motor.deceleration is None:
         return
     wanted = Write(od.QUICK_STOP_DECELERATION, setup.motor.deceleration)

@@ -1,4 +1,4 @@
-"""Stop commands: to each drive by itself, and again until its link has taken them.
+"""Send stop commands to each drive by itself, and again until its link has taken them.
 
 A transmit queue that is full for a moment, or one bus of two that has failed, must not lose the stop of any drive. The
 drives' own deadline for torque frames comes before the last try, so that nobody waits for this.
@@ -15,12 +15,12 @@ from drivers.canopen.words import DISABLE_VOLTAGE, QUICK_STOP, DriveState
 
 _TRIES, _AGAIN = 75, 0.001  # s between them
 _BRAKING = 1.0  # s that drives may take for a quick stop before the arm is left to them
-_FAREWELL = 5  # cycles after the last control words, in which drives say that they are off
+_FAREWELL = 5  # cycles after the last control words, in which drives report that they are off
 _ENDING = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP, DriveState.FAULT_REACTION)
 
 
 class StopCommand:
-    """The last stop, and the drives that have not been told of it; nothing of it raises.
+    """Hold the last stop command, and the drives that it could not be sent to yet; no method raises.
 
     Attributes:
         braking: whether it is a quick stop.
@@ -31,7 +31,7 @@ class StopCommand:
         self._untold: list[int] = []
 
     def give(self, buses: Buses, kind: StopKind) -> None:
-        """Tell every drive; for 75 ms again those that cannot be told."""
+        """Send the stop to every drive; for 75 ms again to those whose link has not taken it."""
         self.braking = kind is StopKind.QUICK_STOP
         self._untold = list(range(len(buses.drives)))
         for _ in range(_TRIES):
@@ -42,7 +42,7 @@ class StopCommand:
                 buses.clock.sleep_until_ns(buses.clock.now_ns() + round(_AGAIN * 1e9))
 
     def repeat(self, buses: Buses) -> None:
-        """Try once more to tell the drives that have not been told."""
+        """Send the stop once more to the drives whose link has not taken it."""
         word, drives, self._untold = QUICK_STOP if self.braking else DISABLE_VOLTAGE, self._untold, []
         for number in drives:
             try:
@@ -51,7 +51,7 @@ class StopCommand:
                 self._untold.append(number)
 
     def counts(self, zero: Sequence[int]) -> Sequence[int] | None:
-        """Return what torque frames carry: zero, or None for no such frames before all drives were told to brake.
+        """Return the torques to send: zero, or None for no torque frames before all drives were told to brake.
 
         By zero torque alone an arm without brakes would fall.
 
@@ -61,7 +61,7 @@ class StopCommand:
         return None if self.braking and self._untold else zero
 
     def see_through(self, buses: Buses, zero: Sequence[int] | None, period_ns: int) -> None:
-        """Cycle until the drives say that they are off, or have had their time; a lost command is given again.
+        """Cycle until the drives report that they are off, or have had their time; a lost command is sent again.
 
         Args:
             buses: open.

@@ -1,7 +1,6 @@
-"""What codes on the bus mean, in words: emergencies, SDO aborts, drive states, NMT states, error registers.
+"""Translate codes on the bus to words: emergencies, SDO aborts, drive states, NMT states, error registers.
 
-Tables of CiA 301 (EMCY 7.2.7, SDO 7.2.4.3.17, NMT 7.3.2) and CiA 402-2 (states and commands 8.2 to 8.4). Boundary:
-data, and the look-ups into it; nothing here knows a bus.
+Tables of CiA 301 (EMCY 7.2.7, SDO 7.2.4.3.17, NMT 7.3.2) and CiA 402-2 (states and commands 8.2 to 8.4).
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from drivers.status import AxisStatus
 
 
 class NmtState(IntEnum):
-    """What a heartbeat says of its node."""
+    """Name the NMT states of a node, as heartbeats carry them."""
 
     BOOT_UP = 0
     STOPPED = 4
@@ -22,7 +21,7 @@ class NmtState(IntEnum):
 
 
 class NmtCommand(IntEnum):
-    """What a node can be told (COB-ID 000h)."""
+    """Name the NMT commands (COB-ID 000h)."""
 
     START = 1
     STOP = 2
@@ -32,7 +31,7 @@ class NmtCommand(IntEnum):
 
 
 class DriveState(Enum):
-    """States of CiA 402 as mask and value of the status word; the first that fits."""
+    """Name the states of CiA 402 as mask and value of the status word; the first that fits counts."""
 
     NOT_READY = (0x4F, 0x00)
     SWITCH_ON_DISABLED = (0x4F, 0x40)
@@ -142,14 +141,14 @@ EMERGENCIES: dict[int, str] = {
     0xFF00: "specific to the device",
 }
 
-# In quick stop the drive brakes by itself, and no torque of ours acts.
+# In quick stop the drive brakes by itself, and no torque of the host acts.
 _AXIS_STATUS: dict[DriveState, AxisStatus] = {
     DriveState.OPERATION_ENABLED: AxisStatus.POWERED,
     DriveState.QUICK_STOP: AxisStatus.IDLE,
     DriveState.FAULT_REACTION: AxisStatus.FAULT,
     DriveState.FAULT: AxisStatus.FAULT,
 }
-_WATCHDOGS = (0x8130, 0x8250, 0x8700)  # we fell silent: no heartbeat or question, no torque frame, no SYNC
+_WATCHDOGS = (0x8130, 0x8250, 0x8700)  # the host fell silent: no heartbeat or question, no torque frame, no SYNC
 
 # Bits of object 1001h, from the lowest.
 ERROR_REGISTER = ("generic", "current", "voltage", "temperature", "communication", "profile", "reserved", "vendor")
@@ -190,7 +189,7 @@ ABORTS: dict[int, str] = {
 
 
 def state_of(status: int) -> DriveState:
-    """The state that a status word (6041h) tells."""
+    """Return the state of CiA 402 that a status word (6041h) has."""
     for state in DriveState:
         mask, value = state.value
         if status & mask == value:
@@ -199,7 +198,7 @@ def state_of(status: int) -> DriveState:
 
 
 def axis_status(status: int, emergency: int = 0) -> AxisStatus:
-    """What a drive says, in the words of all fieldbuses; neither object tells of an emergency stop.
+    """Convert a drive's status to the flags common to all fieldbuses; neither object tells of an emergency stop.
 
     Args:
         status: the status word.
@@ -210,7 +209,7 @@ def axis_status(status: int, emergency: int = 0) -> AxisStatus:
 
 
 def joint_status(drives: Iterable[AxisStatus]) -> AxisStatus:
-    """Of a joint that some drives move: powered when all of them are, in trouble when one of them is."""
+    """Combine the status of the drives that move a joint: powered if all of them are, in trouble if one of them is."""
     powered, trouble = True, AxisStatus(0)
     for word in drives:
         powered = powered and bool(word & AxisStatus.POWERED)
@@ -219,7 +218,7 @@ def joint_status(drives: Iterable[AxisStatus]) -> AxisStatus:
 
 
 def emergency_words(code: int, register: int = 0, vendor: bytes = b"") -> str:
-    """An emergency for people: `8250h RPDO timeout: no torque frame came in time (error register: communication)`."""
+    """Describe an emergency: `8250h RPDO timeout: no torque frame came in time (error register: communication)`."""
     name = EMERGENCIES.get(code)
     if name is None:
         # Unknown members of a known group, else of a known class.
@@ -232,12 +231,12 @@ def emergency_words(code: int, register: int = 0, vendor: bytes = b"") -> str:
 
 
 def register_words(register: int) -> str:
-    """An error register (1001h) for people: `generic, communication`."""
+    """Describe an error register (1001h): `generic, communication`."""
     return ", ".join(bit for place, bit in enumerate(ERROR_REGISTER) if register >> place & 1)
 
 
 def drive_words(status: int, emergency: int = 0) -> str:
-    """A status word (6041h) for people: `fault, warning (8130h life guard or heartbeat)`.
+    """Describe a status word (6041h): `fault, warning (8130h life guard or heartbeat)`.
 
     Args:
         status: the word.
@@ -249,12 +248,12 @@ def drive_words(status: int, emergency: int = 0) -> str:
 
 
 def abort_words(code: int) -> str:
-    """An SDO abort code for people: `06090031h value too high`."""
+    """Describe an SDO abort code: `06090031h value too high`."""
     return f"{code:08X}h {ABORTS.get(code, 'unknown abort code')}"
 
 
 def nmt_words(state: int) -> str:
-    """What a heartbeat says, for people."""
+    """Describe the NMT state of a heartbeat."""
     try:
         return NmtState(state).name.lower().replace("_", "-")
     except ValueError:

@@ -1,15 +1,13 @@
-"""Where the zero of an arm lives whose encoders count from where they were when power came (`zero: at_home`).
+"""Store the zero of an arm in its drives, whose encoders count from where they were at power-up (`zero: at_home`).
 
-It lives in the drives, where it is lost together with the count that it is about; no file of a host can be out of date.
-Object 1020h (CiA 301, verify configuration) is two numbers that a host may keep in a drive:
+There it is lost together with the count that it is about; no file of a host can be out of date. Object 1020h (CiA 301,
+verify configuration) is two numbers that a host may store in a drive:
 
     sub 1   6064h of this motor while the joints stood at the home of the arm's description, as 32 bits
     sub 2   CRC-32 of these counts and of all that their meaning depends on; never 0, which a drive has after power-up
 
 A description with another home, gear or encoder has another mark, so that what was zeroed with the old one is void. It
-is never stored (1010h): a drive that had it back after power-up would vouch for a count that is gone.
-
-Boundary: objects of single drives. When a person may say where the arm stands is `zeroing.py`'s.
+is never stored (1010h): a drive that had it back after power-up would confirm a count that is gone.
 """
 
 from __future__ import annotations
@@ -32,14 +30,14 @@ _STORES_BY_ITSELF = 1 << 1  # of 1010h
 
 
 class Zeros:
-    """The zeros of all drives of one arm.
+    """Hold the zeros of all drives of one arm.
 
     Attributes:
-        home: the posture that they are about [rad or m], shape (joints,), read-only.
+        home: the posture to which the zeros belong [rad or m], shape (joints,), read-only.
     """
 
     def __init__(self, config: ArmConfig) -> None:
-        """Take the description of an arm with `zero: at_home`.
+        """Use the description of an arm with `zero: at_home`.
 
         Raises:
             DriverError: its encoders need no zero, or the description has no posture to say it in.
@@ -61,11 +59,11 @@ class Zeros:
         ]
 
     def mark(self, number: int, counts: int) -> int:
-        """What 1020h:02 of a drive is when it holds these counts at home."""
+        """Return the value of 1020h:02 that marks these counts of a drive as its counts at home."""
         return zlib.crc32(repr((_WHOSE, self._about[number], counts)).encode()) or 1
 
     def held(self, objects: Objects, number: int) -> int | None:
-        """The counts at home that a drive vouches for, signed; None where it does not. Raises as `Objects.read`."""
+        """Return the counts at home that a drive confirms, signed; None where it does not. Raises as `Objects.read`."""
         try:
             mark = objects.read(od.ZERO_MARK)
             counts = signed(objects.read(od.ZERO_COUNTS)) if mark else 0
@@ -76,12 +74,12 @@ class Zeros:
         return counts if mark == self.mark(number, counts) and mark else None
 
     def keep(self, objects: Objects, number: int, counts: int) -> None:
-        """Have a drive vouch for these counts at home, and read it back; raises as `Objects.set`."""
+        """Store these counts at home in a drive, and read them back; raises as `Objects.set`."""
         objects.set(Write(od.ZERO_COUNTS, counts & 0xFFFF_FFFF))
         objects.set(Write(od.ZERO_MARK, self.mark(number, counts)))
 
     def keep_on(self, objects: Objects, number: int, counts: int, restarted: Callable[[], bool]) -> bool:
-        """Have a drive vouch again for what it vouched for before it was configured, unless it has restarted since.
+        """Store again the counts that a drive confirmed before it was configured, unless it has restarted since.
 
         Args:
             objects: of the drive.
@@ -90,7 +88,7 @@ class Zeros:
             restarted: whether it has sent a boot-up message; asked before, and when its answers have been heard.
 
         Returns:
-            Whether it vouches for them; otherwise it vouches for nothing.
+            Whether the drive confirms them; otherwise its mark has been deleted.
 
         Raises:
             DriverError: as `Objects.set`.
@@ -103,11 +101,11 @@ class Zeros:
         return False
 
     def forget(self, objects: Objects) -> None:
-        """Have a drive vouch for nothing, and read it back; raises as `Objects.set`."""
+        """Delete the mark in a drive, so that it confirms nothing, and read it back; raises as `Objects.set`."""
         objects.set(Write(od.ZERO_MARK, 0))
 
     def require_kept(self, objects: Objects) -> None:
-        """Make sure that a drive can hold a zero, and loses it with its power.
+        """Check that a drive can hold a zero, and loses it with its power.
 
         Raises:
             DriverError: it has no object 1020h, or stores parameters by itself.
@@ -132,13 +130,13 @@ class Zeros:
             )
 
     def all_of(self, held: Sequence[int | None]) -> list[int]:
-        """The counts at home of all drives.
+        """Return the counts at home of all drives.
 
         Args:
-            held: what each of them vouches for.
+            held: counts that each of them confirms.
 
         Raises:
-            PositionUnknown: some vouch for nothing; the message names them and says what to do.
+            PositionUnknown: some confirm nothing; the message names them and says what to do.
         """
         lost = [about[1] for about, counts in zip(self._about, held, strict=True) if counts is None]
         if lost:
@@ -146,7 +144,7 @@ class Zeros:
         return [counts for counts in held if counts is not None]
 
     def lost(self, nodes: Sequence[int]) -> str:
-        """What to say of drives that vouch for nothing."""
+        """Describe that drives have no zero, and what to do about it."""
         return (
             f"drives {', '.join(map(str, sorted(nodes)))} do not know where the arm stands: their encoders count from "
             "where they were when power came, and nobody has zeroed them since (with this description); lead the arm "
@@ -155,6 +153,6 @@ class Zeros:
 
 
 def zeros_of(config: ArmConfig) -> Zeros | None:
-    """The zeros of an arm whose encoders need them, else None; raises as `Zeros`."""
+    """Return the zeros of an arm whose encoders need them, else None; raises as `Zeros`."""
     needed = isinstance(config.driver, CanopenDriver) and config.driver.zero == "at_home"
     return Zeros(config) if needed else None

@@ -1,4 +1,4 @@
-"""Zeroing: a person has led the arm to the home of its description, and each drive keeps the counts that it is at.
+"""Set the zero of drives: a person has led the arm to its described home, and each drive stores its counts there.
 
 Nothing is energised, nothing moves, and of the drives' objects only 1020h is written. All marks are taken away before
 the first new one is set, and again when anything fails: drives that were zeroed at different times must never look as
@@ -21,25 +21,25 @@ from drivers.canopen.words import DriveState, drive_words, state_of
 from drivers.canopen.zero import Zeros
 from ident_service.errors import DriverError
 
-APART = 0.5  # s between two looks at a standing arm
-STILL = 0.005  # rad or m that an arm in somebody's hands may stir in between
+APART = 0.5  # s between two readings of a standing arm
+STILL = 0.005  # rad or m that an arm held by hand may move in between
 _OFF = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
 
 
 class ZeroingArm(LookingArm):
-    """Drives that are looked at, whether they have a zero or not, until `take_home`."""
+    """Observe drives, whether they have a zero or not, until `take_home`."""
 
     def _find_zero(self) -> None:
-        """Nothing: whatever zero they have is about to be replaced."""
+        """Do nothing: whatever zero the drives have is about to be replaced."""
 
     def _require_no_restart(self) -> None:
-        """Nothing, before the counts are taken."""
+        """Do nothing before the counts are taken."""
 
     def take_home(self) -> tuple[str, ...]:
-        """Let every drive keep the counts that it is at now.
+        """Store in every drive its present counts as those at home.
 
         Returns:
-            What each drive says of itself.
+            The state of each drive in words.
 
         Raises:
             DriverError: not open, an arm without `zero: at_home`, a drive that does not answer, is powered, or cannot
@@ -82,7 +82,7 @@ class ZeroingArm(LookingArm):
             raise DriverError(f"drives {_nodes(restarted)} restarted meanwhile")
 
     def _taken_back(self, zeros: Zeros) -> list[str]:
-        """All marks taken away; nodes that could not be told."""
+        """Delete all marks; returns the nodes in which that failed."""
         left = []
         for number, (_, node) in enumerate(self._places):
             try:
@@ -92,7 +92,7 @@ class ZeroingArm(LookingArm):
         return left
 
     def _require_off(self) -> tuple[str, ...]:
-        """What all drives say; raises DriverError unless each of them is off."""
+        """Return the states of all drives in words; raises DriverError unless each of them is off."""
         status, codes = self._all(od.STATUS_WORD), self._all(od.LAST_EMERGENCY, needed=False)
         if on := [place for place, word in status.items() if state_of(word) not in _OFF]:
             states = "; ".join(f"node {node}: {drive_words(status[bus, node])}" for bus, node in on)
@@ -121,7 +121,7 @@ class ZeroingArm(LookingArm):
         return [counts[place] for place in self._places]
 
     def _all(self, entry: od.Entry, *, needed: bool = True) -> dict[Place, int]:
-        """One entry of all drives; raises DriverError where it is needed and one does not answer."""
+        """Read one entry of all drives; raises DriverError where it is needed and a drive does not answer."""
         answers = self._ask(self._places, entry, self.clock.now_ns() + round(TIMEOUT * 1e9))
         if needed and (missing := set(self._places) - answers.values.keys()):
             raise DriverError(f"no answer of drives {_nodes(missing)}; check power and cable (`ident bus scan`)")

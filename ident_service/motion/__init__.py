@@ -1,1 +1,1 @@
-"""Motion: references, control, guard and states; the loop between the mathematics and the arm."""
+"""Move arms: reference trajectories, control law, safety guard, state machine and the control loop."""

@@ -1,7 +1,7 @@
 """Choose how a stopped arm is secured: its brakes hold it, the loop holds it, or it is lowered.
 
 Joints are asked by their weight: one whose gravity torque, by the prior model, is above `WEIGHS` of its torque limit in
-some posture falls when its drive lets go, unless it has a brake.
+some posture falls when its drive is switched off, unless it has a brake.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from ident_service.errors import MotionRefused
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.rigid_body import InverseDynamics
 
-WEIGHS: Final = 1e-3  # of a torque limit: less than the friction of any drive that gives this torque
+WEIGHS: Final = 1e-3  # of a torque limit; every drive that reaches this torque has more friction than that
 _POSTURES, _SEED = 64, 1
-# Faults after whose stop a held arm may be led home: what was wrong is neither with the arm nor with its drives.
+# Faults after whose stop a held arm may be led home: they concern neither the arm nor its drives.
 HOME_AFTER: Final = frozenset({"lease_lost", "recorder_behind", "no_way_back", "late_cycles", "controls_failed"})
 
 
@@ -31,7 +31,7 @@ class AfterStop(Enum):
 
 
 def falling_joints(model: ArmModel, limits: MotionLimits) -> tuple[str, ...]:
-    """Names of the joints that gravity moves when their drives let go, with or without a brake.
+    """Return the names of the joints that gravity moves when their drives are off, with or without a brake.
 
     Args:
         model: with prior parameters.
@@ -50,7 +50,7 @@ def falling_joints(model: ArmModel, limits: MotionLimits) -> tuple[str, ...]:
 
 
 def after_stop(model: ArmModel, limits: MotionLimits) -> AfterStop:
-    """Say what follows a stop of this arm.
+    """Return how this arm is secured after a stop: braked, held or lowered.
 
     Args:
         model: with prior parameters.

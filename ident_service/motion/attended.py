@@ -1,8 +1,8 @@
-"""An open arm that is not left alone while something else takes its time.
+"""Exchange cycles without torque while the caller blocks, so that drives do not report a lost host.
 
-Drives take a host that falls silent for a dead one, and rightly let go or stop. So whoever plans, checks or asks a
-person with an arm open lets cycles go on meanwhile, without torque. In virtual time nobody waits, and the work is
-simply done. With the torque on nothing else is done at all: the loop's thread would have to share the interpreter.
+Drives treat a host that falls silent as dead and disable themselves or stop. So code that plans, checks or asks a
+person while an arm is open lets cycles without torque go on meanwhile. In virtual time no drive waits, and the block
+just runs. With torque on nothing else is done at all: the loop's thread would have to share the interpreter.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _FIRST_COME = (os.SCHED_FIFO, os.SCHED_RR)  # threads of one priority let each o
 
 @contextmanager
 def attended(arm: Arm) -> Iterator[None]:
-    """Cycles without torque go on in a thread of their own as long as the block lasts, which must not use the arm.
+    """Exchange cycles without torque in a background thread for as long as the block lasts, which must not use the arm.
 
     Args:
         arm: open, not enabled.
@@ -39,7 +39,7 @@ def attended(arm: Arm) -> Iterator[None]:
         try:
             while not ended.is_set():
                 arm.exchange(None)
-        except Exception as error:  # noqa: BLE001 - whatever it is, nobody attends to the arm from here on
+        except Exception as error:  # noqa: BLE001 - whatever it is, no cycles are exchanged from here on
             failures.append(error)
         finally:
             over.set()
@@ -61,7 +61,7 @@ def attended(arm: Arm) -> Iterator[None]:
 
 
 def _wait_for(over: threading.Event) -> None:
-    """However often somebody interrupts that: whoever goes on uses the arm."""
+    """Wait until the background thread has ended, however often the wait is interrupted: the caller needs the arm."""
     interrupted: KeyboardInterrupt | None = None
     while not over.is_set():
         try:
@@ -74,9 +74,9 @@ def _wait_for(over: threading.Event) -> None:
 
 @contextmanager
 def _behind() -> Iterator[None]:
-    """One priority below threads that were started before, where real time was granted (`realtime.py`).
+    """Run the block one priority below the threads started before, where real time was granted (`realtime.py`).
 
-    They have this thread's priority and core, and would not run at all until it waits.
+    Those threads have this thread's priority and core, and would not run at all until this one waits.
     """
     policy, granted = os.sched_getscheduler(0), os.sched_getparam(0)
     lower = granted.sched_priority - 1

@@ -1,6 +1,6 @@
-"""Every threshold of a sample by itself, from severe to mild, in words; asked only when one of them does not hold.
+"""Compare a sample with every threshold, from severe to mild, and describe each violation in words.
 
-Boundary: judging one sample; what is remembered between samples, and whether to ask at all, is `guard.py`.
+Called only when `guard.py` has found that some threshold is violated.
 """
 
 from __future__ import annotations
@@ -17,28 +17,28 @@ from ident_service.config.limits import MotionLimits
 MAX_AGE = 3  # cycles without an axis' feedback before it counts as gone, where its driver does not say (FIELDBUS.md)
 VELOCITY_STOP, VELOCITY_OFF = 1.2, 2.0  # times the velocity limit (ODrive stops at 1.2)
 JUMP = 4.0  # times what the velocity limit allows in one cycle, away from where the arm should have gone on to
-# A position that stays the same to the last bit for so many cycles, while the controller asks for more than this share
-# of the torque limit beyond the model's torque: no free joint stands that long against that much.
+# A position that stays the same to the last bit for `FROZEN_CYCLES`, while the controller asks for more than
+# `FROZEN_EFFORT` of the torque limit beyond the model's torque: no free joint stands that long against that much.
 FROZEN_CYCLES, FROZEN_EFFORT = 20, 0.2
-# And of one that moved at more than this share of its velocity limit when it stood still to the last bit from one cycle
-# to the next, for so many cycles: only a hard stop does that. Behind light joints the push above may never come.
+# Likewise one that moved at more than `SUDDEN_SPEED` of its velocity limit and then stands still to the last bit for
+# `SUDDEN_CYCLES`: only a hard stop does that. Behind light joints the push above may never come.
 SUDDEN_CYCLES, SUDDEN_SPEED = 10, 0.1
 FOLLOWING_LOST = 2.0  # times the following error allowed
 # Towards a position limit no motion within the acceleration limit a is faster than sqrt(2 a d) at a distance d from it
-# (FIELDBUS.md). The arm itself may brake by so much harder, and be by so much of its velocity limit faster, than that.
+# (FIELDBUS.md). The arm may brake `ENVELOPE` times as hard, and be `ENVELOPE_SLACK` of its velocity limit faster.
 ENVELOPE, ENVELOPE_SLACK = 1.5, 0.2
-# Of the torque limit, by which the torque that acts may differ from the one asked for, and the measured one from both.
-# A sound drive is within its current loop's offset and noise, some hundredths of its largest torque.
+# Share of the torque limit by which the acting torque may differ from the one asked for, and the measured one from
+# both. A healthy drive is within its current loop's offset and noise, some hundredths of its largest torque.
 NOT_APPLIED = 0.1
 
 
 @dataclass(frozen=True)
 class Check:
-    """One thing looked at.
+    """Represent the comparison of one quantity with its threshold, for all joints.
 
     Attributes:
-        code: of the fault it would be.
-        hit: where it is wrong, shape (joints,) or (names,).
+        code: of the fault that a violation would be.
+        hit: where the threshold is violated, shape (joints,) or (names,).
         what: the sentence's middle; `{}` stands for numbers, `{u}` for the position's unit, `{f}` for the torque's.
         numbers: one array, shaped like `hit`, for each `{}`.
         names: of what `hit` is about, the joints when None.
@@ -53,7 +53,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Seen:
-    """A sample, and what is known from those before it.
+    """Hold a sample together with the state known from the samples before it.
 
     Attributes:
         sample: of this cycle.
@@ -89,7 +89,7 @@ class Seen:
 
 
 def checks(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
-    """All of them, in the order in which they are to be believed."""
+    """Yield all checks of a sample, ordered by how far the data they need can be believed."""
     yield from _what_cannot_be_believed(seen, limits)
     yield from _what_has_failed(seen)
     yield from _what_must_end(seen, limits)
@@ -97,7 +97,7 @@ def checks(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
 
 
 def _what_cannot_be_believed(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
-    """Torque off."""
+    """Check for faults that take the torque off: feedback that is not credible, an emergency stop, a runaway."""
     sample, position, speed = seen.sample, seen.position, np.abs(seen.velocity)
     bad = sample.valid & ~np.isfinite(sample.position)
     yield Check("feedback_not_finite", bad, "position is not a number")
@@ -115,7 +115,7 @@ def _what_cannot_be_believed(seen: Seen, limits: MotionLimits) -> Iterator[Check
 
 
 def _what_has_failed(seen: Seen) -> Iterator[Check]:
-    """Quick stop."""
+    """Check for faults that lead to a quick stop."""
     yield Check("drive_fault", _says(seen, AxisStatus.FAULT), "the drive reports a fault")
     yield Check("drive_watchdog", _says(seen, AxisStatus.WATCHDOG), "the drive's watchdog has struck")
     unpowered = seen.was_powered & ~_says(seen, AxisStatus.POWERED) & bool(seen.sample.status)
@@ -124,7 +124,7 @@ def _what_has_failed(seen: Seen) -> Iterator[Check]:
 
 
 def _what_must_end(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
-    """Damped lowering, then controlled stops."""
+    """Check for faults that lead to damped lowering, then for those that lead to a controlled stop."""
     position, velocity, speed = seen.position, seen.velocity, np.abs(seen.velocity)
     away, allowed = np.abs(seen.wanted - position), limits.following_error
     what = "{} {u} from where it should be, {} {u} allowed"
@@ -143,7 +143,7 @@ def _what_must_end(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
 
 
 def _what_can_be_bridged(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
-    """Warnings."""
+    """Check for warnings."""
     jumped_to = seen.sample.position
     yield Check("encoder_jump", seen.jumped, "position jumped to {} {u} from {} {u}", (jumped_to, seen.position))
     yield Check("lost_feedback", ~seen.usable, "no feedback in this cycle")
@@ -157,21 +157,21 @@ def _what_can_be_bridged(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
 
 
 def approach_speed(distance: Vector, limits: MotionLimits) -> Vector:
-    """Speed towards a position limit that is too much.
+    """Return the largest speed allowed towards a position limit.
 
     Args:
         distance: from the limit, negative beyond it [rad or m], shape (joints,).
         limits: of the arm.
 
     Returns:
-        sqrt(2 a d) with the allowances above [rad/s or m/s], shape (joints,).
+        sqrt(2 a d) with the allowances `ENVELOPE` and `ENVELOPE_SLACK` [rad/s or m/s], shape (joints,).
     """
     squared = np.maximum(2.0 * ENVELOPE * limits.acceleration * distance, 0.0)
     return np.asarray(np.sqrt(squared + (ENVELOPE_SLACK * limits.velocity) ** 2))
 
 
 def in_words(check: Check, names: Sequence[str], units: Sequence[str]) -> str:
-    """A check that does not hold: whose, and what.
+    """Describe a violated check in words: the joints concerned, and what was measured.
 
     Args:
         check: with at least one hit.
@@ -187,12 +187,12 @@ def in_words(check: Check, names: Sequence[str], units: Sequence[str]) -> str:
 
 
 def _beyond(position: Vector, limits: MotionLimits) -> tuple[Vector, Vector]:
-    """How far outside the position limits, and which one it is."""
+    """Return how far positions [rad or m] are outside their limits, and the limit concerned, shape (joints,) each."""
     above, below = position - limits.upper, limits.lower - position
     return np.maximum(above, below), np.where(above > below, limits.upper, limits.lower)
 
 
 def _says(seen: Seen, bit: AxisStatus) -> Flags:
-    """Which axes' status words have a bit."""
+    """Return which axes' status words have a bit set, shape (joints,)."""
     status = seen.sample.status or (0,) * len(seen.position)
     return np.array([bool(word & bit) for word in status])

@@ -1,4 +1,4 @@
-"""Computed torque with a proportional and derivative loop (5.2.1, eq. 76, figure 3), and damping alone.
+"""Compute joint torques: computed torque with proportional-derivative feedback (5.2.1, eq. 76, figure 3), and damping.
 
     alpha = ddq_r + K_d (dq_r - dq) + K_p (q_r - q)          tau = M(q) alpha + c(q, dq) + g(q) + f(dq_r)
 
@@ -24,15 +24,15 @@ from ident_service.motion.reference import Setpoint
 
 
 class ComputedTorque:
-    """The control law and its velocity filter.
+    """Compute the control law and filter the velocity for it.
 
     Attributes:
         position: of the last update [rad or m], shape (joints,), predicted where it was not measured.
         velocity: filtered velocity of the last update [rad/s or m/s], shape (joints,).
-        correction: what the errors added to the last torque, `M(q) (K_d (dq_r - dq) + K_p (q_r - q))` [N m or N],
+        correction: feedback part of the last torque, `M(q) (K_d (dq_r - dq) + K_p (q_r - q))` [N m or N],
             shape (joints,); nothing when the arm is only damped.
         feedforward: friction in the last torque [N m or N], shape (joints,); nothing when the arm is only damped.
-        answer: the acceleration in it, `K_d (dq_r - dq) + K_p (q_r - q)` [rad/s^2 or m/s^2], shape (joints,); nothing
+        answer: feedback acceleration, `K_d (dq_r - dq) + K_p (q_r - q)` [rad/s^2 or m/s^2], shape (joints,); nothing
             likewise.
     """
 
@@ -45,7 +45,7 @@ class ComputedTorque:
         position: Vector,
         friction: FrictionFeedforward | None = None,
     ) -> None:
-        """Begin at rest.
+        """Start with the arm at rest.
 
         Args:
             dynamics: the prior model.
@@ -67,13 +67,13 @@ class ComputedTorque:
         self.correction = self.answer = self.feedforward = self._none
 
     def torque(self, position: Vector, valid: Flags, reference: Setpoint, elapsed: float | None = None) -> Vector:
-        """One update.
+        """Return the computed torque for the next cycle; updates the velocity filter.
 
         Args:
             position: measured [rad or m], shape (joints,).
             valid: where `position` is fresh; elsewhere the arm is taken to have gone on as it went.
             reference: where it should be.
-            elapsed: since the update before [s]; one period when None; 0 where nobody knows, and the velocity stays.
+            elapsed: since the update before [s]; one period when None; 0 where it is unknown, and the velocity stays.
 
         Returns:
             Torque [N m or N], shape (joints,), not yet limited.
@@ -96,7 +96,7 @@ class ComputedTorque:
         elapsed: float | None = None,
         back: Vector | float = 0.0,
     ) -> Vector:
-        """One update without a reference.
+        """Return the torque that damps motion and compensates gravity, without a position reference.
 
         Args:
             position: as for `torque`.
@@ -118,7 +118,7 @@ class ComputedTorque:
         return torque
 
     def _filtered(self, position: Vector, valid: Flags, elapsed: float | None) -> Vector:
-        """Update the velocity; the position, with predictions where it was not measured."""
+        """Update the velocity filter and return the position, predicted where it was not measured."""
         seconds = self._period if elapsed is None else elapsed
         gain = self._gain if seconds == self._period else _gain(self._cutoff, seconds)
         if not valid.all():

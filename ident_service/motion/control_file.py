@@ -1,4 +1,4 @@
-"""Controls that a second terminal reaches: one small file, mapped into the loop's memory and into whoever asks.
+"""Share the controls of a motion with other processes through one small memory-mapped file.
 
 | offset | type | what |
 |---|---|---|
@@ -16,12 +16,12 @@
 | 40 | int64 | when a stop was asked for last, whether or not the arm moved then [ns of the same]; 0 for never |
 | 48 | int64 | when the lease of a way home was renewed last [ns of the same] |
 
-A motion takes seconds to begin, in which nobody can be reached yet. So a stop leaves its time behind, and a motion that
-was asked for before it takes the controls with the stop in them.
+A motion takes seconds to begin, in which no loop can be reached yet. So a stop leaves its time behind, and a motion
+that was asked for before it takes the controls with the stop in them.
 
-Every word is written by one side at a time and read whole. The loop reads memory, so asking costs it nothing and nobody
-can make it wait. Whoever moves the arm holds an exclusive lock on the file, which vanishes with the process: a second
-one is refused, and a file without a lock is nobody's.
+Every word is written by one side at a time and read whole. The loop reads memory, so reading costs it nothing and no
+other process can make it wait. The process that moves the arm holds an exclusive lock on the file, which vanishes with
+the process: a second one is refused, and a file without a lock belongs to no process.
 
 The lease is measured on the machine's clock: it is about a process that hangs, not about the arm. `lifeline.py` says
 when it counts.
@@ -45,11 +45,11 @@ from ident_service.motion.controls import LEASE_SECONDS, Homing
 _MAGIC, _VERSION, _SIZE = b"identctl", 1, 64
 _PID, _STOP, _PAUSE, _FINISH, _WAITING, _SUPPORTED, _RENEWED, _LENGTH, _STOPPED = 12, 16, 17, 18, 19, 20, 24, 32, 40
 _HOMING, _HOME_RENEWED = 21, 48
-_TRIES, _TRY_AGAIN = 20, 0.005  # s; who looks whether the file is in use holds it for a moment
+_TRIES, _TRY_AGAIN = 20, 0.005  # s; a process that checks whether the file is in use locks it for a moment
 
 
 class ControlFile:
-    """The controls of one arm; `motion/controls.py` says how the loop reads them."""
+    """Represent the controls of one arm; `motion/controls.py` says how the loop reads them."""
 
     def __init__(self, fd: int, memory: mmap.mmap, now_ns: Callable[[], int]) -> None:
         self._fd, self._memory, self._now_ns = fd, memory, now_ns
@@ -65,7 +65,7 @@ class ControlFile:
         now_ns: Callable[[], int] = time.monotonic_ns,
         asked_ns: int | None = None,
     ) -> Self:
-        """Become the one who moves the arm, with all controls off and the lease renewed.
+        """Take the controls of the arm as the process that moves it: all controls off, the lease renewed.
 
         Only a stop that was asked for after `asked_ns` is there from the beginning.
 
@@ -102,10 +102,10 @@ class ControlFile:
 
     @classmethod
     def reach(cls, path: Path, now_ns: Callable[[], int] = time.monotonic_ns) -> Self:
-        """The controls of an arm that another process moves.
+        """Open the controls of an arm that another process moves.
 
         Raises:
-            UsageError: nobody moves the arm.
+            UsageError: no process moves the arm.
         """
         try:
             fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
@@ -128,7 +128,7 @@ class ControlFile:
             now_ns: the clock of `take`.
 
         Returns:
-            The process that moves the arm; None where nobody does.
+            The id of the process that moves the arm; None where none does.
 
         Raises:
             UsageError: the file cannot be written; an arm that moves has been stopped all the same.
@@ -154,12 +154,12 @@ class ControlFile:
 
     @property
     def pid(self) -> int:
-        """Of the process that moves the arm."""
+        """Return the id of the process that moves the arm."""
         return int(struct.unpack_from("<I", self._memory, _PID)[0])
 
     @property
     def stop(self) -> bool:
-        """Whether the arm is to be brought to a controlled stop."""
+        """Return whether the arm is to be brought to a controlled stop."""
         return self._memory[_STOP] != 0
 
     def ask_stop(self) -> None:
@@ -168,16 +168,16 @@ class ControlFile:
 
     @property
     def pause(self) -> bool:
-        """Whether the arm is to stand."""
+        """Return whether the arm is to pause."""
         return self._memory[_PAUSE] != 0
 
     def ask_pause(self, wanted: bool) -> None:
-        """Let the arm stand, or go on."""
+        """Pause the arm, or let it go on."""
         self._memory[_PAUSE] = int(wanted)
 
     @property
     def finish(self) -> bool:
-        """Whether the run is to end early, where it began."""
+        """Return whether the run is to end early, where it began."""
         return self._memory[_FINISH] != 0
 
     def ask_finish(self) -> None:
@@ -186,24 +186,24 @@ class ControlFile:
 
     @property
     def waiting(self) -> bool:
-        """Tell if the arm is held until a person confirms that it is supported or home."""
+        """Return whether the arm is held until a person confirms that it is supported or home."""
         return self._memory[_WAITING] != 0
 
     def wait_for_support(self) -> None:
-        """Hold the arm until that is confirmed; for whoever moves it."""
+        """Announce that the arm is held until a person confirms that it is supported; for the process that moves it."""
         self._memory[_SUPPORTED] = 0
         self._memory[_WAITING] = 1
 
     @property
     def supported(self) -> bool:
-        """Tell if a person has confirmed the support since the arm began to wait."""
+        """Return whether a person has confirmed the support since the arm began to wait for it."""
         return self._memory[_SUPPORTED] != 0
 
     def confirm_support(self) -> None:
-        """Say, as a person who sees it, that the arm is supported or home; cannot be taken back.
+        """Confirm, as a person who sees it, that the arm is supported or home; cannot be taken back.
 
         Raises:
-            UsageError: the arm does not wait for it; what is said beforehand would let go an arm that still moves.
+            UsageError: the arm does not wait for it; confirmed beforehand, it would release an arm that still moves.
         """
         if not self.waiting:
             raise UsageError("the arm is not held after a stop; there is nothing to confirm")
@@ -211,11 +211,11 @@ class ControlFile:
 
     @property
     def homing(self) -> Homing:
-        """Say how far the way home of a held arm has come."""
+        """Return the stage of leading a held arm home."""
         return Homing(self._memory[_HOMING])
 
     def tell_homing(self, stage: Homing) -> None:
-        """Say how far it has come; for whoever moves the arm."""
+        """Set the stage of leading a held arm home; for the process that moves it."""
         if stage is Homing.GOING:
             self._memory[_WAITING] = 0
         self._memory[_HOMING] = stage
@@ -231,47 +231,47 @@ class ControlFile:
         begun = self._now_ns()
         self.renew_home()
         self._memory[_STOP] = self._memory[_PAUSE] = 0
-        if self._words[_STOPPED // 8] >= begun:  # asked for by somebody else in this moment
+        if self._words[_STOPPED // 8] >= begun:  # asked for by another process in this moment
             self._memory[_STOP] = 1
         self._memory[_HOMING] = Homing.ASKED
 
     def renew_home(self) -> None:
-        """Say that whoever had the arm led home is still there."""
+        """Renew the lease of the requester of the motion home."""
         self._words[_HOME_RENEWED // 8] = self._now_ns()
 
     def home_lease_ok(self) -> bool:
-        """Tell if whoever had the arm led home has said so within `LEASE_SECONDS`."""
+        """Return whether the lease of the requester of the motion home was renewed within `LEASE_SECONDS`."""
         return self._now_ns() - self._words[_HOME_RENEWED // 8] <= round(LEASE_SECONDS * 1e9)
 
     def renew(self) -> None:
-        """Say that whoever asked for motion is still there."""
+        """Renew the lease of the requester of the motion."""
         self._words[_RENEWED // 8] = self._now_ns()
 
     def lease_ok(self, now_ns: int) -> bool:
-        """Whether the lease has been renewed in time; the loop's own clock is not asked."""
+        """Return whether the lease was renewed in time, by the machine's clock instead of the loop's."""
         renewed, length = self._words[_RENEWED // 8], self._words[_LENGTH // 8]
         return length == 0 or self._now_ns() - renewed <= length
 
     def close(self) -> None:
-        """Give the lock back."""
+        """Release the lock and the memory."""
         self._words.release()
         self._view.release()
         self._memory.close()
         os.close(self._fd)
 
     def __enter__(self) -> Self:
-        """Nothing more to do."""
+        """Return these controls."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close."""
+        """Close the controls."""
         self.close()
 
 
 def mover(path: Path) -> int | None:
-    """The process that moves the arm whose control file this is, or None."""
+    """Return the id of the process that moves the arm of a control file, None when no process does."""
     try:
         with ControlFile.reach(path) as controls:
             return controls.pid
@@ -280,7 +280,7 @@ def mover(path: Path) -> int | None:
 
 
 def stop_asked_ns(path: Path) -> int:
-    """Read when a stop of the arm was asked for last [ns of the machine's monotonic clock]; 0 where none is known."""
+    """Return when a stop of the arm was asked for last [ns of the machine's monotonic clock]; 0 where none is known."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except OSError:
@@ -293,7 +293,7 @@ def stop_asked_ns(path: Path) -> int:
 
 
 def in_use(path: Path) -> bool:
-    """Whether a process moves the arm whose control file this is."""
+    """Return whether a process moves the arm of a control file."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except (FileNotFoundError, NotADirectoryError):
@@ -308,7 +308,7 @@ def in_use(path: Path) -> bool:
 
 
 def _locked(fd: int) -> bool:
-    """Take the exclusive lock, unless somebody keeps it."""
+    """Take the exclusive lock, unless another process keeps it; returns whether it was taken."""
     for again in range(_TRIES):
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,4 +1,4 @@
-"""What people and programs may ask of a motion while it runs: stop, pause, finish, and that they are still there.
+"""Define the controls of a running motion: stop, pause, finish early, confirmation of support, the way home, the lease.
 
 An arm without brakes that has been stopped is held, and waits for a person to say that it is supported.
 
@@ -17,7 +17,7 @@ HOLD_TO_RUN_SECONDS = 0.25
 
 
 class Homing(IntEnum):
-    """Name how far the way home of an arm that is held after a stop has come."""
+    """Name the stages of leading home an arm that is held after a stop."""
 
     NONE = 0
     ASKED = 1
@@ -27,42 +27,42 @@ class Homing(IntEnum):
 
 
 class Controls(Protocol):
-    """Read once per cycle; whatever it raises stops the arm."""
+    """Define the controls that the loop reads once per cycle; whatever they raise stops the arm."""
 
     @property
     def stop(self) -> bool:
-        """Whether the arm is to be brought to a controlled stop; the run ends with it."""
+        """Return whether the arm is to be brought to a controlled stop; the run ends with it."""
 
     @property
     def pause(self) -> bool:
-        """Whether the arm is to stand; it goes on when this is False again."""
+        """Return whether the arm is to pause; it goes on when this is False again."""
 
     @property
     def finish(self) -> bool:
-        """Whether what is left of the motion is to be left out: the arm rests, and goes back to where it stood."""
+        """Return whether the rest of the motion is to be left out: the arm rests, and goes back to where it stood."""
 
     @property
     def supported(self) -> bool:
-        """Whether a person has confirmed, since the arm began to wait for it, that it is supported or home."""
+        """Return whether a person has confirmed, since the arm began to wait for it, that it is supported or home."""
 
     def wait_for_support(self) -> None:
-        """Say that the arm is held until somebody confirms that; called once for each hold."""
+        """Announce that the arm is held until a person confirms that it is supported; called once for each hold."""
 
     @property
     def homing(self) -> Homing:
-        """Say whether a person wants the arm, which is held, led home, and how far that has come."""
+        """Return whether a person wants the held arm led home, and the stage of that."""
 
     def tell_homing(self, stage: Homing) -> None:
-        """Say how far it has come; whoever asked for it is from `GOING` on the one whose lease counts."""
+        """Set the stage of leading the arm home; from `GOING` on, the lease of its requester counts."""
 
     def lease_ok(self, now_ns: int) -> bool:
-        """Whether whoever asked for motion is still there at this time of the loop's clock [ns]."""
+        """Return whether the requester of the motion is still alive, at this time of the loop's clock [ns]."""
 
 
 class StopWhen:
-    """Controls of a run that nobody pauses or finishes early: stops when a function says so.
+    """Provide controls that neither pause nor finish early: the arm stops when a function returns true.
 
-    A second function says whether an arm that is held since is supported.
+    A second function tells whether the arm, held after that stop, is supported.
     """
 
     pause = False
@@ -76,27 +76,27 @@ class StopWhen:
 
     @property
     def stop(self) -> bool:
-        """What the function says."""
+        """Return whether the stop function asks for a stop."""
         return self._asked()
 
     @property
     def supported(self) -> bool:
-        """What the second function says."""
+        """Return whether the support function says that the arm is supported."""
         return self._supported()
 
     def wait_for_support(self) -> None:
-        """Nothing more: the function is asked."""
+        """Do nothing: the support function is asked in every cycle."""
 
     def tell_homing(self, stage: Homing) -> None:
-        """Nobody asks for it."""
+        """Do nothing: these controls never ask for the way home."""
 
     def lease_ok(self, now_ns: int) -> bool:
-        """There is no lease to lose."""
+        """Return True: there is no lease to lose."""
         return True
 
 
 class Switches:
-    """Controls in this process, for whoever holds them; each is one attribute, written and read whole.
+    """Hold controls as attributes for use within this process, each written and read whole.
 
     Attributes:
         stop: the arm is to stop.
@@ -108,7 +108,7 @@ class Switches:
     """
 
     def __init__(self, lease_seconds: float | None = None) -> None:
-        """Begin with everything off.
+        """Start with all controls off.
 
         Args:
             lease_seconds: how long the arm may move after `renew` [s]; None for a run that needs no lease.
@@ -126,17 +126,17 @@ class Switches:
         self.supported, self.waiting = False, True
 
     def tell_homing(self, stage: Homing) -> None:
-        """Remember it; the switch `stop`, which led here, is off while the arm goes home."""
+        """Set the stage of leading the arm home; `stop`, which preceded it, is off while the arm goes home."""
         if stage is Homing.GOING:
             self.stop = self.pause = self.waiting = False
         self.homing = stage
 
     def renew(self, now_ns: int) -> None:
-        """Say at a time of the loop's clock [ns] that somebody is still there."""
+        """Renew the lease at a time of the loop's clock [ns]."""
         self._renewed_ns = now_ns
 
     def lease_ok(self, now_ns: int) -> bool:
-        """Whether the lease has been renewed in time; until it is for the first time, the first question begins it."""
+        """Return whether the lease was renewed in time; before any renewal, the first call starts it."""
         if self._length_ns is None:
             return True
         if self._renewed_ns is None:

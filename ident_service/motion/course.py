@@ -1,9 +1,7 @@
-"""Which reference is followed, from state to state: approach, motion, return, pauses in any of them, the stop.
+"""Sequence the references of a run: approach, motion, return, pauses in any of them, and the stop.
 
 A run that is finished early pauses, and goes straight back to where it stood instead of on. Where that way is not free
-it goes on: what was planned is proven, and ends in order too.
-
-Boundary: references and states. Whether the arm itself follows, and rests when its reference does, is `loop.py`'s.
+it goes on as planned, which is proven and ends regularly, too.
 """
 
 from __future__ import annotations
@@ -25,7 +23,7 @@ _UNDER_WAY = (*MOVING, State.PAUSING, State.PAUSED, State.RESUMING)
 
 
 class Course:
-    """Where the arm should be.
+    """Sequence the reference trajectories of a run, state by state.
 
     Attributes:
         reference: of the last cycle.
@@ -47,7 +45,7 @@ class Course:
         *,
         held: bool = False,
     ) -> None:
-        """Plan to move.
+        """Prepare to follow the given references in order.
 
         Args:
             states: armed when the first cycle comes.
@@ -56,7 +54,7 @@ class Course:
             start: where the arm stands.
             limits: of the arm, for stops and pauses.
             resuming: of ways out of pauses.
-            surroundings: what ways out of pauses must keep clear of.
+            surroundings: that trajectories out of pauses must avoid.
             held: whether the end of the last way is held like the end of a stop, instead of being done at once.
         """
         self.reference = start
@@ -78,7 +76,7 @@ class Course:
         self.led = False
 
     def at(self, stamp_ns: int) -> Setpoint:
-        """The reference of the cycle with this stamp [ns]; states follow each other as their references end."""
+        """Return the reference of the cycle with this stamp [ns]; states follow each other as their references end."""
         states = self._states
         if self._begin_ns is None:  # not before: enabling takes as long as it takes
             self._begin_ns = stamp_ns
@@ -99,17 +97,17 @@ class Course:
         return self.reference
 
     def overdue(self, stamp_ns: int) -> float:
-        """For how long the present reference has rested at its end [s]; negative before."""
+        """Return for how long the present reference has rested at its end [s]; negative before."""
         return self._elapsed(stamp_ns) - self._way.duration
 
     def stop(self, stamp_ns: int) -> None:
-        """Turn to a controlled stop, where that is lawful."""
+        """Begin a controlled stop, in states that allow one."""
         if self._states.state in STOPPABLE:
             self._states.enter(State.STOPPING)
             self._begin_ns, self._way = stamp_ns, stop(self.reference, self._limits)
 
     def pause(self, stamp_ns: int) -> None:
-        """Turn to a stop that can be gone on from, where something moves."""
+        """Begin a stop from which the motion can be resumed, where the arm moves."""
         state, elapsed, back = self._states.state, self._elapsed(stamp_ns), self._back
         if state is State.RESUMING and back is not None:
             paused = Paused(back.motion, back.joined, self._limits, self.reference)
@@ -124,13 +122,13 @@ class Course:
         self._begin_ns, self._way, self._paused, self._back = stamp_ns, paused, paused, None
 
     def stood(self) -> None:
-        """The arm rests at the end of a pause's stop: it is paused, and the way back can be looked for."""
+        """Enter PAUSED, when the arm has come to rest, and begin to search for a trajectory back to the motion."""
         self._states.enter(State.PAUSED)
         if self._paused is not None:
             self._search = self._way_out(self._paused)
 
     def finish(self, stamp_ns: int) -> None:
-        """Turn back early, by way of a pause; once, and only before the last way, or else without effect."""
+        """End the run early by way of a pause and a straight return; once, and only before the last reference."""
         if self._finishing or not self._later or self._states.state not in _UNDER_WAY:
             return
         self._finishing = True
@@ -139,7 +137,7 @@ class Course:
             self._back, self._search = None, self._way_out(self._paused)
 
     def _way_out(self, paused: Paused) -> Generator[None, None, Resumed | RuckigReference]:
-        """The search for the way out of a pause: straight back to the start once the run is to be finished early."""
+        """Search for a trajectory out of a pause: straight back to the start where the run is to be finished early."""
         if self._finishing and self._later and not self.not_finished:
             try:
                 return (yield from paused.leave_in_slices(self._start, self._resuming, self._surroundings))
@@ -148,7 +146,7 @@ class Course:
         return (yield from paused.resume_in_slices(self._resuming, self._surroundings))
 
     def look_for_way_back(self) -> str | None:
-        """While paused, one slice of the search for the way back; why there is none, when that turns out."""
+        """Do one slice of the search for a trajectory back; returns the reason where there is none, else None."""
         if self._search is None:
             return None
         try:
@@ -165,7 +163,7 @@ class Course:
         return None
 
     def go_on(self, stamp_ns: int) -> None:
-        """Leave a pause, as soon as the way out is found."""
+        """Leave a pause, as soon as a trajectory out of it is found."""
         if self._away is not None and self._paused is not None:
             self.finished_at = self._paused.time if self._left is State.EXCITING else 0.0
             self._states.enter(State.RETURNING)
@@ -175,7 +173,7 @@ class Course:
             self._begin_ns, self._way = stamp_ns, self._back
 
     def lead_home(self, start: Vector) -> None:
-        """Begin to look for the slow, straight way home of an arm that is stopped; `look_for_way_back` goes on with it.
+        """Begin to search for a slow, straight trajectory home of a stopped arm; `look_for_way_back` continues.
 
         Args:
             start: from where [rad or m], shape (joints,).
@@ -191,7 +189,7 @@ class Course:
         self._away, self._search = None, search()
 
     def leads_home(self, stamp_ns: int) -> bool:
-        """Go home as soon as the way is found; tell if that is now."""
+        """Begin to go home as soon as a trajectory is found; returns whether that is in this cycle."""
         if self._away is None:
             return False
         self._states.enter(State.RETURNING)

@@ -1,4 +1,4 @@
-"""Whether cycles come when they should.
+"""Watch that cycles come on time: late, lost and stalled cycles.
 
 A cycle begins at its stamp: torque begins to act and positions are taken. The answers come back now sooner, now later,
 which is the driver's business as long as the next cycle begins in time; so an arm that stamps by the clock is judged by
@@ -22,7 +22,7 @@ LONGEST_STALL, SUCCESS = 0.010, 0.95  # s, or one period where that is longer
 LATE = 0.25  # periods late that a cycle may be (FIELDBUS.md: OWD counts periods above 1.25 times the nominal one)
 FOLLOWS = 1.0 / 32.0  # of the difference from the schedule that the schedule takes over, each cycle
 _MOST_UNKNOWN = 3  # cycles in a row without a velocity: two stalls, one after the other
-LONGEST_GAP = 20  # periods without a cycle, through which nobody guarded the arm (libfranka's lost packets)
+LONGEST_GAP = 20  # periods without a cycle, in which the arm is not supervised (libfranka's lost packets)
 
 
 def longest_stall(described: float | None, period: float, watchdogs: Iterable[Watchdog]) -> float:
@@ -40,10 +40,10 @@ def longest_stall(described: float | None, period: float, watchdogs: Iterable[Wa
 
 
 class Elapsed:
-    """Seconds from one sample to the next, by their stamps.
+    """Measure the seconds from one sample to the next, by their stamps.
 
     Where cycles come late or are skipped, velocities are differences over what has really passed. Stamps that make no
-    sense are the guard's matter; nobody shall divide by them.
+    sense are the guard's matter and are never divided by.
 
     Attributes:
         known: whether both samples were taken when their stamps say, so that a velocity can be told from them. Where
@@ -51,14 +51,14 @@ class Elapsed:
     """
 
     def __init__(self, period: float) -> None:
-        """`period` [s] of the loop."""
+        """Start with the loop's `period` [s]."""
         self._period, self._period_ns = period, round(period * 1e9)
         self._before_ns: int | None = None
         self._doubt_ns = self._unknown = 0
         self.known = True
 
     def __call__(self, stamp_ns: int, doubt_ns: int = 0) -> float:
-        """The time since the last call's stamp [s], from half a period to `LONGEST_GAP`; a period at first.
+        """Return the time since the last call's stamp [s], half a period to `LONGEST_GAP` periods; a period at first.
 
         Args:
             stamp_ns: of a sample [ns].
@@ -77,12 +77,12 @@ class Elapsed:
 
 
 class Deadlines:
-    """Watches one loop from its first cycle on.
+    """Watch the timing of one loop from its first cycle on.
 
     Attributes:
         lateness_ns: of the last cycle, against the typical one of those before it [ns].
-        elapsed: from the sample before the last one to the last one, at most [s], see `Elapsed`.
-        known: whether `elapsed` is what passed between the two.
+        elapsed: time between the last two samples, at most [s], see `Elapsed`.
+        known: whether `elapsed` is the true time between them.
         lost: cycles that were late or never came, so far.
     """
 
@@ -94,12 +94,12 @@ class Deadlines:
         scheduled_stamps: bool = False,
         longest_stall: float = LONGEST_STALL,
     ) -> None:
-        """Begin.
+        """Start before the first cycle.
 
         Args:
             findings: makes the faults.
             period: of the loop [s].
-            scheduled_stamps: what the arm says of its stamps (`ArmDescription`).
+            scheduled_stamps: whether stamps are those of a schedule (`ArmDescription`).
             longest_stall: that is survived [s].
         """
         self.lateness_ns = self.lost = 0
@@ -119,11 +119,11 @@ class Deadlines:
 
     @property
     def known(self) -> bool:
-        """Whether `elapsed` is what passed between the last two samples."""
+        """Return whether `elapsed` is the true time between the last two samples."""
         return self._of.known
 
     def cycle(self, stamp_ns: int, woken_ns: int, doubt_ns: int = 0) -> Fault | None:
-        """Judge a cycle.
+        """Check whether a cycle came on time, and return a fault where it came too late or too many did.
 
         Args:
             stamp_ns: of its sample [ns].
@@ -159,7 +159,7 @@ class Deadlines:
         return self._late(stamp_ns, max(gap - period, lateness, doubt_ns))
 
     def _late(self, stamp_ns: int, late_ns: int) -> Fault:
-        """Count a late cycle, and what was lost before it: too long a stall, or too many, are a fault."""
+        """Count a late cycle and the cycles lost before it; too long a stall, or too many lost cycles, are a fault."""
         lost = max(1, round(late_ns / self._period_ns))
         self.lost += lost
         self._recent.append((stamp_ns, lost))

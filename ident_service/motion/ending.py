@@ -1,4 +1,4 @@
-"""How a run ended, as one file in its folder; without it, the run did not end but was killed."""
+"""Write the report of how a run ended into its folder; a run without that file was killed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The one place where a configuration becomes an Arm: drivers register under an entry point, third-party ones too."""
+"""Create the `Arm` of a configuration from drivers registered under an entry point, third-party ones too."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ GROUP = "ident_service.drivers"
 
 
 def make_arm(config: ArmConfig, clock: Clock | None = None) -> Arm:
-    """The arm that a configuration describes, not yet open.
+    """Create the arm that a configuration describes, not yet open.
 
     Args:
         config: its `driver.kind` names an entry point of the group `ident_service.drivers`.

@@ -1,10 +1,8 @@
-"""The faults of one arm on the disk, until a person acknowledges each by its name.
+"""Store the faults of one arm on disk until a person acknowledges each by its code.
 
-Whoever moves the arm writes down beforehand that it does (`moving.json`), and takes that back when the arm is without
-torque and every fault is in `faults.json`. What is killed in between, alone or with all its family, thus leaves a mark,
-and a mark without a process that holds the arm's control file is the fault `motion_process`.
-
-Boundary: files; the memory of faults within a run is `latch.py`.
+The process that moves the arm first marks that it does (`moving.json`), and removes the mark when the arm is without
+torque and every fault is in `faults.json`. A process that is killed in between, alone or with its children, thus leaves
+the mark; a mark without a process that holds the arm's control file is the fault `motion_process`.
 """
 
 from __future__ import annotations
@@ -29,7 +27,7 @@ UNFINISHED: Final = "motion_process"
 
 @dataclass(frozen=True)
 class Remembered:
-    """A fault that nobody has acknowledged.
+    """Represent an unacknowledged fault on disk.
 
     Attributes:
         code: its name.
@@ -43,34 +41,34 @@ class Remembered:
 
 
 class FaultFile:
-    """Faults that ended runs of one arm."""
+    """Store the faults that ended runs of one arm."""
 
     def __init__(self, folder: Path) -> None:
-        """`folder` of the arm, below the state folder; called like the arm."""
+        """Use the arm's `folder` below the state folder; it is named like the arm."""
         self._arm = folder.name
         self._faults, self._mark, self._controls = folder / "faults.json", folder / "moving.json", folder / CONTROLS
 
     def latched(self) -> dict[str, str]:
-        """Cause by code, the earliest first; raises as `remembered`."""
+        """Return the cause of each stored fault by code, the earliest first; raises as `remembered`."""
         return {one.code: one.cause for one in self.remembered()}
 
     def remembered(self) -> tuple[Remembered, ...]:
-        """All that is latched, the earliest first.
+        """Return all stored faults, the earliest first.
 
         Raises:
-            UsageError: a file was damaged by somebody.
+            UsageError: a file is damaged.
         """
         return self._remembered(moving=in_use(self._controls))
 
     def began(self, run: Path) -> None:
-        """Write down that this process, which has taken the control file, is about to move the arm.
+        """Mark that this process, which has taken the control file, is about to move the arm.
 
         Args:
             run: folder of the run.
 
         Raises:
-            MotionRefused: a fault that nobody has acknowledged.
-            UsageError: a file was damaged by somebody, or cannot be written.
+            MotionRefused: there is an unacknowledged fault.
+            UsageError: a file is damaged, or cannot be written.
         """
         self.require_none({one.code: one.cause for one in self._remembered(moving=False)})
         self._mark.parent.mkdir(parents=True, exist_ok=True)
@@ -78,7 +76,7 @@ class FaultFile:
         write_atomically(self._mark, json.dumps(mark, indent=1) + "\n")
 
     def ended(self) -> None:
-        """Take that back: the arm is without torque, and what went wrong is latched."""
+        """Remove the mark of a moving arm: the arm is without torque, and its faults are stored."""
         self._mark.unlink(missing_ok=True)
 
     def require_none(self, faults: dict[str, str]) -> None:
@@ -89,10 +87,10 @@ class FaultFile:
             raise MotionRefused(f"{self._arm}: faults that nobody has acknowledged: {words}; {acks}")
 
     def latch(self, code: str, cause: str) -> None:
-        """Remember a fault; one that is latched already keeps its first cause.
+        """Store a fault; one that is stored already keeps its first cause.
 
         Raises:
-            UsageError: the file was damaged by somebody, or cannot be written.
+            UsageError: the file is damaged, or cannot be written.
         """
         with self._alone():
             rows = self._rows()
@@ -100,7 +98,7 @@ class FaultFile:
                 self._write((*rows, Remembered(code, cause, time.time())))
 
     def acknowledge(self, code: str) -> str:
-        """Forget a fault; returns its cause.
+        """Remove a fault from the store; returns its cause.
 
         Raises:
             UsageError: no fault of this name is latched, or a file was damaged by somebody; or the arm is still held
@@ -158,7 +156,7 @@ class FaultFile:
             raise self._damaged(self._faults, error) from None
 
     def _read(self, path: Path) -> Any:
-        """The JSON in a file, None without one."""
+        """Return the JSON content of a file, None when there is no file."""
         try:
             return json.loads(path.read_text(encoding="utf-8"))
         except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""What can be wrong while an arm moves, and what is done about it: one table, after FIELDBUS.md 5.2.
+"""Define every fault of a moving arm and the reaction to it, in one table after FIELDBUS.md 5.2.
 
 Reactions, from mild to severe; a motion only ever goes from a milder one to a more severe one.
 
@@ -6,7 +6,7 @@ Reactions, from mild to severe; a motion only ever goes from a milder one to a m
   too many of the last 100 cycles becomes a controlled stop.
 * **controlled stop**: the loop stays closed on a stop within limits (`stop.py`). The arm must then be measured at rest
   within `SETTLE` of the end of the stop, and is held: gravity compensated, motion damped, what else it needed to stand
-  kept on, no position asked for, so that it gives way to whoever pushes it. After `HOLD` seconds the drives of an arm
+  kept on, no position asked for, so that it yields when it is pushed. After `HOLD` seconds the drives of an arm
   with brakes are told to quick-stop. Without brakes (`after_stop.py`) it is held until a person confirms that it is
   supported or home, or lowered; either ends without torque when the arm rests.
 * **damped lowering**: for an arm that does not follow although it can be measured. No position is asked for any more:
@@ -21,8 +21,6 @@ A run that ends in DONE stands where it stood, supported, before it began; its t
 Where this table differs from FIELDBUS.md 5.2: a frozen encoder takes the torque (decision 0008); beyond a position
 limit the stop is controlled as long as the arm is no further out than a following error, because these limits are
 ours and lie inside the hardware's; faults of the program and of single axes quick-stop instead of dropping the arm.
-
-Boundary: data, and what counts warnings; who finds a fault is `guard.py`, `deadlines.py` and `loop.py`.
 """
 
 from __future__ import annotations
@@ -40,7 +38,7 @@ WINDOW = 100  # cycles over which warnings are counted (libfranka's success rate
 
 
 class Reaction(IntEnum):
-    """What a fault leads to, from mild to severe."""
+    """Name the reactions to a fault, from mild to severe."""
 
     WARN = 0
     CONTROLLED_STOP = 1
@@ -50,12 +48,12 @@ class Reaction(IntEnum):
 
     @property
     def stop_kind(self) -> StopKind:
-        """How torque ends, at once or at last."""
+        """Return how the drives end torque under this reaction, immediately or after lowering or holding."""
         return StopKind.TORQUE_OFF if self is Reaction.TORQUE_OFF else StopKind.QUICK_STOP
 
 
 class Severity(IntEnum):
-    """How bad it is, as levels of rcl_interfaces/msg/Log."""
+    """Name the severities of faults, as levels of rcl_interfaces/msg/Log."""
 
     WARNING = 30
     ERROR = 40
@@ -64,11 +62,11 @@ class Severity(IntEnum):
 
 @dataclass(frozen=True)
 class Rule:
-    """One row of the table.
+    """Represent one row of the fault table.
 
     Attributes:
         reaction: to the fault.
-        means: what may be the cause, the end of the sentence that a person reads.
+        means: the possible cause, the end of the sentence that a person reads.
         often: of a warning, in how many of the last 100 cycles it is still only a warning.
         becomes: the fault that one more makes of it.
         each: whether every message of a warning is told, not only the first of its code.
@@ -82,7 +80,7 @@ class Rule:
 
     @property
     def severity(self) -> Severity:
-        """How bad it is."""
+        """Return the severity that follows from the reaction."""
         if self.reaction is Reaction.WARN:
             return Severity.WARNING
         return Severity.FATAL if self.reaction >= Reaction.QUICK_STOP else Severity.ERROR
@@ -101,7 +99,7 @@ FAULTS: dict[str, Rule] = {
     "drive_warning": Rule(_WARN, "temperature, voltage or current near its limit; see the drive's manual"),
     "torque_limited": Rule(_WARN, "the drive itself gives less torque than it was asked for"),
     "strange_frame": Rule(_WARN, "a bus that is too full, a wrong node number, or another device on it"),
-    # `deadlines.py` says when it is too late, or too often; the others of a second are survived.
+    # `deadlines.py` decides when a cycle is too late, or too many are; fewer in a second are tolerated.
     "late_cycle": Rule(_WARN, "the machine was busy with something else", often=WINDOW - 1),
     # The loop can still be trusted to stop the arm.
     "repeated_warnings": Rule(_STOP, "what is bridged once must not go on"),
@@ -118,7 +116,7 @@ FAULTS: dict[str, Rule] = {
     "status_stale": Rule(_STOP, "nobody would hear of it if the drive let go; its report is lost, or the bus too full"),
     "bus_degraded": Rule(_STOP, "a bad cable, connector or termination, or a wrong bit rate"),
     "recorder_behind": Rule(_STOP, "a motion that is not recorded is worth nothing"),
-    # It can be measured, but does not do what it is told.
+    # The arm can be measured, but does not follow.
     "following_lost": Rule(_LOWER, "it is blocked, loaded, or a drive does not give its torque"),
     # The host, the bus or single axes; the other drives can brake.
     "feedback_gone": Rule(_QUICK, "an axis, its encoder or cable failed; if all: the bus, or this machine stalled"),
@@ -151,7 +149,7 @@ FAULTS: dict[str, Rule] = {
 
 @dataclass(frozen=True)
 class Fault:
-    """Something that must not be, found in one cycle.
+    """Represent a fault found in one cycle.
 
     Attributes:
         code: its name in the table.
@@ -165,15 +163,15 @@ class Fault:
 
     @property
     def severity(self) -> Severity:
-        """How bad it is."""
+        """Return the severity of the fault, from the table."""
         return FAULTS[self.code].severity
 
 
 class Findings:
-    """Makes faults, and makes too many warnings into one.
+    """Create faults from the table, and turn repeated warnings into a fault.
 
     Attributes:
-        cycle: number of the present cycle, for whoever counts cycles to advance.
+        cycle: number of the present cycle, advanced by the caller.
         warnings: how often each warning was found.
     """
 
@@ -183,7 +181,7 @@ class Findings:
         self._recent: dict[str, deque[int]] = {}
 
     def found(self, code: str, what: str) -> Fault:
-        """A fault of the table, or what a warning becomes when it is found too often.
+        """Return a fault of the table, or the fault that a warning becomes when it is found too often.
 
         Args:
             code: in the table.

@@ -1,10 +1,7 @@
-"""What must be true of every sample and of every torque, before the torque leaves.
+"""Check every sample, and every torque before it is sent, against the limits of the arm.
 
-Nearly all cycles are healthy, so all thresholds are compared at once, in one array. Only when one of them does not hold
-is each looked at by itself (`checks.py`) and put into words. A number that is none holds no threshold.
-
-Boundary: samples and torques; time is `deadlines.py`'s, what follows from a fault is the table in `faults.py` and
-`loop.py`.
+Nearly all cycles are healthy, so all thresholds are compared at once, in one array. Only when one of them is violated
+is each compared by itself (`checks.py`) and put into words. NaN violates every threshold.
 """
 
 from __future__ import annotations
@@ -31,20 +28,20 @@ from ident_service.motion.checks import (
     checks,
     in_words,
 )
-from ident_service.motion.faults import Fault as Fault  # who uses a guard needs these too
+from ident_service.motion.faults import Fault as Fault  # users of a guard need these too
 from ident_service.motion.faults import Findings
 from ident_service.motion.faults import Reaction as Reaction
 from ident_service.motion.owed import Owed
 from ident_service.motion.reference import Setpoint
 from ident_service.motion.told import told
 
-ABSURD = 3.0  # times the torque limit: no controller of ours asks for that
-# Change of torque: libfranka's 1000 N m/s; on small joints, of whom that asks nothing, from none to full in 10 ms.
+ABSURD = 3.0  # times the torque limit: no controller here asks for that
+# Change of torque: libfranka's 1000 N m/s; on small joints, which that would not limit, from none to full in 10 ms.
 TORQUE_RATE, TORQUE_RATE_SHARE = 1000.0, 100.0  # N m/s or N/s; times the torque limit per second
 
 
 class Guard:
-    """Checks every sample and every torque of one motion.
+    """Check every sample and every torque of one motion.
 
     Attributes:
         findings: makes the faults and counts the warnings, of others than the guard too.
@@ -63,7 +60,7 @@ class Guard:
         owed: Owed | None = None,
         max_age: int = MAX_AGE,
     ) -> None:
-        """Begin with the arm standing somewhere.
+        """Start with the arm standing at a position.
 
         Args:
             joint_names: for the sentences.
@@ -71,8 +68,9 @@ class Guard:
             period: of the loop [s].
             position: where it stands [rad or m], shape (joints,).
             revolute: which joints turn, for the units in the sentences; all when None.
-            contact: what may not touch; without it, nothing is checked.
-            owed: of joints that stand still; without it, only hard pushes and full motion tell frozen encoders.
+            contact: pairs of solids that may not touch; None for no collision check.
+            owed: estimates how far joints that stand still would have moved; without it, only hard pushes and full
+                motion reveal frozen encoders.
             max_age: cycles without an axis' feedback before it counts as gone (`ArmDescription.lost_cycles`).
         """
         joints = len(position)
@@ -110,7 +108,7 @@ class Guard:
 
     @property
     def warnings(self) -> dict[str, int]:
-        """How often each warning was found."""
+        """Return how often each warning was found, by code."""
         return self.findings.warnings
 
     def feedback(
@@ -125,16 +123,16 @@ class Guard:
         *,
         known: bool = True,
     ) -> tuple[Flags, Fault | None]:
-        """Judge a sample.
+        """Check a sample against all thresholds; returns the usable positions and the most severe fault.
 
         Args:
             sample: of this cycle.
             reference: where the arm should be at its stamp.
             velocity: filtered velocity before this sample [rad/s or m/s], shape (joints,).
             correction: of the torque before this sample, what the errors added to it [N m or N], shape (joints,).
-            answer: the acceleration in it [rad/s^2 or m/s^2], shape (joints,); without, nothing is owed.
+            answer: the feedback acceleration in it [rad/s^2 or m/s^2], shape (joints,); without, `owed` is not updated.
             elapsed: since the sample before [s]; one period when None.
-            known: whether that is so; if not, it is the longest that it may be.
+            known: whether `elapsed` is the true time; if not, it is the longest that it may be.
             feedforward: friction in the torque before this sample [N m or N], shape (joints,), which pushes a joint
                 against its own friction as the correction does.
 
@@ -160,13 +158,13 @@ class Guard:
                 usable, fault = self._judged(sample, reference.position, velocity)
         if sample.events:
             event = told(sample.events, self._names, self.findings)
-            # Of equals, what a drive says of itself tells more than what its status word does.
+            # Of equally severe faults, a drive's event tells more than its status word.
             if event is not None and (fault is None or event.reaction >= fault.reaction):
                 fault = event
         return usable, fault
 
     def torque(self, wanted: Vector) -> tuple[Vector, Fault | None]:
-        """Judge and limit a torque; the change to the first one is not limited, because the support gives way to it.
+        """Check and limit a torque; the first torque is not limited in rate, because the support yields to it.
 
         Args:
             wanted: by the controller [N m or N], shape (joints,).
@@ -221,11 +219,11 @@ class Guard:
         return np.asarray(before + np.where(self._joined, share, 1.0).min(axis=1) * (wanted - before))
 
     def about(self, joint: int, what: str, velocity: float) -> str:
-        """The beginning of a sentence about one joint; `{}` in it stands for its velocity [rad/s or m/s]."""
+        """Return the beginning of a sentence about one joint; `{}` in `what` stands for its velocity [rad/s or m/s]."""
         return f"{self._names[joint]}: {what.format(f'{velocity:.4g} {self._units[joint]}/s')}"
 
     def _quiet(self, position: Vector, wanted: Vector, velocity: Vector) -> bool:
-        """Whether positions that all answered hold every threshold of theirs."""
+        """Return whether positions that all answered keep every position, velocity, following and jump threshold."""
         above, below, to_upper, to_lower, speed, away, jump = self._rows
         np.subtract(position, self._limits.upper, out=above)
         np.subtract(self._limits.lower, position, out=below)
@@ -245,11 +243,11 @@ class Guard:
         return bool((self._values <= self._bounds).all())
 
     def _farthest(self) -> Vector:
-        """How far a position may be from the expected one [rad or m], shape (joints,)."""
+        """Return how far a position may be from the expected one [rad or m], shape (joints,)."""
         return self._jump if self._known else self._jump * (self._elapsed / self._period)
 
     def _plain(self, sample: Sample) -> bool:
-        """Whether nothing else is wrong: encoders, status, torque, the space the arm may be in."""
+        """Return whether encoders, status words, torques, velocities and collision distances are all healthy."""
         if not (self._none_still and self._all_change) and bool(self._frozen().any()):
             return False
         if sample.status is not self._healthy and not self._all_well(sample.status):
@@ -268,7 +266,7 @@ class Guard:
         return bool((self._depths <= 0.0).all())
 
     def _all_well(self, status: tuple[int, ...]) -> bool:
-        """Whether no drive says that its torque does not act."""
+        """Return whether no drive has tripped or lost its power; remembers healthy status words."""
         if status != self._healthy:
             powered = np.array([bool(word & AxisStatus.POWERED) for word in status])
             if any(word & TRIPPED for word in status) or bool((self._was_powered & ~powered).any()):
@@ -278,9 +276,9 @@ class Guard:
         return True
 
     def _judged(self, sample: Sample, wanted: Vector, velocity: Vector) -> tuple[Flags, Fault | None]:
-        """A sample with which something may be wrong."""
+        """Check a sample that may violate a threshold, threshold by threshold."""
         position = sample.position
-        # A window that only grew with the age would let the second reading of a wrong position in.
+        # If the window only grew with the age, the second reading of a wrong position would be accepted.
         expected = self._position + velocity * (self._elapsed + self._period * self._age)
         jumped = sample.valid & (np.abs(position - expected) > self._farthest())
         usable = sample.valid & ~jumped
@@ -315,7 +313,7 @@ class Guard:
         return usable, None
 
     def _count_still(self, sample: Sample, correction: Vector) -> None:
-        """Count for how long each position has not changed against a push."""
+        """Count for how many cycles each position has stood still while the controller pushed."""
         pushed = np.abs(correction) > self._push
         if pushed.any():
             changed = sample.valid & (sample.position != self._shown)
@@ -326,7 +324,7 @@ class Guard:
             self._none_still = True
 
     def _count_unchanged(self, sample: Sample, velocity: Vector) -> None:
-        """Count for how long each position has not changed at all, and whether that began in full motion."""
+        """Count for how many cycles each position has stood still, and note whether that began in full motion."""
         same = sample.position == self._shown
         if same.any():
             same &= sample.valid
@@ -339,7 +337,7 @@ class Guard:
             self._all_change = True
 
     def _frozen(self) -> Flags:
-        """Which encoders stand still although the joint cannot."""
+        """Return which encoders stand still although the joint cannot."""
         return (self._still >= FROZEN_CYCLES) | (self._sudden & (self._unchanged >= SUDDEN_CYCLES)) | self._owes
 
     def _found(self, check: Check) -> Fault:

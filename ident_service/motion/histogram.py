@@ -1,4 +1,4 @@
-"""How late cycles woke and how long they computed: counts in fixed bins, so that nothing grows while the loop runs."""
+"""Count how late cycles woke and how long they computed, in fixed bins, so that nothing grows while the loop runs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _EDGES_US = (1, 2, 5, 10, 20, 50, 100, 150, 200, 300, 500, 1000, 2000, 5000, 10_
 
 
 class Histogram:
-    """Counts of times.
+    """Count times in fixed bins.
 
     Attributes:
         count: how many.
@@ -24,14 +24,14 @@ class Histogram:
         self._counts = [0] * (len(_EDGES_US) + 1)
 
     def add(self, time_ns: int) -> None:
-        """Count one."""
+        """Count one time [ns]."""
         self.count += 1
         if time_ns > self.worst_ns:
             self.worst_ns = time_ns
         self._counts[int(self._edges.searchsorted(time_ns, side="left"))] += 1
 
     def below_us(self, share: float) -> float:
-        """The edge [us] that `share` of all times do not exceed; the longest time where that is the last bin."""
+        """Return the bin edge [us] that `share` of all times do not exceed; the longest time if in the last bin."""
         if self.count == 0:
             return 0.0
         seen = 0
@@ -42,7 +42,7 @@ class Histogram:
         return self.worst_ns / 1e3
 
     def document(self) -> dict[str, Any]:
-        """As JSON values."""
+        """Return the histogram as JSON values."""
         return {
             "count": self.count,
             "worst_us": self.worst_ns / 1e3,

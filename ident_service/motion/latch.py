@@ -1,6 +1,6 @@
-"""Faults that stay until a person has acknowledged each by its name.
+"""Hold the active faults of an arm in memory until a person acknowledges each by its code.
 
-Boundary: memory only; the state table asks it before an arm is armed (`states.py`).
+The state machine refuses to arm the arm while there are any (`states.py`).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from ident_service.errors import UsageError
 
 @dataclass(frozen=True)
 class Latched:
-    """A fault that nobody has acknowledged yet.
+    """Represent an unacknowledged fault in memory.
 
     Attributes:
         code: its name.
@@ -26,14 +26,14 @@ class Latched:
 
 
 class Latch:
-    """The unacknowledged faults of one arm, the earliest first; it outlives the single run."""
+    """Hold the unacknowledged faults of one arm, the earliest first, beyond the single run."""
 
     def __init__(self) -> None:
         self._faults: dict[str, Latched] = {}
 
     @property
     def faults(self) -> tuple[Latched, ...]:
-        """What is latched."""
+        """Return the active faults, the earliest first."""
         return tuple(self._faults.values())
 
     def set(self, code: str, cause: str, since_ns: int) -> None:
@@ -41,10 +41,10 @@ class Latch:
         self._faults.setdefault(code, Latched(code, cause, since_ns))
 
     def acknowledge(self, code: str) -> Latched:
-        """Take note of one fault.
+        """Acknowledge one fault: remove and return it.
 
         Raises:
-            UsageError: no fault of this name is latched; whoever acknowledges must know what.
+            UsageError: no fault of this code is latched; a person must acknowledge a known fault.
         """
         if code not in self._faults:
             known = ", ".join(self._faults) or "none"

@@ -1,4 +1,4 @@
-"""Whether whoever asked for the motion is still there: a pipe that it holds, and the lease that it renews.
+"""Check that the requester of a motion is still alive: by a pipe that it holds, and a lease that it renews.
 
 The pipe ends with the process at its other end, however that dies, and within a cycle; so does the motion, in real and
 in virtual time. The lease is for one that lives but hangs. It is measured on the machine's clock, because that is where
@@ -16,14 +16,14 @@ from ident_service.motion.controls import Homing
 
 
 class Lifeline:
-    """The loop's `Controls` in a process of its own."""
+    """Implement the loop's `Controls` in a process of its own, supervised by pipe and lease."""
 
     def __init__(self, controls: ControlFile, pipe: int, *, lock_step: bool) -> None:
-        """Take both.
+        """Use the given control file and pipe.
 
         Args:
             controls: taken by this process.
-            pipe: readable end of the pipe that whoever asked for the motion holds open; a file or a device, too, which
+            pipe: readable end of the pipe that the requester of the motion holds open; a file or a device, too, which
                 never ends.
             lock_step: whether the loop's clock waits (a clock's `lock_step`).
         """
@@ -33,46 +33,46 @@ class Lifeline:
 
     @property
     def stop(self) -> bool:
-        """Whether the arm is to be brought to a controlled stop."""
+        """Return whether the arm is to be brought to a controlled stop."""
         return self._controls.stop
 
     @property
     def pause(self) -> bool:
-        """Whether the arm is to stand."""
+        """Return whether the arm is to pause."""
         return self._controls.pause
 
     @property
     def finish(self) -> bool:
-        """Whether the run is to end early."""
+        """Return whether the run is to end early."""
         return self._controls.finish
 
     @property
     def supported(self) -> bool:
-        """Whether a person has confirmed that the arm, which waits for it, is supported or home."""
+        """Return whether a person has confirmed that the waiting arm is supported or home."""
         return self._controls.supported
 
     def wait_for_support(self) -> None:
-        """Hold the arm until that is confirmed."""
+        """Announce that the arm is held until a person confirms that it is supported."""
         self._controls.wait_for_support()
 
     @property
     def homing(self) -> Homing:
-        """Say how far the way home of a held arm has come."""
+        """Return the stage of leading a held arm home."""
         return self._controls.homing
 
     def tell_homing(self, stage: Homing) -> None:
-        """Say how far it has come."""
+        """Set the stage of leading a held arm home."""
         self._controls.tell_homing(stage)
 
     @property
     def cut(self) -> bool:
-        """Whether the other end of the pipe is closed."""
+        """Return whether the other end of the pipe is closed."""
         return bool(self._poll.poll(0))
 
     def lease_ok(self, now_ns: int) -> bool:
-        """Tell whether whoever asked for the motion is there; a system call that does not wait.
+        """Return whether the requester of the motion is still alive; a system call that does not wait.
 
-        A held arm that is led home was asked for by somebody else, whose lease counts instead.
+        The motion home of a held arm has another requester, whose lease counts instead.
         """
         if self._controls.homing is Homing.GOING:
             return self._lock_step or self._controls.home_lease_ok()

@@ -1,4 +1,4 @@
-"""The cycle: exchange, judge, follow, limit, record, react. Every torque that leaves has passed the guard.
+"""Run the control loop: exchange, judge, follow, limit, record, react; every torque passes the guard before it is sent.
 
     exchange -> deadlines -> course -> guard.feedback -> control law -> guard.torque -> sink -> reaction -> controls
 
@@ -45,7 +45,7 @@ LOWERS: Final = "lowered under damped control until it rests"
 
 @dataclass
 class Peaks:
-    """Largest following error [rad or m] and torque [N m or N] so far, each of shape (joints,)."""
+    """Hold the largest following error [rad or m] and torque [N m or N] so far, each of shape (joints,)."""
 
     following_error: Vector
     torque: Vector
@@ -53,7 +53,7 @@ class Peaks:
 
 @dataclass
 class Loop:
-    """One motion, cycle by cycle.
+    """Run the control loop of one motion, cycle by cycle.
 
     Attributes:
         ended_by: the fault that stopped the arm under control, if one did.
@@ -87,7 +87,7 @@ class Loop:
         self._since_ns = 0  # of the hold or the lowering
         self._lowering: Lowering | None = None
         self._anchor: Anchor | None = None  # of an arm that is held for as long as it takes
-        self._waiting = self._leading = False  # for a person's word; for a way home
+        self._waiting = self._leading = False  # for a person's confirmation; for a trajectory home
         self._recorded = False  # all that is recorded of the run
         self._told: set[str] = set()
         self._rest_speed = REST_SPEED * self.limits.velocity
@@ -107,7 +107,7 @@ class Loop:
             wanted = self._cycle(wanted)
 
     def _cycle(self, torque: Vector) -> Vector | None:
-        """Send a torque; the next one, or None at the end."""
+        """Run one cycle with the torque to send; returns the torque of the next cycle, or None at the end."""
         try:
             sample = self.arm.exchange(torque)
         except DriverError as error:
@@ -145,7 +145,7 @@ class Loop:
         return torque
 
     def _law(self, sample: Sample, usable: Flags, reference: Setpoint, free: bool) -> Vector:
-        """The torque wanted [N m or N], shape (joints,)."""
+        """Return the torque that the control law asks for [N m or N], shape (joints,)."""
         elapsed = self.deadlines.elapsed if self.deadlines.known else 0.0
         if not free:
             return self.control.torque(sample.position, usable, reference, elapsed)
@@ -157,7 +157,7 @@ class Loop:
         return self.control.damping(sample.position, usable, share, share * needed, elapsed, beyond)
 
     def _react(self, fault: Fault, stamp_ns: int) -> None:
-        """Do what the table says, unless something as severe is being done already.
+        """React to a fault as the table says, unless a reaction at least as severe is under way.
 
         Raises:
             ArmFault: torque must end now.
@@ -185,7 +185,7 @@ class Loop:
         self._lowering, self._since_ns = Lowering(self.limits, stamp_ns, after), stamp_ns
 
     def _rests(self, stamp_ns: int) -> bool:
-        """See to the ends of stops, pauses, holds and lowerings; whether this was the last cycle.
+        """Check for the ends of stops, pauses, holds and lowerings; returns whether this was the last cycle.
 
         Raises:
             ArmFault: lowered; not at rest in time; or at rest no more.
@@ -218,7 +218,7 @@ class Loop:
         return False
 
     def _held(self, stamp_ns: int, since: float) -> bool:
-        """See to the end of a hold, which for an arm without brakes is the beginning of its lowering."""
+        """Check for the end of a hold, which for an arm without brakes is the beginning of its lowering."""
         if self.after_stop is AfterStop.BRAKE:
             return since >= self.hold_seconds
         if self.after_stop is AfterStop.LOWER:
@@ -240,7 +240,7 @@ class Loop:
         return False
 
     def _lead_home(self, stamp_ns: int) -> None:
-        """Look for the way home of a held arm, a slice in each cycle, and take it."""
+        """Search for a trajectory home of a held arm, a slice in each cycle, and start it when found."""
         refusal = None
         if self.ended_by is not None and self.ended_by.code not in HOME_AFTER:
             refusal = f"it was stopped by {self.ended_by.code}; support it, and confirm that"
@@ -276,7 +276,7 @@ class Loop:
             return False
 
     def _is_lowered(self, lowering: Lowering, stamp_ns: int, since: float) -> bool:
-        """Go on lowering; whether the arm rests or is at its floor.
+        """Lower the arm for one more cycle; returns whether it rests or has reached its floor.
 
         Raises:
             ArmFault: the arm was lowered because of a fault.
@@ -297,7 +297,7 @@ class Loop:
         self._rested, self._needed = 0, np.zeros_like(self._needed)
 
     def _obey(self, now_ns: int, stamp_ns: int) -> None:
-        """Do what is asked from outside; whatever is wrong with that, too, stops the arm."""
+        """Obey the controls; whatever goes wrong while reading them stops the arm, too."""
         try:
             stop, pause, lease = self.controls.stop, self.controls.pause, self.controls.lease_ok(now_ns)
             finish = self.controls.finish
@@ -330,13 +330,13 @@ class Loop:
             self.tell(Severity.WARNING, stamp_ns, f"not finished early, goes on to its end: {why}")
 
     def _lapse(self, stamp_ns: int) -> None:
-        """The lease is lost; a stop that is under way already does not become a fault by it."""
+        """React to a lost lease; a stop that is under way already does not become a fault by it."""
         if self.states.state not in (State.STOPPING, State.STOPPED):
             self._react(self.guard.findings.found("lease_lost", "the lease has ended"), stamp_ns)
 
     def _record(self, sample: Sample, reference: Setpoint, compute_ns: int) -> Fault | None:
         if self.states.state is State.STOPPED and self.after_stop is not AfterStop.BRAKE:
-            # Nobody identifies from it, and a person may let an arm wait for hours.
+            # No identification uses these samples, and a person may let an arm wait for hours.
             self._recorded = self._recorded or (sample.stamp_ns - self._since_ns) * 1e-9 > self.hold_seconds
         if self._recorded:
             return None
@@ -366,7 +366,7 @@ class Loop:
         return self.guard.findings.found("recorder_behind", why)
 
     def _finite(self, sample: Sample) -> Sample:
-        """A sample as readers of recordings can use it: what is no number is invalid, and what it was before."""
+        """Return a sample for recordings: a position that is not finite is invalid and replaced by the one before."""
         before = self.last[-2] if len(self.last) > 1 else sample
         position, velocity = sample.position, sample.velocity
         good = np.isfinite(position)
@@ -386,15 +386,15 @@ class Loop:
         np.maximum(self.peaks.torque, np.abs(sample.torque), out=self.peaks.torque)
 
     def _named(self, code: str, what: str) -> Fault:
-        """A fault of the joint that moves most, in terms of its limit; `{}` stands for its velocity."""
+        """Return a fault of the joint that moves fastest relative to its limit; `{}` stands for its velocity."""
         joint = int(np.argmax(np.abs(self.control.velocity) / self.limits.velocity))
         return self.guard.findings.found(code, self.guard.about(joint, what, self.control.velocity[joint]))
 
     def _end(self, fault: Fault) -> ArmFault:
-        """The error that takes the torque away."""
+        """Return the error that makes the caller take the torque away."""
         return ArmFault(fault.code, fault.message, self.last)
 
     def tell(self, level: int, stamp_ns: int, message: str) -> None:
-        """Tell the sink a line of the story."""
+        """Send a line of the run's story to the sink."""
         with suppress(Exception):  # a recorder that has failed says so at its next sample
             self.sink.event(stamp_ns, int(level), message)

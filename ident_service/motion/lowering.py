@@ -26,37 +26,37 @@ _RISES: Final = 3.0  # times as fast, at most, as it is taken away
 RESTING: Final = 0.5  # s in which no joint may have moved by more than STILL of its velocity limit would move it
 STILL: Final = 0.002
 GIVE: Final = 0.01  # s at the velocity limit: how far a held joint is pushed before its place goes with it
-# What an arm that comes to rest on something, or at the end of a joint's range, must not be stopped for.
+# Faults that must not stop an arm being lowered, which comes to rest on something or at the end of a joint's range.
 MEANT: Final = frozenset({"position_limit", "position_envelope", "workspace"})
 
 
 class Anchor:
-    """The place where an arm is held, which gives way to whoever pushes it, so that it can be led by hand.
+    """Represent the position at which an arm is held; it yields to a push, so that the arm can be led by hand.
 
     Held by damping alone, an arm would creep wherever the model's weight is not its own.
     """
 
     def __init__(self, limits: MotionLimits, position: Vector) -> None:
-        """`position` [rad or m], shape (joints,), is the first place."""
+        """Start at the given `position` [rad or m], shape (joints,)."""
         self._give = GIVE * limits.velocity
         self._place = position.copy()
 
     def back(self, position: Vector) -> Vector:
-        """How far each joint is to be brought back [rad or m], shape (joints,)."""
+        """Return how far each joint is to be brought back [rad or m], shape (joints,); beyond that the hold yields."""
         pull = np.clip(self._place - position, -self._give, self._give)
         self._place = position + pull
         return pull
 
 
 class Lowering:
-    """One lowering.
+    """Lower an arm once, by taking gravity compensation away.
 
     Attributes:
         share: of gravity to compensate, s.
     """
 
     def __init__(self, limits: MotionLimits, stamp_ns: int, after: float = 0.0) -> None:
-        """Begin.
+        """Start with full gravity compensation.
 
         Args:
             limits: of the arm.
@@ -73,11 +73,11 @@ class Lowering:
         self._still = STILL * RESTING * limits.velocity
 
     def beyond(self, position: Vector) -> Vector:
-        """How far each joint is to be brought back inside its position limits [rad or m], shape (joints,)."""
+        """Return how far each joint is to be brought back inside its position limits [rad or m], shape (joints,)."""
         return np.clip(position, self._limits.lower, self._limits.upper) - position
 
     def update(self, stamp_ns: int, position: Vector, velocity: Vector) -> bool:
-        """Go on by one cycle.
+        """Update the share of compensated gravity for one cycle.
 
         Args:
             stamp_ns: of the cycle [ns].
@@ -99,7 +99,7 @@ class Lowering:
 
 
 def lowest_point(model: ArmModel) -> Callable[[Vector], float]:
-    """Make the function that tells how high the lowest point of the arm is.
+    """Create the function that returns the height of the lowest point of the arm.
 
     Args:
         model: of the arm; links are the capsules of its geometry, and the origins of their frames.

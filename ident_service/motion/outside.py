@@ -1,11 +1,9 @@
-"""Positions outside the limits: how far out an arm may be led back from, and what it may do on the way.
+"""Handle positions outside the limits: how far out an arm may be led back from, and its limits on the way in.
 
 Position limits are the description's and lie inside the hardware's. An arm that was pushed, or that overshot in a stop,
-may stand beyond one of them; nothing but an inward way may begin there. Farther out than the following error it is left
-alone: no controller of ours can have brought it there, so that its zero may be wrong (`far_outside` in `faults.py`),
-and a way that is planned from a wrong position leads anywhere.
-
-Boundary: pure computation.
+may stand beyond one of them; only an inward trajectory may begin there. Farther out than the following error it is left
+alone: no controller here can have brought it there, so that its zero may be wrong (`far_outside` in `faults.py`),
+and a trajectory that is planned from a wrong position leads anywhere.
 """
 
 from __future__ import annotations
@@ -22,7 +20,7 @@ SAG = 0.25  # of the following error, that an arm may give way outwards when its
 
 
 def outside(position: Vector, limits: MotionLimits, names: Sequence[str]) -> list[str]:
-    """Which joints stand outside their position limits, in words.
+    """Describe in words which joints stand outside their position limits; empty where none does.
 
     Args:
         position: [rad or m], shape (joints,).
@@ -37,7 +35,7 @@ def outside(position: Vector, limits: MotionLimits, names: Sequence[str]) -> lis
 
 
 def reachable(limits: MotionLimits) -> MotionLimits:
-    """The limits, and as far outside as an arm may be led back from."""
+    """Return the position limits widened to where an arm may still be led back from."""
     more = limits.following_error
     return replace(limits, lower=limits.lower - more, upper=limits.upper + more)
 
@@ -57,7 +55,7 @@ def require_near(position: Vector, limits: MotionLimits, names: Sequence[str]) -
 
 
 def admitting(position: Vector, limits: MotionLimits, share: float = SAG) -> MotionLimits:
-    """Limits for a way that begins outside: wide enough to let the arm in from where it stands, and no wider.
+    """Return limits for a trajectory that begins outside: just wide enough to include the start.
 
     Args:
         position: where the arm stands [rad or m], shape (joints,).
@@ -76,7 +74,7 @@ def admitting(position: Vector, limits: MotionLimits, share: float = SAG) -> Mot
 
 
 def just_inside(position: Vector, limits: MotionLimits) -> Vector:
-    """The nearest posture that is inside by a quarter of the following error, or of the range where that is less.
+    """Return the nearest posture inside by a quarter of the following error, or of the range where that is less.
 
     Joints that stand inside stay where they are. So far in, an arm that stops short of its reference, because friction
     holds it, is inside nevertheless.

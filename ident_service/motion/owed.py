@@ -1,4 +1,4 @@
-"""How far joints whose positions stand still to the last bit would have moved if nothing but dry friction held them.
+"""Detect frozen encoders: estimate how far a joint whose position reads constant would have moved against dry friction.
 
 Behind a light joint a small torque makes a large speed before a push that is large for the drive is reached, so what is
 asked is not how hard a joint is pushed but what the push must have done. The push c is the correction and the friction
@@ -9,14 +9,12 @@ allowance b of the one case or the other
 
     dv = max(|c - c_0| - b, 0) / m_jj(q) dt          dd = v dt
 
-with m the inertia of the prior alone: the drive inertia that the description states would have a joint owe more slowly,
-and behind a light one too slowly. Of the change only as much counts as is also the joint's own, what is fed forward and
-`M_jj (a - a_0)_j` with M the control law's inertia and a the acceleration that its own errors ask for: the rest
-balances what other joints' corrections do to it. A joint that owes more than a way `d` which it could hide in its
-encoder's steps is not where its encoder says. A jammed joint looks the same, and so does one
-whose dry friction is far larger than the configuration says.
-
-Boundary: one observer of all joints; what follows is `guard.py`'s.
+with m the inertia of the prior alone: with the drive inertia that the description states, the estimate d would grow
+more slowly, and behind a light joint too slowly. Of the change only as much counts as is also the joint's own, what is
+fed forward and `M_jj (a - a_0)_j` with M the control law's inertia and a the feedback acceleration: the rest balances
+what other joints' corrections do to it. A joint whose estimated displacement d is more than its encoder's steps can
+hide is not where its encoder says. A jammed joint looks the same, and so does one whose dry friction is far larger than
+configuration says.
 """
 
 from __future__ import annotations
@@ -29,15 +27,15 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.expected_friction import expected_friction
 from ident_service.model.rigid_body import InverseDynamics
 
-# Times the friction expected, which is a guess: how far the correction may change against a joint that stands, and on
-# in the direction of one that slid, for what friction is larger at rest and for other joints' reactions.
+# Times the expected friction, which is a guess: by how much the push may change against a joint that stands, and along
+# the direction of one that slid, since friction is larger at rest and other joints react.
 STANDING, SLIDING = 3.0, 1.0
 SLID = 20  # cycles within which a second step in the same direction shows that a joint slides
 OWED, STEPS = 0.02, 10.0  # of the following error allowed; and steps of the encoder
 
 
 class Owed:
-    """The ways that joints owe."""
+    """Observe joints whose encoders may be frozen: integrate the motion that each joint's push should have caused."""
 
     def __init__(
         self,
@@ -48,7 +46,7 @@ class Owed:
         resolution: Vector,
         least: InverseDynamics | None = None,
     ) -> None:
-        """Begin with nothing owed.
+        """Start with an estimated displacement of zero.
 
         Args:
             dynamics: the control law's model.
@@ -78,19 +76,19 @@ class Owed:
         position: Vector,
         feedforward: Vector | float = 0.0,
     ) -> Flags:
-        """One cycle.
+        """Update the estimate for one cycle.
 
         Args:
             direction: in which each position has changed, 1 or -1, or 0 where it has not or was not measured, shape
                 (joints,).
-            correction: what the errors added to the torque [N m or N], shape (joints,); all zero where no position is
-                asked for, of which nothing follows.
-            answer: the acceleration in it [rad/s^2 or m/s^2], shape (joints,).
+            correction: feedback torque [N m or N], shape (joints,); all zero where no position is asked for, which
+                allows no conclusion.
+            answer: feedback acceleration [rad/s^2 or m/s^2], shape (joints,).
             position: last known [rad or m], shape (joints,).
             feedforward: friction in the torque [N m or N], shape (joints,).
 
         Returns:
-            Which joints owe more than can be hidden, shape (joints,).
+            Which joints should have moved farther than their encoders can hide, shape (joints,).
         """
         self._cycle += 1
         pushed = correction + feedforward
@@ -130,7 +128,7 @@ class Owed:
 def owed_ways(
     dynamics: InverseDynamics, model: ArmModel, limits: MotionLimits, period: float, resolution: Vector
 ) -> Owed:
-    """The observer of an arm: dry friction is the prior's, but never less than the configuration's guess."""
+    """Create the frozen-encoder observer of an arm; dry friction is the prior's, at least the configuration's guess."""
     guess = model.config.design.friction_guess
     expected = expected_friction(model, limits, guess).at_joints(model.chain).coulomb
     least = None if model.prior is None else InverseDynamics(model.chain, model.layout, model.prior)

@@ -1,7 +1,7 @@
-"""Pause and resume: a controlled stop out of a motion, and a jerk-limited way back onto it, or away from it for good.
+"""Pause and resume a motion: a controlled stop, and a jerk-limited trajectory back onto the motion or away from it.
 
 The way back leads from standstill to the motion's own moving state, so that position, velocity and acceleration have
-no step anywhere. Boundary: pure functions of time.
+no step anywhere.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _SEARCH = 20  # steps to either side
 
 
 class Paused:
-    """A motion that is stopped, and then stands.
+    """Represent a motion that is brought to a controlled stop, and then stands.
 
     Attributes:
         duration: until the arm stands [s].
@@ -28,7 +28,7 @@ class Paused:
     """
 
     def __init__(self, motion: Reference, time: float, limits: MotionLimits, start: Setpoint | None = None) -> None:
-        """Leave a motion.
+        """Plan the stop out of a motion.
 
         Args:
             motion: within the limits.
@@ -43,11 +43,11 @@ class Paused:
         self.duration = self._stop.duration
 
     def at(self, time: float) -> Setpoint:
-        """Setpoint at `time` [s] since the pause began."""
+        """Return the setpoint at `time` [s] since the pause began."""
         return self._stop.at(time)
 
     def resume(self, limits: MotionLimits | None = None) -> Resumed:
-        """The way back onto the motion and the rest of it, to be followed once the arm stands.
+        """Plan a trajectory back onto the motion and the rest of the motion, to be followed once the arm stands.
 
         It joins the motion where it was left. Where no way leads there within the limits, it joins a little earlier and
         repeats that little; else a little later; else it begins the motion again. This takes a millisecond or few where
@@ -64,11 +64,11 @@ class Paused:
     def resume_in_slices(
         self, limits: MotionLimits | None = None, surroundings: Surroundings | None = None
     ) -> Generator[None, None, Resumed]:
-        """As `resume`, a bearable part of a control cycle at a time; the generator returns the way back.
+        """Plan as `resume` does, in slices short enough for a control cycle; the generator returns the resumed motion.
 
         Args:
             limits: as for `resume`.
-            surroundings: what ways back must keep clear of; one that does not is none, and the search goes on.
+            surroundings: that trajectories back must avoid; after one that does not, the search goes on.
 
         Raises:
             MotionRefused: as `resume`, from any of its steps.
@@ -87,12 +87,12 @@ class Paused:
     def leave_in_slices(
         self, end: Setpoint, limits: MotionLimits, surroundings: Surroundings | None = None
     ) -> Generator[None, None, RuckigReference]:
-        """The straight, calm way to another place, from rest to rest, to be followed once the arm stands.
+        """Plan a straight trajectory at reduced speed to another setpoint at rest, to be followed after the pause.
 
         Args:
             end: at rest.
             limits: of the way, as for `resume`.
-            surroundings: what the way must keep clear of.
+            surroundings: that the trajectory must avoid.
 
         Raises:
             MotionRefused: the straight way is not free; from any of the steps.
@@ -104,7 +104,7 @@ class Paused:
 
 
 class Resumed:
-    """A way back onto a motion, and the motion from there on.
+    """Represent a trajectory back onto a motion, and the motion from there on.
 
     Attributes:
         duration: of both [s].
@@ -121,7 +121,7 @@ class Resumed:
         self.duration = back.duration + motion.duration - joined
 
     def at(self, time: float) -> Setpoint:
-        """Setpoint at `time` [s] since the way back began."""
+        """Return the setpoint at `time` [s] since the trajectory back began."""
         return self._way.at(time) if time < self.back else self.motion.at(self.joined + time - self.back)
 
 

@@ -1,7 +1,7 @@
-"""What a run is to do from where the arm stands: an excitation and back, or one way to a destination.
+"""Plan the references of a run from where the arm stands: an excitation and back, or a move to a destination.
 
-A plan is asked twice: whether it can be made at all, before anything is looked at, and for its ways from where the arm
-has been seen. Boundary: references and refusals; nothing here touches an arm.
+A plan is asked twice: whether it can be made at all, before the arm is opened, and for its references from where the
+arm has been measured.
 """
 
 from __future__ import annotations
@@ -30,49 +30,49 @@ Leg = tuple[State, Reference]
 
 
 class Plan(Protocol):
-    """What a run is to do."""
+    """Define what a run is to do."""
 
     @property
     def speed(self) -> float:
-        """Share of the ways' own speed at which all of it is played, ways out of pauses too."""
+        """Return the share of the references' own speed at which they are played, trajectories out of pauses too."""
 
     @property
     def held(self) -> bool:
-        """Whether it ends where nothing may support the arm, which is then held and braked as after a stop."""
+        """Return whether the run ends where nothing may support the arm, which is then held and braked like a stop."""
 
     def require_possible(self, model: ArmModel, limits: MotionLimits) -> None:
-        """Raise MotionRefused where no start makes it possible."""
+        """Raise MotionRefused where no start makes the plan possible."""
 
     def admits(self, model: ArmModel, position: Vector, limits: MotionLimits) -> MotionLimits:
-        """The limits of this run, or MotionRefused where none may begin at this position [rad or m], (joints,)."""
+        """Return the limits of this run; MotionRefused where none may begin at this position [rad or m], (joints,)."""
 
     def legs(self, model: ArmModel, start: Vector, limits: MotionLimits) -> Sequence[Leg]:
-        """The ways from `start` [rad or m], shape (joints,), in order; MotionRefused where they lead too near."""
+        """Return the references from `start` [rad or m], (joints,), in order; MotionRefused if they lead too near."""
 
 
 @dataclass(frozen=True)
 class Excite:
-    """To an excitation, along it, and back to where the arm stood, all at one share of its speed."""
+    """Plan to move to an excitation, along it, and back to where the arm stood, all at one share of its speed."""
 
     excitation: Excitation
     speed: float = 1.0
     held = False  # it stands again where it stood, supported, before
 
     def require_possible(self, model: ArmModel, limits: MotionLimits) -> None:
-        """The motion was made for this arm, keeps its limits, and so does every stop out of it."""
+        """Check that the motion was made for this arm and keeps its limits, and so does every stop out of it."""
         if self.excitation.arm_sha256 != model.config.motion_sha256:
             raise MotionRefused(f"the {self.excitation.name} motion was made for another description of the arm")
         require_within_limits(self.excitation.path, model, limits)
         require_stops_within_limits(self.excitation.path, limits, model.chain.names)
 
     def admits(self, model: ArmModel, position: Vector, limits: MotionLimits) -> MotionLimits:
-        """From inside the position limits only."""
+        """Return the limits unchanged; the run may begin inside the position limits only."""
         if found := outside(position, limits, model.chain.names):
             raise MotionRefused(f"outside the position limits: {'; '.join(found)}; `ident recover` says what to do")
         return limits
 
     def legs(self, model: ArmModel, start: Vector, limits: MotionLimits) -> Sequence[Leg]:
-        """Approach, motion, return."""
+        """Return the approach, the excitation and the return."""
         exciting = PathReference(self.excitation.path)
         begin, end = exciting.at(0.0), exciting.at(exciting.duration)
         there, back = calm_way(rest(start), begin, limits), calm_way(end, rest(start), limits)
@@ -82,7 +82,7 @@ class Excite:
 
 
 class Destination(Enum):
-    """Where one way leads."""
+    """Name the destinations of a point-to-point motion."""
 
     HOME = "home"  # the description's
     INSIDE = "inside"  # the nearest posture inside the position limits
@@ -90,7 +90,7 @@ class Destination(Enum):
 
 @dataclass(frozen=True)
 class GoTo:
-    """One straight way in joint space from rest to rest, slowly; it may begin a little outside the position limits.
+    """Plan a slow straight motion in joint space from rest to rest; it may begin a little outside the position limits.
 
     All joints share one time profile (`way.py`), so that each moves from its start towards its end without turning
     round; the end is inside the limits, and so the way of a joint that stands outside leads inwards all the time.
@@ -101,17 +101,17 @@ class GoTo:
     held = True  # whatever supported the arm where it stood is not where it ends
 
     def require_possible(self, model: ArmModel, limits: MotionLimits) -> None:
-        """Home is inside the limits by the description's own check, and inside is inside."""
+        """Do nothing: home is inside the limits by the description's own check, as is the nearest posture inside."""
 
     def admits(self, model: ArmModel, position: Vector, limits: MotionLimits) -> MotionLimits:
-        """From no farther outside than a following error; on the way in, limits begin where the arm stands."""
+        """Return limits that begin where the arm stands; it may stand no farther outside than a following error."""
         require_near(position, limits, model.chain.names)
         if self.destination is Destination.INSIDE and not outside(position, limits, model.chain.names):
             raise MotionRefused("the arm stands inside all its position limits; there is nothing to leave")
         return admitting(position, limits)
 
     def legs(self, model: ArmModel, start: Vector, limits: MotionLimits) -> Sequence[Leg]:
-        """The one way."""
+        """Return the one reference to the destination."""
         end = limits.home if self.destination is Destination.HOME else just_inside(start, limits)
         way = calm_way(rest(start), rest(end), admitting(start, limits))
         try:

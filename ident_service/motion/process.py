@@ -1,4 +1,4 @@
-"""The motion process: the arm, the loop and nothing else, started by whoever wants the arm to move.
+"""Run the motion process: the arm and its control loop, started by the process that requests the motion.
 
 It gets one JSON object on its standard input and says in lines of JSON on its standard output which state it enters and
 how the run ended; samples and story go through the ring to the recorder's process. It takes the arm's control file and
@@ -6,7 +6,7 @@ holds its lock, so that `ident stop` reaches it whatever became of its parent. A
 standard input, and one that hangs lets the lease lapse: either stops the arm (`lifeline.py`). What is to be known
 afterwards does not need a parent: faults are latched, and the ending is written into the run folder, from here.
 
-A pipe that nobody reads must not make the loop wait: lines that do not fit are dropped.
+A pipe that the parent does not read must not make the loop wait: lines that do not fit are dropped.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _STATES = frozenset(state.value for state in State)
 
 
 class TimedSink:
-    """Hands everything on to the ring, counts how late and how long cycles were, and tells the parent the states.
+    """Pass samples and events on to the ring, count lateness and duration of cycles, and tell the parent the states.
 
     Attributes:
         lateness: of waking.
@@ -62,7 +62,7 @@ class TimedSink:
 
     @property
     def error(self) -> str:
-        """Why nothing is recorded any more, or empty."""
+        """Return why nothing is recorded any more, empty while something is."""
         return self._sink.error
 
     def put(self, cycle: Cycle) -> bool:
@@ -83,18 +83,18 @@ class TimedSink:
 
 
 def say(line: dict[str, Any]) -> None:
-    """One line of JSON on standard output, or nothing where it does not fit at once."""
+    """Write one line of JSON to standard output, or nothing where it does not fit at once."""
     with suppress(OSError):
         os.write(sys.stdout.fileno(), json.dumps(line).encode() + b"\n")
 
 
 def main() -> int:
-    """Do what standard input asks for; 0 when the run ended in DONE or STOPPED."""
+    """Run the motion that standard input asks for; returns 0 when the run ended in DONE or STOPPED."""
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the terminal's Ctrl-C is for the parent, which asks for a stop
     line = sys.stdin.readline()
     if not line.endswith("\n"):
-        return 1  # whoever wanted to ask is gone already
+        return 1  # the parent is gone already
     request = json.loads(line)
     os.set_blocking(sys.stdout.fileno(), False)
     code, answer = _ended(request)
@@ -109,7 +109,7 @@ def main() -> int:
 
 
 def _ended(request: dict[str, Any]) -> tuple[int, dict[str, Any]]:
-    """Do it; the exit code, and the last line for the parent."""
+    """Run the motion with the control file taken; returns the exit code, and the last line for the parent."""
     try:
         place = Path(request["arm_folder"]) / CONTROLS
         with ControlFile.take(place, request["lease"], asked_ns=request["asked_ns"]) as controls:
@@ -120,18 +120,18 @@ def _ended(request: dict[str, Any]) -> tuple[int, dict[str, Any]]:
         return 4, {"error": {"kind": "ArmFault", "code": fault.code, "message": _words(fault)}}
     except IdentError as error:
         return 1, {"error": {"kind": type(error).__name__, "message": _words(error)}}
-    except Exception as error:  # noqa: BLE001 - a mistake of ours, too, has a message besides its traceback
+    except Exception as error:  # noqa: BLE001 - a mistake of the program, too, has a message besides its traceback
         traceback.print_exc()
         return 1, {"error": {"kind": "ArmError", "message": f"the motion process failed: {error!r}"}}
 
 
 def _words(error: IdentError) -> str:
-    """The error and its notes in one line."""
+    """Return the error and its notes in one line."""
     return "; ".join((str(error), *getattr(error, "__notes__", ())))
 
 
 def _latching(request: dict[str, Any], controls: ControlFile) -> dict[str, Any]:
-    """Move the arm; whatever happens to this process or its parent, what went wrong is latched on the disk."""
+    """Move the arm; whatever happens to this process or its parent, faults are stored on the disk."""
     faults, latch = FaultFile(Path(request["arm_folder"])), Latch()
     faults.began(Path(request["folder"]))
     try:
@@ -147,14 +147,14 @@ def _latching(request: dict[str, Any], controls: ControlFile) -> dict[str, Any]:
 
 
 def _remember(faults: FaultFile, latch: Latch) -> None:
-    """What went wrong is on the disk, and only then the arm is without a mark."""
+    """Store the faults on the disk, and only then remove the mark of a moving arm."""
     for fault in latch.faults:
         faults.latch(fault.code, fault.cause)
     faults.ended()
 
 
 def _moved(request: dict[str, Any], controls: ControlFile, latch: Latch) -> dict[str, Any]:
-    """The report, as JSON values."""
+    """Move the arm and record it; returns the report as JSON values."""
     config = ArmConfig.model_validate(request["config"])
     motion = None if request["excitation"] is None else excitation_from_json(request["excitation"])
     plan: Plan = GoTo(Destination(request["destination"])) if motion is None else Excite(motion, request["speed"])
@@ -193,7 +193,7 @@ def _moved(request: dict[str, Any], controls: ControlFile, latch: Latch) -> dict
 
 
 def _early(report: RunReport) -> dict[str, Any]:
-    """What there is to say of a run that was finished early, or was to be."""
+    """Return the report's entries about a run that was finished early, or was to be."""
     if report.finished_at is not None:
         return {"finished": "early", "motion_seconds": report.finished_at}
     return {"not_finished": report.not_finished} if report.not_finished else {}

@@ -1,8 +1,8 @@
-"""Ways whose jerk is constant piece by piece: cubic in position, so that turning points are exact.
+"""Represent profiles of piecewise constant jerk: cubic in position, so that turning points are exact.
 
     q(t) = q_i + dq_i t + ddq_i t^2 / 2 + j_i t^3 / 6          within piece i
 
-Pieces may differ from joint to joint. Boundary: pure computation; which pieces lead to rest is `stop.py`'s question.
+Pieces may differ from joint to joint.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Piece = tuple[Vector, Vector]
 
 
 class ToRest:
-    """Pieces of constant jerk that end at rest.
+    """Represent a motion to rest, in pieces of constant jerk.
 
     Attributes:
         duration: until the last joint stands [s].
@@ -26,7 +26,7 @@ class ToRest:
     """
 
     def __init__(self, start: Setpoint, pieces: Sequence[Piece]) -> None:
-        """Put the pieces together.
+        """Integrate the pieces from the start on.
 
         Args:
             start: its arrays of shape (joints,), or (samples, joints) for many ways at once.
@@ -49,15 +49,15 @@ class ToRest:
         self.end = self._position[-1]
 
     def at(self, time: float) -> Setpoint:
-        """Setpoint at `time` [s] of a single way."""
+        """Return the setpoint at `time` [s] of a single motion."""
         time = max(time, 0.0)
         here = ((self._begin <= time).sum(axis=0) - 1, self._joint)
         knot = Setpoint(self._position[here], self._velocity[here], self._acceleration[here])
-        with np.errstate(all="ignore"):  # what is no number is for the guard to judge, in the same cycle
+        with np.errstate(all="ignore"):  # NaN and infinity are for the guard to judge, in the same cycle
             return after(knot, self._jerk[here], time - self._begin[here])
 
     def extent(self) -> tuple[Vector, Vector]:
-        """Lowest and highest position on the way, exact but for rounding, shape (..., joints)."""
+        """Return the lowest and highest position on the profile, exact but for rounding, shape (..., joints) each."""
         velocity, acceleration, jerk = self._velocity, self._acceleration, self._jerk
         with np.errstate(all="ignore"):  # a piece without a turning point has no root; its ends stand for it
             root = np.sqrt(acceleration**2 - 2.0 * jerk * velocity)
@@ -70,7 +70,7 @@ class ToRest:
 
 
 def after(start: Setpoint, jerk: Vector, time: Vector) -> Setpoint:
-    """The state `time` [s] later under a constant `jerk`, shaped like the position."""
+    """Return the state `time` [s] later under a constant `jerk`, shaped like the position."""
     velocity = start.velocity + time * (start.acceleration + time * jerk / 2.0)
     position = start.position + time * (start.velocity + time * (start.acceleration / 2.0 + time * jerk / 6.0))
     return Setpoint(position, velocity, start.acceleration + time * jerk)

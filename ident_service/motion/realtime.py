@@ -1,7 +1,7 @@
-"""What a process asks of the kernel so that a loop wakes in time: priority, memory, a core, no garbage collection.
+"""Ask the kernel for real time, so that a loop wakes on time: priority, locked memory, a core, no garbage collection.
 
-Each is asked for by itself and none is needed: without privileges the loop works, later now and then, and says so. The
-answers go into the recording. Boundary: this process; nothing here knows what the loop does.
+Each is asked for by itself and none is needed: without privileges the loop works, wakes late now and then, and says so.
+The answers go into the recording.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _MCL_CURRENT, _MCL_FUTURE = 1, 2  # sys/mman.h
 
 @dataclass(frozen=True)
 class Granted:
-    """What was got, and why the rest was not.
+    """Represent the real-time privileges that were granted, and why the others were refused.
 
     Attributes:
         scheduling: SCHED_FIFO.
@@ -36,7 +36,7 @@ class Granted:
     refusals: tuple[str, ...]
 
     def sentence(self) -> str:
-        """For people and for the recording."""
+        """Describe the grants and refusals in one sentence, for people and for the recording."""
         got = [
             name
             for name, one in (
@@ -51,7 +51,7 @@ class Granted:
 
 
 def ask(core_from_last: int = 0) -> Granted:
-    """Ask for everything; call it once, in the process of the loop, when all that it needs is loaded.
+    """Ask for all privileges; call it once, in the process of the loop, when all that it needs is loaded.
 
     Args:
         core_from_last: which core, counted back from the last; for a second loop beside the first.
@@ -72,7 +72,7 @@ def ask(core_from_last: int = 0) -> Granted:
     cores = sorted(os.sched_getaffinity(0))
     if len(cores) > 1:
         try:
-            # The last one: interrupts and whoever started us prefer the first.
+            # The last one: interrupts and the parent process prefer the first.
             wanted = cores[-1 - core_from_last % len(cores)]
             os.sched_setaffinity(0, {wanted})
             core = wanted
@@ -88,7 +88,7 @@ def ask(core_from_last: int = 0) -> Granted:
 
 @contextmanager
 def asked(core_from_last: int = 0) -> Iterator[Granted]:
-    """The same for a while, for a loop in a process that does other things afterwards.
+    """Ask for all privileges for the duration of a block, in a process that does other things afterwards.
 
     Args:
         core_from_last: as for `ask`.

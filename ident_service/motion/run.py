@@ -1,4 +1,4 @@
-"""One run: check, arm, follow the ways of a plan (`plans.py`), every cycle guarded, every cycle recorded.
+"""Run a motion: check and arm, then follow the references of a plan (`plans.py`), every cycle guarded and recorded.
 
 The loop owns no file: it hands samples to a sink that keeps the disk away, and a sink that fails stops the arm under
 control like one that is slow. The stop path is `_halt`: torque away, no condition, nothing that can raise.
@@ -44,13 +44,13 @@ _INFO: Final = 20  # level of rcl_interfaces/msg/Log
 
 @dataclass(frozen=True)
 class RunReport:
-    """How a run went.
+    """Represent the outcome of a run.
 
     Attributes:
-        state: DONE, or STOPPED where somebody asked for a stop.
+        state: DONE, or STOPPED after a request to stop.
         cycles: exchanged.
         peak_following_error: [rad or m], shape (joints,).
-        peak_torque: that left [N m or N], shape (joints,).
+        peak_torque: largest torque sent [N m or N], shape (joints,).
         warnings: how often each mild fault was seen.
         finished_at: of a run that was finished early and is DONE, how much of its excitation was made [s]; else None.
         not_finished: why a run that was to be finished early went on; empty for any other.
@@ -85,7 +85,7 @@ def run(
         model: with the prior parameters that control needs.
         excitation: checked against the limits beforehand.
         sink: takes every sample.
-        controls: read every cycle; None for a run that nobody stops, pauses or finishes early.
+        controls: read every cycle; None for a run without stop, pause or early finish.
         speed: share of the motion's own speed at which all of it is played, approach, return and ways out of pauses
             too; a rehearsal takes 0.2. Stops are never slowed.
         latch: the arm's faults, which outlive the run; a new one when None.
@@ -113,12 +113,12 @@ def follow(
     latch: Latch | None = None,
     hold_seconds: float = HOLD,
 ) -> RunReport:
-    """Do what a plan says with an open arm; `run` is this for an excitation.
+    """Follow a plan with an open arm; `run` does this for an excitation.
 
     Args:
         arm: open, not enabled.
         model: with the prior parameters that control needs.
-        plan: where to.
+        plan: the references to follow.
         sink: takes every sample.
         controls: as for `run`.
         latch: as for `run`.
@@ -149,7 +149,7 @@ class _Run:
             waiting = "; ".join(f"{fault.code} ({fault.cause})" for fault in self.latch.faults)
             raise MotionRefused(f"faults that nobody has acknowledged: {waiting}")
         loop, torque = self._prepared()
-        if self.controls.stop:  # planning takes a second or more; nobody wants to see the arm energised after a stop
+        if self.controls.stop:  # planning takes a second or more; the arm must not be energised after a stop
             raise MotionRefused("a stop was asked for before the arm was energised; nothing has moved")
         if not self.controls.lease_ok(self.arm.clock.now_ns()):
             raise MotionRefused("whoever asked for the motion is gone, or is silent; nothing has moved")
@@ -185,7 +185,7 @@ class _Run:
         )
 
     def _prepared(self) -> tuple[Loop, Vector]:
-        """Everything checked and put together, and the torque that holds the arm where it stands."""
+        """Check and assemble the loop; returns it with the torque that holds the arm where it stands."""
         model, chain, arm = self.model, self.model.chain, self.arm
         limits, prior = motion_limits(model.config), control_model(model).prior
         if prior is None:
@@ -265,7 +265,7 @@ class _Run:
         return loop, torque
 
     def _at_floor(self) -> Callable[[Vector], bool]:
-        """Make the function that tells if the arm's lowest point is at the floor of its description."""
+        """Create the function that returns whether the arm's lowest point is at the floor of its description."""
         floor = self.model.config.control.floor
         if floor is None:
             return lambda position: False
@@ -273,7 +273,7 @@ class _Run:
         return lambda position: height(position) <= floor
 
     def _look(self, limits: MotionLimits, period: float) -> Sample:
-        """Samples without torque: the arm must be at rest."""
+        """Exchange some cycles without torque and check that the arm rests; returns the last sample."""
         samples = [self.arm.exchange(None) for _ in range(REST_CYCLES)]
         last = samples[-1]
         if not all(bool(sample.valid.all() and np.isfinite(sample.position).all()) for sample in samples):
@@ -289,7 +289,7 @@ class _Run:
         self._loop.tell(_INFO, stamp_ns, state.value)
 
     def _halt(self, error: BaseException, loop: Loop) -> None:
-        """Take the torque away, whatever happened, and only then tell of it."""
+        """Take the torque away, whatever happened, and only then report the fault."""
         code = error.code if isinstance(error, ArmFault) else "driver" if isinstance(error, DriverError) else "program"
         # A code that the table lacks must not keep the torque on.
         rule = FAULTS.get(code, FAULTS["program"])
@@ -306,7 +306,7 @@ class _Run:
 
 
 def _tell_before(error: BaseException, loop: Loop) -> None:
-    """What came before a fault often says why it came."""
+    """Add the first fault and the warnings before a fault to its error, as notes."""
     first, warnings = loop.ended_by, loop.guard.findings.warnings
     if first is not None and first.message not in str(error):
         error.add_note(f"first came {first.code}: {first.message}")

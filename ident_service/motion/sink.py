@@ -1,4 +1,4 @@
-"""Where samples and the story of a run go; `record.recorder_process.RecorderProcess` is one."""
+"""Define where samples and events of a run go; `record.recorder_process.RecorderProcess` is one such sink."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from ident_service.record.cycle import Cycle
 
 
 class Sink(Protocol):
-    """Keeps the disk away from the loop."""
+    """Define a sink of samples and events that keeps the disk away from the loop."""
 
     @property
     def error(self) -> str:
-        """Why nothing is recorded any more; empty as long as something is, or nobody knows."""
+        """Return why nothing is recorded any more; empty as long as something is, or the reason is unknown."""
 
     def put(self, cycle: Cycle) -> bool:
-        """Take one cycle; False when the sink cannot keep up."""
+        """Take one cycle; returns False when the sink cannot keep up."""
 
     def event(self, stamp_ns: int, level: int, message: str) -> bool:
-        """Take one line of the story."""
+        """Take one line of the run's story; returns False when the sink cannot keep up."""

@@ -1,4 +1,4 @@
-"""A motion at another speed: along the same positions, at all times slower or from some time on faster or slower.
+"""Play a motion at another speed, along the same positions: constantly slower, or changing smoothly from some time on.
 
 With the motion's own time s as a function of time, and its rate r = ds/dt,
 
@@ -6,7 +6,7 @@ With the motion's own time s as a function of time, and its rate r = ds/dt,
     acceleration  q''(s) r^2  + q'(s) dr/dt
     jerk          q'''(s) r^3 + 3 q''(s) r dr/dt + q'(s) d2r/dt2
 
-A rate of at most 1 that does not change asks for less than the motion itself. Boundary: pure functions of time.
+A constant rate of at most 1 asks for less velocity, acceleration and jerk than the motion itself.
 """
 
 from __future__ import annotations
@@ -27,23 +27,23 @@ _Share = TypeVar("_Share", float, Vector)
 
 
 class Peaks(Protocol):
-    """Largest sizes of a motion's derivatives; the limits themselves are those of a way within limits."""
+    """Define the largest sizes of a motion's derivatives; for a motion within limits, the limits themselves will do."""
 
     @property
     def velocity(self) -> Vector:
-        """[rad/s or m/s], shape (joints,)."""
+        """Return the largest velocity [rad/s or m/s], shape (joints,)."""
 
     @property
     def acceleration(self) -> Vector:
-        """[rad/s^2 or m/s^2], shape (joints,)."""
+        """Return the largest acceleration [rad/s^2 or m/s^2], shape (joints,)."""
 
     @property
     def jerk(self) -> Vector:
-        """[rad/s^3 or m/s^3], shape (joints,)."""
+        """Return the largest jerk [rad/s^3 or m/s^3], shape (joints,)."""
 
 
 class Slowed:
-    """A motion at a constant share of its speed: a rehearsal.
+    """Represent a motion at a constant share of its speed: a rehearsal.
 
     Attributes:
         duration: the motion's divided by the factor [s].
@@ -60,13 +60,13 @@ class Slowed:
         self.duration = reference.duration / factor
 
     def at(self, time: float) -> Setpoint:
-        """Setpoint at `time` [s]."""
+        """Return the setpoint at `time` [s]."""
         point = self._reference.at(self._factor * time)
         return Setpoint(point.position, point.velocity * self._factor, point.acceleration * self._factor**2)
 
 
 class SpeedChange:
-    """The rest of a motion, led smoothly from one speed to another.
+    """Represent the rest of a motion, led smoothly from one speed to another.
 
     Attributes:
         change: length of the change [s]; velocity, acceleration and jerk limits hold all the while.
@@ -76,7 +76,7 @@ class SpeedChange:
     def __init__(
         self, reference: Reference, time: float, factors: tuple[float, float], peaks: Peaks, limits: MotionLimits
     ) -> None:
-        """Change the speed from now on.
+        """Plan to change the speed from now on.
 
         Args:
             reference: the motion at full speed.
@@ -97,13 +97,13 @@ class SpeedChange:
         self.duration = self._time_of(reference.duration)
 
     def motion_time(self, time: float) -> float:
-        """Time of the motion [s] at `time` [s] since the change began."""
+        """Return the time of the motion [s] at `time` [s] since the change began."""
         share = min(time / self.change, 1.0)
         gained = self.change * (self._before * share + (self._after - self._before) * _sum(share))
         return self._begin + gained + self._after * max(time - self.change, 0.0)
 
     def at(self, time: float) -> Setpoint:
-        """Setpoint at `time` [s] since the change began."""
+        """Return the setpoint at `time` [s] since the change began."""
         time = min(time, self.duration)
         share = min(time / self.change, 1.0)
         rate = self._before + (self._after - self._before) * _step(share)
@@ -113,7 +113,7 @@ class SpeedChange:
         return Setpoint(point.position, point.velocity * rate, acceleration)
 
     def _time_of(self, motion_time: float) -> float:
-        """When the motion gets to a time [s] of its own."""
+        """Return the time since the change began [s] at which the motion gets to a time [s] of its own."""
         beyond = motion_time - self.motion_time(self.change)
         if beyond >= 0.0:
             return self.change + beyond / self._after
@@ -125,7 +125,7 @@ class SpeedChange:
 
 
 def slowed_limits(limits: MotionLimits, factor: float) -> MotionLimits:
-    """Limits of a way that is to look like one within `limits` at `factor` times its speed.
+    """Return limits within which a reference looks like one within `limits` at `factor` times its speed.
 
     Raises:
         UsageError: the factor is not above 0 and at most 1.
@@ -140,7 +140,7 @@ def slowed_limits(limits: MotionLimits, factor: float) -> MotionLimits:
 
 
 def require_factor(factor: float) -> float:
-    """The factor, when it is a speed that a motion can be slowed to.
+    """Return the factor, when it is a speed that a motion can be slowed to.
 
     Raises:
         UsageError: it is not above 0 and at most 1.
@@ -161,7 +161,7 @@ def _change_length(before: float, after: float, peaks: Peaks, limits: MotionLimi
 
 
 def _keeps(length: float, before: float, after: float, peaks: Peaks, limits: MotionLimits) -> bool:
-    """Whether a change of `length` [s] stays within the limits even where all peaks meet."""
+    """Check whether a change of `length` [s] stays within the limits even where all peaks meet."""
     step = after - before
     rate = (before + step * _step(_SHARES))[:, None]
     quickening = np.abs(step * _rate(_SHARES))[:, None] / length
@@ -174,20 +174,20 @@ def _keeps(length: float, before: float, after: float, peaks: Peaks, limits: Mot
 
 
 def _step(share: _Share) -> _Share:
-    """From 0 to 1, so flat at both ends that a motion which uses a limit in full is brought to full speed in time."""
+    """Return a smooth step from 0 to 1, so flat at both ends that a motion using a limit in full reaches full speed."""
     return share**4 * (35.0 + share * (-84.0 + share * (70.0 - 20.0 * share)))
 
 
 def _rate(share: _Share) -> _Share:
-    """Derivative of the step."""
+    """Return the first derivative of the smooth step."""
     return 140.0 * (share * (1.0 - share)) ** 3
 
 
 def _curve(share: _Share) -> _Share:
-    """Its second derivative."""
+    """Return the second derivative of the smooth step."""
     return 420.0 * (share * (1.0 - share)) ** 2 * (1.0 - 2.0 * share)
 
 
 def _sum(share: _Share) -> _Share:
-    """Its integral from 0."""
+    """Return the integral of the smooth step from 0."""
     return share**5 * (7.0 + share * (-14.0 + share * (10.0 - 2.5 * share)))

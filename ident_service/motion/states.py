@@ -1,4 +1,4 @@
-"""States of a motion and the only ways between them."""
+"""Define the states of a motion and the transitions between them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ident_service.motion.latch import Latch
 
 
 class State(Enum):
-    """Where a motion is."""
+    """Name the states of a motion."""
 
     IDLE = "idle"
     CHECKED = "checked"  # it may be made, from where the arm stands; nothing is energised
@@ -52,14 +52,14 @@ LAWFUL: dict[State, tuple[State, ...]] = {
 
 
 class States:
-    """The present state of one motion.
+    """Hold the present state of one motion, and allow lawful transitions only.
 
     Attributes:
         state: present.
     """
 
     def __init__(self, latch: Latch, told: Callable[[State], None] = lambda state: None) -> None:
-        """Begin idle.
+        """Start in IDLE.
 
         Args:
             latch: the arm's.
@@ -70,9 +70,9 @@ class States:
         self._told = told
 
     def enter(self, wanted: State) -> None:
-        """Go to another state.
+        """Enter another state.
 
-        Raises:
+        ArmError: no transition leads there, a mistake of the program; or an unacknowledged fault forbids it.
             ArmError: no lawful way leads there, a mistake of the program; or a latched fault stands in it.
         """
         if wanted not in LAWFUL[self.state]:

@@ -1,4 +1,4 @@
-"""The controlled stop: from any state to rest, each joint by itself, as soon as it can.
+"""Plan controlled stops: from any state to rest, each joint by itself, as soon as it can.
 
 The quickest stop of a joint ramps its acceleration with the largest jerk to a braking one, holds it, and ramps it back
 so that velocity and acceleration vanish together. It is written down in closed form: nothing is searched, nothing can
@@ -18,8 +18,6 @@ fail, and thousands of stops are judged at once. What is guaranteed of it, with 
   (1/3 + 1/sqrt(8) + 1/24) A^3 / J^2 wide, 0.73 of that unit, the stop stays inside whenever anything does: from every
   state of a motion that itself keeps to all limits until each joint has next stood or turned, without any margin. From
   a state that nothing can keep inside, the way out is never longer than the quickest stop's.
-
-Boundary: pure computation.
 """
 
 from __future__ import annotations
@@ -39,7 +37,7 @@ _BLOCK = 4096  # samples judged at once, so that a long motion needs no more mem
 
 
 def stop(start: Setpoint, limits: MotionLimits) -> ToRest:
-    """From any state to rest; never raises.
+    """Return the controlled stop from any state to rest; never raises.
 
     Args:
         start: arrays of shape (joints,), or (samples, joints) for many stops at once. Where a number is not finite or
@@ -55,7 +53,7 @@ def stop(start: Setpoint, limits: MotionLimits) -> ToRest:
 
 
 def stop_overshoot(limits: MotionLimits) -> Vector:
-    """How far the quickest stop from a state of a motion can go beyond the motion's own turning points.
+    """Return how far the quickest stop from a state of a motion can go beyond the motion's own turning points.
 
     Returns:
         A^3 / (24 J^2) [rad or m], shape (joints,); proof above. A motion that stays so far inside the position limits
@@ -65,13 +63,13 @@ def stop_overshoot(limits: MotionLimits) -> Vector:
 
 
 def stop_extent(path: Path, limits: MotionLimits) -> tuple[Vector, Vector]:
-    """Lowest and highest position that stops from anywhere on a motion reach, the motion itself included.
+    """Return the lowest and highest position that stops from anywhere on a motion reach, the motion itself included.
 
-    Between two times looked at it may be exceeded by a trifle; and where stops come so close to a position limit that
+    Between two sampled times it may be exceeded slightly; and where stops come so close to a position limit that
     some must brake harder, by how far these settle back from there. Neither leads outside the limits: see above.
 
     Args:
-        path: looked at every 5 ms wherever it does something new.
+        path: sampled every 5 ms in its distinct parts.
         limits: that the stops keep.
 
     Returns:
@@ -118,7 +116,7 @@ def _sampled(path: Path) -> Iterator[Vector]:
 
 
 def _judged(start: Setpoint, limits: MotionLimits, side: Vector) -> tuple[ToRest, Vector, Vector]:
-    """A stop, how far it leaves the position limits [rad or m], and on which side (-1 or 1)."""
+    """Return a stop, how far it leaves the position limits [rad or m], and on which side (-1 or 1)."""
     braked = _braked(start, limits, side)
     lowest, highest = braked.extent()
     above, below = highest - limits.upper, limits.lower - lowest
@@ -126,7 +124,7 @@ def _judged(start: Setpoint, limits: MotionLimits, side: Vector) -> tuple[ToRest
 
 
 def _braked(start: Setpoint, limits: MotionLimits, side: Vector) -> ToRest:
-    """The quickest stop; first, where `side` is 1 or -1, the hardest braking before that position limit."""
+    """Return the quickest stop; where `side` is 1 or -1, the hardest braking before that position limit comes first."""
     pieces: list[Piece] = []
     state = start
     for piece in (_led_back, _ramped, _held):
@@ -136,13 +134,13 @@ def _braked(start: Setpoint, limits: MotionLimits, side: Vector) -> ToRest:
 
 
 def _led_back(state: Setpoint, limits: MotionLimits, side: Vector) -> Piece:
-    """An acceleration beyond its limit back to it."""
+    """Return the piece that leads an acceleration beyond its limit back to it."""
     excess = np.maximum(np.abs(state.acceleration) - limits.acceleration, 0.0)
     return -np.sign(state.acceleration) * limits.jerk, excess / limits.jerk
 
 
 def _ramped(state: Setpoint, limits: MotionLimits, side: Vector) -> Piece:
-    """The hardest ramp to a braking acceleration, no further than to where the joint stands."""
+    """Return the hardest ramp to a braking acceleration, no further than to where the joint stands."""
     acceleration = side * state.acceleration
     level = _braking(state, limits, side)
     length = np.where(level > 0.0, np.maximum(acceleration + level, 0.0) / limits.jerk, 0.0)
@@ -150,7 +148,7 @@ def _ramped(state: Setpoint, limits: MotionLimits, side: Vector) -> Piece:
 
 
 def _held(state: Setpoint, limits: MotionLimits, side: Vector) -> Piece:
-    """The largest braking acceleration until the joint stands."""
+    """Return the piece of largest braking acceleration until the joint stands."""
     full = _braking(state, limits, side) >= limits.acceleration
     # Ramping back from the full acceleration changes the velocity by so much, and it must not pass its own limit.
     spare = np.maximum(0.5 * limits.acceleration**2 / limits.jerk - limits.velocity, 0.0)
@@ -159,7 +157,7 @@ def _held(state: Setpoint, limits: MotionLimits, side: Vector) -> Piece:
 
 
 def _braking(state: Setpoint, limits: MotionLimits, side: Vector) -> Vector:
-    """Largest braking acceleration to be reached before the joint stands; 0 where it does not go to that side."""
+    """Return the largest braking acceleration reached before the joint stands; 0 if it does not move to that side."""
     velocity, acceleration = side * state.velocity, side * state.acceleration
     # The velocity at which the acceleration vanishes on the ramp through this state.
     crest = np.maximum(velocity + 0.5 * acceleration**2 / limits.jerk, 0.0)
@@ -169,7 +167,7 @@ def _braking(state: Setpoint, limits: MotionLimits, side: Vector) -> Vector:
 
 
 def _settled(state: Setpoint, limits: MotionLimits) -> list[Piece]:
-    """The quickest stop from an acceleration within its limit: ramp, hold, ramp back."""
+    """Return the quickest stop from an acceleration within its limit: ramp, hold, ramp back."""
     jerk, largest = limits.jerk, limits.acceleration
     # Where it would go on to if the acceleration were led straight to zero: that is what braking works against.
     side = np.where(state.velocity + 0.5 * state.acceleration * np.abs(state.acceleration) / jerk < 0.0, -1.0, 1.0)

@@ -1,6 +1,6 @@
-"""An arm that takes no torque once somebody asks for a stop: for whoever moves it without a loop that asks.
+"""Wrap an arm so that it takes no torque once a stop was asked for, for callers without a loop that checks for stops.
 
-Preflight moves an arm by hand's breadths, and ends whatever goes wrong with torque off; so does a stop in it.
+Preflight moves an arm by a few centimetres, and ends whatever goes wrong with torque off; so does a stop in it.
 """
 
 from __future__ import annotations
@@ -13,55 +13,55 @@ from ident_service.errors import DriverError
 
 
 class StoppableArm(Arm):
-    """Another arm; before it is energised, and before every torque, somebody may have asked for a stop."""
+    """Wrap an arm and refuse to enable it, or to send a torque, once a stop was asked for."""
 
     def __init__(self, arm: Arm, asked: Callable[[], bool]) -> None:
-        """Take an arm, and who says whether it is to stop."""
+        """Wrap the given arm; `asked` returns whether it is to stop."""
         self._arm, self._asked = arm, asked
         self.clock = arm.clock
 
     def open(self) -> None:
-        """Open it; the clock is its then."""
+        """Open the wrapped arm and use its clock."""
         self._arm.open()
         self.clock = self._arm.clock
 
     def describe(self) -> ArmDescription:
-        """As the arm says."""
+        """Return the wrapped arm's description."""
         return self._arm.describe()
 
     def enable(self) -> None:
-        """As the arm does; raises DriverError instead once a stop was asked for."""
+        """Enable the wrapped arm; raises DriverError instead once a stop was asked for."""
         self._require_not_asked()
         self._arm.enable()
 
     def reset(self) -> None:
-        """As the arm does."""
+        """Reset the wrapped arm."""
         self._arm.reset()
 
     def exchange(self, torque: Vector | None) -> Sample:
-        """As the arm does; raises DriverError instead of sending a torque once a stop was asked for."""
+        """Exchange with the wrapped arm; raises DriverError instead of sending a torque once a stop was asked for."""
         if torque is not None:
             self._require_not_asked()
         return self._arm.exchange(torque)
 
     def watchdogs(self) -> tuple[Watchdog, ...]:
-        """As the arm says."""
+        """Return the wrapped arm's watchdogs."""
         return self._arm.watchdogs()
 
     def withhold(self, kind: str) -> None:
-        """As the arm does."""
+        """Withhold what watchdogs of one kind watch from the wrapped arm's drives."""
         self._arm.withhold(kind)
 
     def drive_status(self) -> tuple[AxisStatus, ...]:
-        """As the arm says."""
+        """Return the wrapped arm's drive status."""
         return self._arm.drive_status()
 
     def stop(self, kind: StopKind) -> None:
-        """As the arm does."""
+        """Stop the wrapped arm."""
         self._arm.stop(kind)
 
     def close(self) -> None:
-        """As the arm does."""
+        """Close the wrapped arm."""
         self._arm.close()
 
     def _require_not_asked(self) -> None:

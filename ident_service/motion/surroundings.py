@@ -1,6 +1,6 @@
-"""Whether a run keeps clear of the arm itself and of its surroundings: the motion, the ways to and from it, the stops.
+"""Check that a run avoids collisions: the motion, the trajectories to and from it, and the stops out of all of them.
 
-Motion and ways are proven for all time (`excitation/clearance.py`); stops are looked at where they begin every 50 ms,
+Motion and trajectories are proven for all time (`excitation/clearance.py`); stops are sampled every 50 ms,
 and must only not touch: a stop is short, rare, and better than what it was asked for.
 
 A way back from a pause is proven while the arm stands and the loop goes on, one posture at a time. Within a time h a
@@ -27,19 +27,19 @@ from ident_service.motion.stop import stop
 from ident_service.motion.way import at_once
 
 _BEGINS, _POINTS = 0.05, 8  # s between stops, points on each
-_AT_ONCE = 4  # postures looked at in one go, while the loop goes on
+_AT_ONCE = 4  # postures checked in one slice, while the loop goes on
 _SHORTEST = 1e-4  # s between two postures of a way
 _ROUNDING = 1e-6  # m, more than what coal's distances are wrong by
 
 
 @dataclass(frozen=True)
 class Nearest:
-    """Where something comes nearest.
+    """Represent the smallest distance found on a motion.
 
     Attributes:
         distance: [m]; infinite where there is nothing to touch.
-        pair: whose it is, or None.
-        time: when [s].
+        pair: names of the two bodies, or None.
+        time: at which the distance is smallest [s].
     """
 
     distance: float
@@ -48,10 +48,10 @@ class Nearest:
 
 
 class Surroundings:
-    """What a way that is found while the arm is energised must keep clear of."""
+    """Check that references which are found while the arm is energised keep clear of the surroundings."""
 
     def __init__(self, model: ArmModel, limits: MotionLimits) -> None:
-        """Take an arm.
+        """Prepare the collision model of an arm.
 
         Args:
             model: with its geometry and surroundings; without any, every way is clear.
@@ -65,7 +65,7 @@ class Surroundings:
         self._limits = limits
 
     def require_clear(self, way: Reference, limits: MotionLimits) -> Generator[None, None, None]:
-        """Prove that a way keeps clear and that no stop out of it touches, a bearable part of a cycle at a time.
+        """Prove that a trajectory keeps clear and that no stop out of it touches, in slices for single control cycles.
 
         Where the arm stands nearer to something than the clearance, as after a stop, half of that distance is kept.
 
@@ -111,7 +111,7 @@ class Surroundings:
 def stops_touching(
     collision: CollisionModel, way: Reference, limits: MotionLimits
 ) -> Generator[None, None, str | None]:
-    """The stop out of a way that would touch something, in words, or None, a bearable part of a cycle at a time."""
+    """Describe a stop out of a trajectory that would touch something, or None; in slices, like `require_clear`."""
     for time in np.arange(0.0, way.duration, _BEGINS).tolist():
         reference = stop(way.at(time), limits)
         yield
@@ -131,7 +131,7 @@ def _touches(what: str, time: float, pair: str | None, distance: float) -> str:
 
 
 def way_clearance(collision: CollisionModel, reference: Reference, limits: MotionLimits, least: float) -> Clearance:
-    """Prove that a way within the velocity limits keeps clear by `least` [m]."""
+    """Compute the certified clearance of a trajectory within the velocity limits; proven if at least `least` [m]."""
 
     def position(time: Vector) -> Vector:
         return np.array([reference.at(float(t)).position for t in time])
@@ -140,7 +140,7 @@ def way_clearance(collision: CollisionModel, reference: Reference, limits: Motio
 
 
 def stop_clearance(path: Path, limits: MotionLimits, model: ArmModel) -> Nearest:
-    """The smallest distance on stops out of a motion, bodies replaced by capsules around them."""
+    """Return the smallest distance on stops out of a motion, bodies replaced by capsules around them."""
     capsules = CapsuleModel(model)
     nearest = Nearest(float("inf"), None, 0.0)
     if not capsules.pairs:
@@ -158,7 +158,7 @@ def stop_clearance(path: Path, limits: MotionLimits, model: ArmModel) -> Nearest
 
 
 def touching_stop(path: Path, limits: MotionLimits, model: ArmModel) -> str | None:
-    """The stop out of a motion that would touch something, in words; None where none does."""
+    """Describe the stop out of a motion that would touch something; None where none does."""
     nearest = stop_clearance(path, limits, model)
     if nearest.distance > 0.0:
         return None
@@ -188,7 +188,7 @@ def require_clear(model: ArmModel, path: Path, ways: Sequence[Reference], limits
 
 
 def require_ways_clear(model: ArmModel, ways: Sequence[tuple[str, Reference]], limits: MotionLimits) -> None:
-    """Refuse ways that come too near to anything, or out of which a stop would touch something.
+    """Refuse trajectories that come too near to anything, or out of which a stop would touch something.
 
     Args:
         model: of the arm, with its geometry and surroundings; without any, nothing is checked.

@@ -1,7 +1,4 @@
-"""What drives and buses tell beside their samples, as faults of the table; the most severe of a cycle counts.
-
-Boundary: from events to one fault; what events there are is `drivers/status.py`, what follows is `faults.py`.
-"""
+"""Turn the events that drives and buses report with a sample into the most severe fault of the table."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ from ident_service.motion.faults import Fault, Findings
 
 
 def told(events: Sequence[AxisEvent], names: Sequence[str], findings: Findings) -> Fault | None:
-    """Judge the events of one sample.
+    """Return the most severe fault among the events of one sample.
 
     Args:
         events: of the sample.

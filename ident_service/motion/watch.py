@@ -1,4 +1,4 @@
-"""Watch: a look at an arm that cannot move it. Nothing is energised, no torque is sent, not even a stop.
+"""Watch an arm without being able to move it: nothing is energised, no torque is sent, not even a stop.
 
 Only `look`, and `open`, `describe`, `exchange(None)` and `close` of what it returns, are used of the contract.
 """
@@ -18,12 +18,12 @@ _LONGEST = 24 * 3600.0  # s
 
 @dataclass(frozen=True)
 class Watched:
-    """What was seen of every joint, arrays of shape (joints,).
+    """Hold the summary of watching an arm, arrays of shape (joints,).
 
     Attributes:
         joint_names: in the order of the arrays.
         cycles: seen.
-        position: of the last answer [rad or m]; not a number where there was none.
+        position: of the last answer [rad or m]; NaN where there was none.
         lowest: [rad or m].
         highest: [rad or m].
         velocity: mean over all cycles [rad/s or m/s].
@@ -50,7 +50,7 @@ class Watched:
 
 
 class _Sums:
-    """Sums over all cycles, so that hours of watching need no memory."""
+    """Accumulate sums over all cycles, so that hours of watching need no memory."""
 
     def __init__(self, joints: int) -> None:
         self.count = np.zeros(joints)
@@ -72,7 +72,7 @@ class _Sums:
         self.lowest = np.where(seen, np.minimum(self.lowest, position), self.lowest)
         self.highest = np.where(seen, np.maximum(self.highest, position), self.highest)
         time = (sample.stamp_ns - self.first_ns) * 1e-9
-        # From the first position on, so that nothing is lost of the noise of an arm far from zero.
+        # Relative to the first position, so that noise of an arm far from zero is not lost to rounding.
         from_first = np.where(seen, position - self.first, 0.0)
         self.count += seen
         self.t += seen * time
@@ -85,7 +85,7 @@ class _Sums:
         self.cycles += 1
 
     def line(self) -> tuple[Vector, Vector]:
-        """Slope of the straight line through the positions, and the standard deviation about it."""
+        """Return the slope of the straight line through the positions, and the standard deviation about it."""
         count = np.maximum(self.count, 1.0)
         tt = self.tt - self.t**2 / count
         tq = self.tq - self.t * self.q / count
@@ -104,7 +104,7 @@ def watch(
     cycles: int | None = None,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> Watched:
-    """Look at an arm, and only look.
+    """Watch an arm for some time, without torque, and summarise the samples.
 
     Args:
         arm: not open.
@@ -117,7 +117,7 @@ def watch(
         The summary.
 
     Raises:
-        UsageError: no time to look in, or more than a day.
+        UsageError: no time to watch, or more than a day.
         DriverError: the arm cannot be opened or does not answer.
     """
     if not (0.0 < seconds <= _LONGEST) or (cycles is not None and cycles < 1):

@@ -1,4 +1,4 @@
-"""Jerk-limited ways from one moving state to another: the approach, the return, the way back onto a motion.
+"""Plan jerk-limited trajectories from one moving state to another: approach, return, resumption of a motion.
 
 Every way is a ruckig trajectory within the arm's velocity, acceleration and jerk; ruckig is imported nowhere else.
 """
@@ -17,14 +17,14 @@ from ident_service.errors import MotionRefused
 from ident_service.motion.reference import Setpoint
 
 _Result = TypeVar("_Result")
-_SLICE = 50  # points of a way looked at in one go
-# s; ruckig finds no way of just the slowest joint's duration where another is to end as it begins, accelerating
+_SLICE = 50  # points of a trajectory evaluated in one slice
+# s; where a joint is to end as it begins, accelerating, ruckig finds no trajectory of just the slowest joint's duration
 _DURATIONS = (None, 0.1, 0.2, 0.5, 1.0)
 _EXTENT_STEP = 1e-3  # s; a turning point lies at most acceleration * step^2 / 8 outside: 2e-6 rad at 16 rad/s^2
 
 
 class RuckigReference:
-    """A jerk-limited trajectory."""
+    """Represent a jerk-limited trajectory computed by ruckig."""
 
     def __init__(self, parameters: ruckig.InputParameter) -> None:
         self._trajectory = ruckig.Trajectory(parameters.degrees_of_freedom)
@@ -49,16 +49,16 @@ class RuckigReference:
         return ruckig.Ruckig(parameters.degrees_of_freedom).calculate(parameters, self._trajectory)
 
     def at(self, time: float) -> Setpoint:
-        """Setpoint at `time` [s]."""
+        """Return the setpoint at `time` [s]."""
         position, velocity, acceleration = self._trajectory.at_time(min(time, self.duration))[:3]
         return Setpoint(np.array(position), np.array(velocity), np.array(acceleration))
 
     def extent(self) -> tuple[Vector, Vector]:
-        """Lowest and highest position on the way, each of shape (joints,), but for what happens between two points."""
+        """Return the lowest and highest position, each of shape (joints,), sampled every `_EXTENT_STEP`."""
         return at_once(self.extent_in_slices())
 
     def extent_in_slices(self) -> Generator[None, None, tuple[Vector, Vector]]:
-        """As `extent`, a bearable part of a control cycle at a time."""
+        """Compute `extent` in slices short enough for a control cycle; the generator returns both positions."""
         # The position_extrema of ruckig itself miss turning points (pantor/ruckig#215), here by more than 0.1 rad.
         times = np.linspace(0.0, self.duration, 2 + int(self.duration / _EXTENT_STEP)).tolist()
         at_time = self._trajectory.at_time
@@ -75,9 +75,9 @@ _CALM = 0.5  # of the limits, on the way to a motion and back
 
 
 def calm_way(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference:
-    """The way to a motion or back from it: within half of the velocity and acceleration limits where its ends allow.
+    """Plan a trajectory to a motion or back, within half of the velocity and acceleration limits where its ends allow.
 
-    A way at the full limits leaves nothing for what the model does not know, and nobody waits for its last second.
+    A trajectory at the full limits leaves no margin for errors of the model, and a second more does not matter.
 
     Raises:
         MotionRefused: as `way`.
@@ -86,7 +86,7 @@ def calm_way(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigRefe
 
 
 def calm_way_in_slices(start: Setpoint, end: Setpoint, limits: MotionLimits) -> Generator[None, None, RuckigReference]:
-    """As `calm_way`, a bearable part of a control cycle at a time; the generator returns the way.
+    """Plan as `calm_way` does, in slices short enough for a control cycle; the generator returns the trajectory.
 
     Raises:
         MotionRefused: as `way`, from any of its steps.
@@ -102,7 +102,7 @@ def calm_way_in_slices(start: Setpoint, end: Setpoint, limits: MotionLimits) -> 
 
 
 def way(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference:
-    """From one moving or resting state to another, all joints arriving together.
+    """Plan a trajectory from one moving or resting state to another, all joints arriving together.
 
     Raises:
         MotionRefused: no such way exists within the limits, or it would leave the position limits.
@@ -111,7 +111,7 @@ def way(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference
 
 
 def way_in_slices(start: Setpoint, end: Setpoint, limits: MotionLimits) -> Generator[None, None, RuckigReference]:
-    """As `way`, a bearable part of a control cycle at a time; the generator returns the way.
+    """Plan as `way` does, in slices short enough for a control cycle; the generator returns the trajectory.
 
     Raises:
         MotionRefused: as `way`, from any of its steps.
@@ -141,7 +141,7 @@ def way_in_slices(start: Setpoint, end: Setpoint, limits: MotionLimits) -> Gener
 
 
 def at_once(slices: Generator[None, None, _Result]) -> _Result:
-    """What a generator returns."""
+    """Run a generator to its end and return its result."""
     while True:
         try:
             next(slices)

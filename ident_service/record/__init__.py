@@ -1,1 +1,1 @@
-"""Recordings: written while the arm moves, read back one block at a time, whatever file they lie in."""
+"""Write recordings while the arm moves, and read them back one block at a time, whatever file they lie in."""

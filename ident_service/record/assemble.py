@@ -1,4 +1,4 @@
-"""From the pieces a reader decodes to the blocks the door promises: of the asked length, and checked.
+"""Assemble the pieces that a reader decodes into checked blocks of the requested length.
 
 The checks are the same for every kind of file: finite values and strictly increasing stamps. A sample that repeats the
 one before it, stamp and values, says nothing new (a message delivered twice, a bag merged with itself); it is left out
@@ -35,7 +35,7 @@ def assemble(
         samples: length of the blocks; the last one is shorter.
         path: of the file, for messages.
         joints: a name per column, for messages.
-        place: what to call the sample of this index (from 0, those left out counted) in messages.
+        place: name in messages of the sample of this index (from 0, those left out counted).
         skip_missing: whether to leave out samples with a value of NaN.
 
     Raises:
@@ -70,7 +70,7 @@ def assemble(
 
 
 class _Check:
-    """Knows the samples that went by."""
+    """Check pieces one after the other, remembering the last sample."""
 
     def __init__(self, path: Path, joints: Sequence[str], place: Callable[[int], str], *, skip_missing: bool) -> None:
         self._path = path
@@ -108,7 +108,7 @@ class _Check:
         return _selected(piece, np.flatnonzero(kept), int(repeats.sum()))
 
     def ended(self, block: Block) -> Block:
-        """Count what was left out behind the file's last sample with that sample."""
+        """Add the samples that were left out behind the file's last sample to the count of that sample."""
         if not self.skipped:
             return block
         skipped = np.zeros_like(block.stamp_ns) if block.skipped is None else block.skipped.copy()
@@ -132,7 +132,7 @@ class _Check:
         return _selected(replace(piece, skipped=np.diff(before, prepend=0)), kept, piece.repeats), kept
 
     def _refuse(self, piece: Block, step: Stamps, stuck: NDArray[np.bool_]) -> None:
-        """Raise for the first sample that cannot be."""
+        """Raise RecordingError for the first sample that is not valid."""
         problems = []
         if stuck.any():
             problems.append((int(np.argmax(stuck)), "the stamp does not increase, but the values change"))
@@ -161,7 +161,7 @@ class _Check:
 
 
 def _same_as_before(run: Block) -> NDArray[np.bool_]:
-    """Which samples, from the second on, equal the one before in everything."""
+    """Return which samples, from the second on, equal the one before in stamp and all values."""
     same: NDArray[np.bool_] = np.diff(run.stamp_ns) == 0
     if same.any():
         for values in (run.position, run.torque, run.velocity):
@@ -171,7 +171,7 @@ def _same_as_before(run: Block) -> NDArray[np.bool_]:
 
 
 def _selected(piece: Block, kept: NDArray[np.intp], repeats: int) -> Block:
-    """Select samples of a piece; what was skipped before the others counts before the next one that is kept."""
+    """Select samples of a piece; samples skipped before dropped ones count before the next one that is kept."""
     velocity = None if piece.velocity is None else piece.velocity[kept]
     skipped = None if piece.skipped is None else np.diff(np.cumsum(piece.skipped)[kept], prepend=0)
     return Block(piece.stamp_ns[kept], piece.position[kept], piece.torque[kept], velocity, repeats, skipped)

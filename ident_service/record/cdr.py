@@ -1,4 +1,4 @@
-"""Encoders for our messages in CDR (OMG CORBA 3.0 section 15.3, the plain XCDR version 1 of DDS), little endian.
+"""Encode messages in CDR (OMG CORBA 3.0 section 15.3, the plain XCDR version 1 of DDS), little endian.
 
 A payload is the encapsulation header `00 01 00 00` and then the fields, each aligned to its own size counted from
 behind that header. All that is equal from sample to sample is laid out once per recording.
@@ -19,7 +19,7 @@ _NO_ELEMENTS: Final = struct.pack("<I", 0)
 
 
 class CdrBuilder:
-    """Fields appended one after the other, each at its alignment."""
+    """Append fields one after the other, each at its alignment."""
 
     def __init__(self) -> None:
         self._data = bytearray()
@@ -29,48 +29,48 @@ class CdrBuilder:
         self._data.extend(bytes(-len(self._data) % size))
 
     def uint8(self, value: int) -> None:
-        """One byte."""
+        """Append one byte."""
         self._data.append(value)
 
     def uint32(self, value: int) -> None:
-        """Four bytes at a multiple of four."""
+        """Append four bytes at a multiple of four."""
         self.align(4)
         self._data += struct.pack("<I", value)
 
     def stamp(self, utc_ns: int) -> None:
-        """builtin_interfaces/Time from nanoseconds since 1970."""
+        """Append a builtin_interfaces/Time from nanoseconds since 1970."""
         self.align(4)
         self._data += stamp_bytes(utc_ns)
 
     def string(self, value: str) -> None:
-        """Length with the closing zero, the bytes in UTF-8, and the zero."""
+        """Append a string: length with the closing zero, the bytes in UTF-8, and the zero."""
         encoded = value.encode()
         self.uint32(len(encoded) + 1)
         self._data += encoded + b"\x00"
 
     def body(self) -> bytes:
-        """What has been appended, without the encapsulation header."""
+        """Return the bytes appended so far, without the encapsulation header."""
         return bytes(self._data)
 
     def payload(self) -> bytes:
-        """The whole message."""
+        """Return the whole message."""
         return ENCAPSULATION + self._data
 
 
 def stamp_bytes(utc_ns: int) -> bytes:
-    """builtin_interfaces/Time: whole seconds rounded down, and the nanoseconds on top."""
+    """Encode a builtin_interfaces/Time: whole seconds rounded down, and the nanoseconds on top."""
     return _STAMP.pack(*divmod(utc_ns, 1_000_000_000))
 
 
 def encode_string(data: str) -> bytes:
-    """std_msgs/msg/String."""
+    """Encode a std_msgs/msg/String."""
     builder = CdrBuilder()
     builder.string(data)
     return builder.payload()
 
 
 def encode_log(utc_ns: int, level: int, name: str, message: str) -> bytes:
-    """rcl_interfaces/msg/Log without a source position; `level` is 10 (debug), 20, 30, 40 or 50 (fatal)."""
+    """Encode a rcl_interfaces/msg/Log without a source position; `level` is 10 (debug), 20, 30, 40 or 50 (fatal)."""
     builder = CdrBuilder()
     builder.stamp(utc_ns)
     builder.uint8(level)
@@ -81,7 +81,7 @@ def encode_log(utc_ns: int, level: int, name: str, message: str) -> bytes:
 
 
 class JointStateEncoder:
-    """sensor_msgs/msg/JointState of always the same joints, with an empty frame_id."""
+    """Encode sensor_msgs/msg/JointState of always the same joints, with an empty frame_id."""
 
     def __init__(self, joint_names: Sequence[str]) -> None:
         self._joints = len(joint_names)
@@ -109,7 +109,7 @@ class JointStateEncoder:
         self._until_effort = effort.body()[_STAMP.size :]
 
     def encode_effort(self, utc_ns: int, effort: ArrayLike) -> bytes:
-        """One message without position and velocity.
+        """Encode one message without position and velocity.
 
         Args:
             utc_ns: stamp [ns since 1970].
@@ -121,7 +121,7 @@ class JointStateEncoder:
         return b"".join((ENCAPSULATION, stamp_bytes(utc_ns), self._until_effort, self._floats(effort)))
 
     def encode(self, utc_ns: int, position: ArrayLike, velocity: ArrayLike | None, effort: ArrayLike | None) -> bytes:
-        """One message.
+        """Encode one message.
 
         Args:
             utc_ns: stamp [ns since 1970].
@@ -151,7 +151,7 @@ class JointStateEncoder:
 
 
 class CycleEncoder:
-    """ident_msgs/msg/Cycle of a fixed number of axes, with an empty frame_id."""
+    """Encode ident_msgs/msg/Cycle of a fixed number of axes, with an empty frame_id."""
 
     def __init__(self, axes: int) -> None:
         self._axes = axes
@@ -167,7 +167,7 @@ class CycleEncoder:
         age: ArrayLike,
         lost: int,
     ) -> bytes:
-        """One message.
+        """Encode one message.
 
         Args:
             utc_ns: stamp [ns since 1970].

@@ -1,4 +1,4 @@
-"""Reads CSV recordings: header `t,q1..qN,tau1..tauN`, optional `dq1..dqN`, in any order, plain or gzip.
+"""Read CSV recordings: header `t,q1..qN,tau1..tauN`, optional `dq1..dqN`, in any order, plain or gzip.
 
 Time `t` becomes integer nanoseconds as if by decimal arithmetic, so that a UTC time keeps all its digits. A column map
 (`RecordingFormat.columns`) reads other names and units, and no other columns than those it names.
@@ -132,7 +132,7 @@ class CsvRecording:
                 yield self._parse(rows[begin : begin + BLOCK_SAMPLES], first + begin)
 
     def _parse(self, rows: list[bytes], first: int) -> Block:
-        """Rows to a block; `first` is the line number of the first one."""
+        """Parse rows to a block; `first` is the line number of the first one."""
         columns = self._columns
         separators = columns.fields - 1
         if any(row.count(b",") != separators for row in rows):
@@ -216,7 +216,7 @@ class CsvRecording:
                     raise RecordingError(self.path, f"line {line}: {name} is {field[:40]!r}, not a number{hint}")
 
     def _lines(self) -> Iterator[list[bytes]]:
-        """The file's lines, some at a time, without their ends."""
+        """Yield the file's lines, some at a time, without their ends."""
         tail = b""
         for data in self._expanded():
             lines = (tail + data).split(b"\n")
@@ -229,7 +229,7 @@ class CsvRecording:
             yield [tail]
 
     def _expanded(self) -> Iterator[bytes]:
-        """The file's bytes, decompressed where needed, a bounded number in all."""
+        """Yield the file's bytes, decompressed where needed, a bounded number in all."""
         total = 0
         try:
             with self.path.open("rb") as raw:

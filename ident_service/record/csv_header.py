@@ -1,4 +1,4 @@
-"""The header of a CSV recording: which column is what in which unit, or everything that is wrong with it at once."""
+"""Parse the header of a CSV recording: which column is which quantity in which unit, or all that is wrong with it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _NAME: Final = re.compile(r"(q|dq|tau)([1-9]\d{0,3})")
 
 @dataclass(frozen=True)
 class CsvColumns:
-    """Where in a row each quantity stands.
+    """Hold the column index, and the scale to SI, of each quantity in a row.
 
     Attributes:
         names: of all columns, as the file has them.
@@ -31,7 +31,7 @@ class CsvColumns:
         torque: indices of the torques, shape (joints,).
         velocity: indices of the velocities, shape (joints,), or None.
         nanoseconds: in one unit of the time column.
-        scale: what each column's numbers are multiplied by to be in SI, shape (fields,); None where all are.
+        scale: factor from each column's unit to SI, shape (fields,); None where all are in SI.
         used: indices of all columns above, in the order of the file.
     """
 
@@ -46,22 +46,22 @@ class CsvColumns:
 
     @property
     def fields(self) -> int:
-        """Fields in a row."""
+        """Return the number of fields in a row."""
         return len(self.names)
 
     @property
     def joints(self) -> int:
-        """Number of joints."""
+        """Return the number of joints."""
         return len(self.position)
 
 
 def parse_header(path: Path, header: str, columns: Mapping[str, Column] | None = None) -> CsvColumns:
-    """Find the columns.
+    """Find the columns of a recording in its header.
 
     Args:
         path: for messages.
         header: the first line.
-        columns: the file's column for each of ours, where it has others; None reads ours, in SI.
+        columns: the file's column for each standard name, where it has others; None reads standard names, in SI.
 
     Raises:
         RecordingError: the message lists all problems.

@@ -1,6 +1,6 @@
-"""One cycle as it is recorded: what passes from the motion loop through the ring to the file.
+"""Define the record of one control cycle, which passes from the motion loop through the ring to the file.
 
-Boundary: the record's fields and what they mean. A named tuple, because the loop makes one every millisecond.
+It is a named tuple because the loop makes one every millisecond.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ Vector = NDArray[np.float64]
 
 
 class Cycle(NamedTuple):
-    """One cycle; whoever keeps it longer than the call it was handed over in copies the arrays.
+    """Represent one control cycle; code that keeps it beyond the call it was passed in must copy the arrays.
 
     Attributes:
         stamp_ns: monotonic time of the positions [ns].

@@ -1,7 +1,4 @@
-"""How the loop kept time while it recorded: what stands on `/cycle` of our own MCAP recordings.
-
-Boundary: numbers out of a file; what they mean to a person is said elsewhere.
-"""
+"""Read the timing of the control loop from `/cycle` of this package's MCAP recordings."""
 
 from __future__ import annotations
 
@@ -27,7 +24,7 @@ _CHUNK: Final = 8192
 
 @dataclass(frozen=True)
 class Cycles:
-    """Consecutive cycles of a loop.
+    """Hold the timing and axis status of consecutive cycles of a loop.
 
     Attributes:
         lateness_ns: how late each began [ns], shape (cycles,).
@@ -45,9 +42,9 @@ class Cycles:
 
 
 def read_cycles(path: Path) -> Iterator[Cycles]:
-    """Read `/cycle` in order, some thousand cycles at a time, up to the tear where there is one.
+    """Read `/cycle` in order, some thousand cycles at a time, up to where the file is cut off or damaged.
 
-    Nothing comes from a file that is not MCAP or has no such topic of our kind.
+    Yields nothing from a file that is not MCAP or has no such topic of this package's type.
 
     Raises:
         UsageError: no such file.
@@ -101,7 +98,7 @@ def _columns(payloads: list[bytes], kind: np.dtype[np.void]) -> Cycles:
 
 
 def _layout(path: Path, payload: bytes) -> np.dtype[np.void]:
-    """Where in a payload the fields stand; `CycleEncoder` is the other side."""
+    """Return the layout of the fields in a payload; the counterpart of `CycleEncoder`."""
     try:
         (axes,) = struct.unpack_from("<I", payload, _COUNT)
     except struct.error:

@@ -1,4 +1,4 @@
-"""What stands beside the samples in an MCAP recording: metadata, attachments, events, the arm's description."""
+"""Read what accompanies the samples in an MCAP recording: metadata, attachments, events, the arm's description."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _LOG_TEXTS: Final = 13  # encapsulation header, stamp, level
 
 @dataclass(frozen=True)
 class Event:
-    """A line that somebody logged while recording.
+    """Represent a line that was logged while recording.
 
     Attributes:
         stamp_ns: on the recording's time axis [ns].
         level: 10 debug, 20 information, 30 warning, 40 error, 50 fatal.
-        name: who logged.
-        message: what.
+        name: of the logger.
+        message: text that was logged.
     """
 
     stamp_ns: int
@@ -38,7 +38,7 @@ class Event:
 
 @dataclass(frozen=True)
 class Extras:
-    """All of it.
+    """Hold metadata, attachments, events and robot description of a recording.
 
     Attributes:
         metadata: by name of the record; of several of one name the later entries count.
@@ -54,13 +54,13 @@ class Extras:
 
 
 def read_extras(path: Path, stream: IO[bytes], size: int, utc_offset_ns: int) -> Extras:
-    """Read them from an open file, up to the tear where there is one.
+    """Read the extras from an open file, up to the damage where there is some.
 
     Args:
         path: for messages.
         stream: the file.
         size: how many bytes of it to read.
-        utc_offset_ns: what to subtract from the events' stamps [ns].
+        utc_offset_ns: offset to subtract from the events' stamps [ns].
 
     Raises:
         RecordingError: attachments of more than 64 MiB, or a chunk that expands beyond that.
@@ -106,7 +106,7 @@ def read_extras(path: Path, stream: IO[bytes], size: int, utc_offset_ns: int) ->
 
 
 def event(payload: bytes, utc_offset_ns: int) -> Event:
-    """A line of `/events`, `utc_offset_ns` subtracted from its stamp [ns]; raises struct.error where it is none."""
+    """Decode a message of `/events`, its stamp less `utc_offset_ns` [ns]; struct.error where it is malformed."""
     seconds, nanoseconds, level = struct.unpack_from("<iIB", payload, 4)
     name, position = _string(payload, _LOG_TEXTS)
     message, _ = _string(payload, position)
@@ -114,7 +114,7 @@ def event(payload: bytes, utc_offset_ns: int) -> Event:
 
 
 def _string(payload: bytes, position: int) -> tuple[str, int]:
-    """A string at or behind `position`, and the position behind it."""
+    """Decode a string at the next multiple of four from `position`; returns it and the position behind it."""
     position += -position % 4
     (length,) = struct.unpack_from("<I", payload, position)
     end = position + 4 + length

@@ -1,4 +1,4 @@
-"""What every reader asks of a file before it looks inside: that it is there, and its hash; and writing one whole."""
+"""Check that files exist and can be written, hash them, and write them atomically."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def require_file(path: Path) -> None:
 
 
 def require_writable(folder: Path) -> None:
-    """Make a folder and see that a file can be kept in it, before something begins that must be written down there.
+    """Create a folder and check that files can be written into it, before something begins that must be recorded there.
 
     Raises:
         UsageError: it cannot be made, or nothing can be written into it.
@@ -61,7 +61,7 @@ def require_writable(folder: Path) -> None:
 
 
 def sha256(path: Path, size: int) -> str:
-    """SHA-256 of the first `size` bytes, so that a file that is still growing has a hash of what is read of it.
+    """Return the SHA-256 of the first `size` bytes, so that a file that still grows has a hash of what is read of it.
 
     Raises:
         RecordingError: the file cannot be read.

@@ -1,4 +1,4 @@
-"""How regular a recording's stamps are: usual period, jitter, gaps; found in one pass, in constant memory.
+"""Determine how regular a recording's stamps are (usual period, jitter, gaps) in one pass, in constant memory.
 
 The usual period is the mean of the steps that are near it, found from the median step in a few rounds: the median
 alone would be off by the rounding of the stamps (steps of 7 and 8 ms at 128 Hz) or by stamps that come late in turns,
@@ -30,7 +30,7 @@ _CLASSES: Final = 43_700  # 1000 a factor of e, up to the longest step an int64 
 
 @dataclass(frozen=True)
 class Segment:
-    """Samples without a gap between them.
+    """Represent a range of samples without a gap between them.
 
     Attributes:
         first_ns: stamp of the first one [ns].
@@ -42,13 +42,13 @@ class Segment:
 
     @property
     def duration_s(self) -> float:
-        """From first to last [s]."""
+        """Return the duration from the first to the last sample [s]."""
         return (self.last_ns - self.first_ns) * 1e-9
 
 
 @dataclass(frozen=True)
 class Grid:
-    """The stamps of a recording, trimmed.
+    """Describe the stamps of a recording, after trimming.
 
     Attributes:
         period_s: of the uniform samples made of it [s].
@@ -82,12 +82,12 @@ class Grid:
 
     @property
     def gaps(self) -> tuple[Segment, ...]:
-        """From the last sample before each gap to the first one after it."""
+        """Return each gap, from the last sample before it to the first one after it."""
         pairs = zip(self.segments[:-1], self.segments[1:], strict=True)
         return tuple(Segment(before.last_ns, after.first_ns) for before, after in pairs)
 
     def least_s(self, shortest_s: float) -> float:
-        """How long a segment has to be [s]: as asked for, and long enough for a curve through four samples.
+        """Return the least duration of a usable segment [s]: as asked for, and enough for a curve through four samples.
 
         Args:
             shortest_s: shortest duration asked for [s].
@@ -97,7 +97,7 @@ class Grid:
 
 
 def grid(recording: Recording, fmt: RecordingFormat) -> Grid:
-    """Read a recording's stamps once.
+    """Read a recording's stamps once and determine their period, jitter and gaps.
 
     Raises:
         RecordingError: fewer than two samples, or none left after trimming; more than 1000 gaps; a rate asked for
@@ -123,7 +123,7 @@ def _grid(recording: Recording, fmt: RecordingFormat) -> Grid:
         if block.skipped is None:
             steps.add(run)
         else:
-            # A step over what was left out says nothing of how evenly samples were taken.
+            # A step across samples that were left out does not show how evenly samples were taken.
             skipped += int(block.skipped.sum())
             behind = np.flatnonzero(block.skipped) + len(run) - len(stamps)
             for part in np.split(run, behind):
@@ -180,7 +180,7 @@ def _grid(recording: Recording, fmt: RecordingFormat) -> Grid:
 
 
 def trimmed(blocks: Iterable[Block], trim: tuple[float, float]) -> Iterator[Block]:
-    """Blocks without the first and the last seconds; holds back as many samples as the end's seconds have.
+    """Yield blocks without the first and the last seconds; holds back as many samples as the last seconds have.
 
     Args:
         blocks: of a recording, in order.
@@ -205,7 +205,7 @@ def trimmed(blocks: Iterable[Block], trim: tuple[float, float]) -> Iterator[Bloc
 
 
 def _period(recording: Recording, fmt: RecordingFormat, own: float) -> float:
-    """The uniform samples' period [ns]."""
+    """Return the uniform samples' period [ns]."""
     if fmt.rate is None or abs(fmt.rate * own * 1e-9 - 1.0) <= REGULAR:
         return own
     share = fmt.rate * own * 1e-9
@@ -219,7 +219,7 @@ def _period(recording: Recording, fmt: RecordingFormat, own: float) -> float:
 
 
 class _Steps:
-    """Counts steps in classes, and remembers the longest ones with their places."""
+    """Count steps in classes, and remember the longest steps with their stamps."""
 
     def __init__(self) -> None:
         self._count = np.zeros(_CLASSES, np.int64)
@@ -230,7 +230,7 @@ class _Steps:
         self._longest = np.empty((0, 2), np.int64)
 
     def add(self, stamps: Stamps) -> None:
-        """Take the steps between consecutive samples [ns]."""
+        """Count the steps between consecutive stamps [ns]."""
         if len(stamps) < 2:
             return
         order = np.argsort(np.diff(stamps), kind="stable")
@@ -253,7 +253,7 @@ class _Steps:
         return not self._count.any()
 
     def usual(self) -> float:
-        """The usual step [ns]."""
+        """Return the usual step [ns]."""
         median = int(np.searchsorted(np.cumsum(self._count), 0.5 * self._count.sum()))
         usual = float(self._sum[median] / self._count[median])
         for _ in range(_ROUNDS):
@@ -262,7 +262,7 @@ class _Steps:
         return usual
 
     def spread(self, usual: float, gap: float) -> tuple[float, float, float]:
-        """Smallest and largest step that is no gap, and the standard deviation from the usual one [ns]."""
+        """Return the smallest and largest step that is no gap, and the standard deviation from the usual one [ns]."""
         inside = (self._count > 0) & (self._low <= gap)
         n = self._count[inside].sum()
         square = self._square[inside].sum() - 2.0 * usual * self._sum[inside].sum() + n * usual**2
@@ -271,6 +271,6 @@ class _Steps:
         return float(self._low[inside].min()), min(float(self._high[inside].max()), gap), deviation
 
     def longer_than(self, gap: float) -> Stamps:
-        """Stamps before and after each of the longest steps that are gaps [ns], in order, shape (gaps, 2)."""
+        """Return the stamps before and after each of the longest gaps [ns], in order, shape (gaps, 2)."""
         found: Stamps = self._longest[self._longest[:, 1] - self._longest[:, 0] > gap]
         return found[np.argsort(found[:, 0])]

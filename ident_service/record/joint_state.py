@@ -1,4 +1,4 @@
-"""Decodes sensor_msgs/msg/JointState payloads many at a time.
+"""Decode sensor_msgs/msg/JointState payloads many at a time.
 
 Messages of one publisher differ in the stamp and the numbers only, so one is parsed field by field and the rest are
 read as columns, after a check that their names and counts are byte for byte the same.
@@ -24,7 +24,7 @@ _MAX_LAYOUTS: Final = 16
 
 
 class PayloadError(ValueError):
-    """A payload that is no JointState, or not the one that was expected; `index` counts within the call."""
+    """Report a payload that is no JointState, or not the expected one; `index` counts within the call."""
 
     def __init__(self, message: str, index: int = 0) -> None:
         self.index = index
@@ -33,7 +33,7 @@ class PayloadError(ValueError):
 
 @dataclass(frozen=True)
 class Layout:
-    """Where in a payload of this length and these names the numbers stand.
+    """Describe where the numbers stand in a payload of a given length and given joint names.
 
     Attributes:
         names: of the joints, in the payload's order.
@@ -73,7 +73,7 @@ class Layout:
                 raise PayloadError("the message ends too early")
             return value
 
-        # The frame's length moves everything behind it; what it says is nobody's business.
+        # The frame's length moves everything behind it; its content is not used.
         frame = count()
         position += frame
         names = []
@@ -101,18 +101,18 @@ class Layout:
         return cls(tuple(names), **starts, fixed=where, expected=np.frombuffer(payload, np.uint8)[where])
 
     def matches(self, rows: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """Which payloads, one a row, have this layout."""
+        """Return which payloads, one a row, have this layout."""
         same: NDArray[np.bool_] = (rows[:, self.fixed] == self.expected).all(axis=1)
         return same
 
     def columns(self, rows: NDArray[np.uint8], start: int, order: NDArray[np.intp]) -> Matrix:
-        """One value sequence of all payloads, shape (payloads, len(order))."""
+        """Return one value sequence of all payloads, shape (payloads, len(order))."""
         values = rows[:, start : start + 8 * len(self.names)]
         return np.ascontiguousarray(values).view("<f8")[:, order].astype(np.float64, copy=False)
 
 
 class JointStateDecoder:
-    """Turns payloads into columns of chosen joints.
+    """Decode payloads into columns of chosen joints.
 
     Args:
         names: joints wanted, in the order of the columns.
@@ -174,7 +174,7 @@ class JointStateDecoder:
         return Block(stamp[used], position[used], effort[used], velocity[used] if self._velocity else None)
 
     def _order(self, layout: Layout) -> NDArray[np.intp] | None:
-        """Where in the payload the wanted joints stand, None for a payload to leave out."""
+        """Return the indices in the payload of the wanted joints, None for a payload to leave out."""
         present = set(layout.names)
         missing = [name for name in self._names if name not in present]
         if self._others and len(missing) == len(self._names):

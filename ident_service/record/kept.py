@@ -39,10 +39,10 @@ def memory_of(recording: Recording) -> Memory | None:
 
 
 class KeptRecording:
-    """Another recording behind the same protocol; one that is larger than a bound is read from its file every time."""
+    """Cache another recording behind the same protocol; one larger than a bound is read from its file every time."""
 
     def __init__(self, whole: Recording, max_bytes: int = MAX_BYTES) -> None:
-        """Stand before `whole`, and keep at most `max_bytes` of its samples."""
+        """Wrap `whole`, and cache at most `max_bytes` of its samples."""
         self.path: Path = whole.path
         self.sha256 = whole.sha256
         self.joint_names = whole.joint_names
@@ -55,7 +55,7 @@ class KeptRecording:
 
     @property
     def torn(self) -> bool:
-        """True when the file ended in the middle of a record and was read up to there."""
+        """Return whether the file ended in the middle of a record and was read up to there."""
         return self._whole.torn
 
     @torn.setter
@@ -63,7 +63,7 @@ class KeptRecording:
         self._whole.torn = torn
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
-        """Read the samples in order; see `Recording.blocks`. Nobody may write into a block."""
+        """Read the samples in order; see `Recording.blocks`. The blocks' arrays are read-only."""
         if self._kept is not None:
             for start in range(0, len(self._kept.stamp_ns), samples):
                 yield cut(self._kept, start, start + samples)

@@ -1,7 +1,7 @@
-"""Reads JointState recordings in MCAP: our own, and ROS 2 bags from anywhere.
+"""Read JointState recordings in MCAP: this package's own, and ROS 2 bags from anywhere.
 
-Our own say in their metadata how far UTC is from the monotonic clock, and that torque is held from stamp to stamp; of
-a bag neither is known. A file that was cut off is read up to the cut, and so is one with a damaged chunk.
+This package's files say in their metadata how far UTC is from the monotonic clock, and that torque is held from stamp
+to stamp; for a bag neither is known. A file that was cut off is read up to the cut, so is one with a damaged chunk.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _MAX_STAMP: Final = (1 << 63) - 1
 
 
 class McapRecording:
-    """A Recording in an MCAP file.
+    """Represent a recording in an MCAP file.
 
     Attributes:
         path: the file.
@@ -40,7 +40,7 @@ class McapRecording:
         torn: whether the file ends, or is damaged, before its end mark.
         metadata: the record `ident`, empty for a bag.
         own: whether this package wrote it; topic, names and sides are then its own whatever the arm's bags are like.
-        damage: what is wrong where the file is torn, else empty.
+        damage: description of the damage where the file is torn, else empty.
     """
 
     def __init__(
@@ -174,7 +174,7 @@ class McapRecording:
     def _payloads(
         self, directory: mcap.Directory | None = None, topic: str | None = None
     ) -> Iterator[tuple[int, bytes]]:
-        """Log time [ns] and payload of each message on a topic, that of the states if None, up to the tear."""
+        """Yield log time [ns] and payload of each message on a topic (None: that of the states), up to the damage."""
         directory, topic = directory or mcap.Directory(), topic or self._topic
 
         def choose(channel_id: int) -> bool:
@@ -203,7 +203,7 @@ class McapRecording:
         return True
 
     def _first(self, order: Sequence[str] | None) -> tuple[Layout, bytes]:
-        """The first message that has one of the wanted joints."""
+        """Return the first message that has one of the wanted joints, and its layout."""
         directory = mcap.Directory()
         seen: dict[str, None] = {}
         for index, (_, payload) in enumerate(self._payloads(directory)):

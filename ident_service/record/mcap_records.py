@@ -1,4 +1,4 @@
-"""The record layer of an MCAP file (https://mcap.dev/spec), read forwards and up to the first damage.
+"""Read the record layer of an MCAP file (https://mcap.dev/spec), forwards and up to the first damage.
 
 The index at the end of a file is not used: a recording that was cut off has none. Everything is bounded before it is
 expanded: a record and an expanded chunk to 64 MiB each, a chunk to the size it declares.
@@ -33,11 +33,11 @@ Message = tuple[int, int, bytes]
 
 
 class TornError(Exception):
-    """The file ends, or makes no sense, from here on."""
+    """Report that the file ends, or is not valid, from some position on."""
 
 
 class TooLargeError(Exception):
-    """A record or chunk beyond the bounds above."""
+    """Report a record or chunk beyond the bounds of size."""
 
 
 class Directory:
@@ -49,7 +49,7 @@ class Directory:
         self.chosen: dict[int, bool] = {}
 
     def schema_of(self, channel: Channel) -> str:
-        """Name of the channel's message type, empty where the file does not say."""
+        """Return the name of the channel's message type, empty where the file does not say."""
         return self.schemas.get(channel.schema_id, "")
 
 
@@ -95,7 +95,7 @@ def records(stream: IO[bytes], size: int, wanted: Collection[int]) -> Iterator[t
 
 
 def contents(stream: IO[bytes], size: int) -> Iterator[bytes]:
-    """Every chunk, expanded and checked, as one run of records; a record outside of chunks is a run of its own.
+    """Yield every chunk, expanded and checked, as one run of records; a record outside of chunks is a run of its own.
 
     Raises:
         TornError: as `records`, or a chunk that is damaged.
@@ -106,14 +106,14 @@ def contents(stream: IO[bytes], size: int) -> Iterator[bytes]:
 
 
 def expand(content: bytes) -> bytes:
-    """A chunk record's content, decompressed; checked against its size and, where it has one, its CRC."""
+    """Decompress a chunk record's content, checked against its size and, where it has one, its CRC."""
     chunk: Chunk = _parse(Chunk, content)
     size = chunk.uncompressed_size
     if size > MAX_RECORD:
         raise TooLargeError(f"a chunk expands to {size} bytes, above the limit of {MAX_RECORD}")
     try:
         if chunk.compression == "zstd":
-            # A frame that names its size is expanded to it no matter what limit is given, so that is looked at first.
+            # A frame that states its size is expanded to it whatever limit is given, so the size is checked first.
             if zstandard.frame_content_size(chunk.data) > size:
                 raise TornError("a chunk expands beyond the size it declares")
             data = zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=size)
@@ -176,13 +176,13 @@ def messages(run: bytes, directory: Directory, choose: Callable[[int], bool] = l
 
 
 def metadata(content: bytes) -> Metadata:
-    """A metadata record's content."""
+    """Parse a metadata record's content."""
     parsed: Metadata = _parse(Metadata, content)
     return parsed
 
 
 def attachment(content: bytes) -> Attachment:
-    """An attachment record's content."""
+    """Parse an attachment record's content."""
     parsed: Attachment = _parse(Attachment, content)
     return parsed
 

@@ -1,7 +1,7 @@
-"""A recording of ours with the torque that drives measured in place of the one that they were told.
+"""Replace the commanded torque of a recording by the torque that the drives measured.
 
-A measured torque is told with the positions of a stamp and is what acted until it, so that what acts from stamp k until
-the next one is what stands at stamp k+1. A sample whose next one has no measurement of all joints is left out.
+A measured torque is reported with the positions of a stamp and acted until it, so that the torque which acts from stamp
+k until the next one is that reported at k+1. A sample whose next one lacks a measurement of some joint is left out.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ ENOUGH: Final = 0.99  # of the samples; fewer are reports now and then, for peop
 
 
 class MeasuredRecording:
-    """Another recording behind the same protocol.
+    """Wrap a recording of this package and replace its torque by the measured one.
 
     Attributes:
         share: of the samples, that have a measured torque of all joints.
     """
 
     def __init__(self, whole: McapRecording) -> None:
-        """Read what was measured.
+        """Read the measured torques.
 
         Args:
-            whole: of ours.
+            whole: a recording of this package.
 
         Raises:
             RecordingError: the file cannot be read.
@@ -52,7 +52,7 @@ class MeasuredRecording:
 
     @property
     def torn(self) -> bool:
-        """True when the file ended in the middle of a record and was read up to there."""
+        """Return whether the file ended in the middle of a record and was read up to there."""
         return self._whole.torn
 
     @torn.setter
@@ -68,7 +68,7 @@ class MeasuredRecording:
         found = False
         before: Block | None = None
         for block in self._whole.blocks(samples):
-            # One sample of the next block says what acted at the end of this one.
+            # The first sample of the next block has the torque that acted at the end of this one.
             if before is not None:
                 part = self._with_measured(before, int(block.stamp_ns[0]))
                 found = found or bool(len(part.stamp_ns))

@@ -1,4 +1,4 @@
-"""The ROS 2 message definitions that stand in our files, as `ros2msg` text with their dependencies.
+"""Provide the ROS 2 message definitions for recordings, as `ros2msg` text with their dependencies.
 
 A reader that knows nothing of ROS packages finds here all it needs: after the message's own definition comes each
 type it uses, behind a line of `=` and a line `MSG: package/Type`. `ident_msgs/msg/Cycle` is our own.

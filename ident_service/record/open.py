@@ -1,4 +1,4 @@
-"""Opens a recording by what is in the file, whatever it is called."""
+"""Open a recording by what is in the file, whatever its name."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def open_recording(
         joints: the arm's joints. An MCAP file's columns come in this order; a CSV file must have as many.
         fmt: how the file is to be read.
         transmission: the arm's gears, needed for a file that was recorded on the motor side.
-        torque: of a recording of ours, the one that drives were told, the one that they measured, or the latter where
+        torque: of this package's recordings, the commanded torque, the measured one, or the latter where
             nearly every sample has it (None); files of others have one torque.
 
     Returns:
@@ -75,7 +75,7 @@ def open_recording(
 
 
 def _with_torque(recording: McapRecording, torque: Literal["measured", "commanded"] | None) -> Recording:
-    """A recording of ours with the torque that is asked for."""
+    """Return a recording of this package with the torque that is asked for."""
     if torque == "commanded":
         return recording
     measured = MeasuredRecording(recording)

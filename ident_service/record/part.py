@@ -1,4 +1,4 @@
-"""Part of a recording: a range of its time, or what lies between standstill at its ends."""
+"""Select part of a recording: a range of its time, or what lies between standstill at its ends."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _BIN: Final = 0.1  # s; positions are averaged over it, so that noise does not p
 
 
 class RangeRecording:
-    """Samples of another recording within a range of its time, behind the same protocol.
+    """Select the samples of another recording within a range of its time, behind the same protocol.
 
     Attributes:
         path: of the other recording; its last part ends in the range where that was asked for by name.
@@ -30,13 +30,13 @@ class RangeRecording:
     """
 
     def __init__(self, whole: Recording, start: float, end: float, label: str = "") -> None:
-        """Keep `start` <= time < `end` of `whole`.
+        """Select `start` <= time < `end` of `whole`.
 
         Args:
             whole: a file, or a range of one.
             start: [s] after the first sample of the file.
             end: likewise; may be infinite.
-            label: what the name ends in, to tell ranges of one file apart.
+            label: suffix of the name, to tell ranges of one file apart.
         """
         self.path: Path = whole.path.with_name(whole.path.name + label)
         self.sha256 = whole.sha256
@@ -76,7 +76,7 @@ class RangeRecording:
 
 
 def _stamp(first_ns: int, seconds: float) -> np.int64:
-    """Return the stamp so many seconds after the first one, or the farthest that there is."""
+    """Return the stamp `seconds` after the first one, saturated to the range of an int64 [ns]."""
     bounds = np.iinfo(np.int64)
     if not np.isfinite(seconds):
         return np.int64(bounds.max if seconds > 0.0 else bounds.min)
@@ -97,7 +97,7 @@ def time_range(recording: Recording) -> tuple[float, float]:
 
 
 def overlap(one: Recording, other: Recording) -> bool:
-    """Tell whether two recordings share samples: those of the same file, unless their ranges are apart."""
+    """Return whether two recordings share samples: those of the same file, unless their ranges do not overlap."""
     (start, end), (other_start, other_end) = time_range(one), time_range(other)
     return one.sha256 == other.sha256 and start < other_end and other_start < end
 

@@ -1,7 +1,7 @@
-"""What a recording is worth, before anything is identified from it: rate, jitter, gaps, saturation, standstill.
+"""Assess a recording before anything is identified from it: rate, jitter, gaps, saturation, standstill.
 
-A drive at its limit no longer gives the torque that was asked for, and a joint that stands still shows friction of
-unknown size: both belong in no equation, and a person should know how much of the recording that is.
+A drive at its limit no longer gives the torque that was asked for, and a joint that stands still has a friction torque
+that is not determined: neither may enter an equation, and a person should know how much of the recording that is.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ident_service.record.timing import Timing
 Array = NDArray[np.float64]
 
 SATURATED: Final = 0.999  # of the limit
-PLATEAU: Final = 5  # samples exactly at the extreme value in a row look like a limit where none is known
+PLATEAU: Final = 5  # so many samples in a row exactly at the extreme value look like a limit where none is known
 STANDSTILL: Final = 0.005  # [rad/s or m/s]
 STANDSTILL_OVER: Final = 0.02  # [s]
 MUCH_JITTER: Final = 0.05  # of a period, standard deviation
@@ -33,7 +33,7 @@ _LEAST_STEP: Final = 1e-12  # below is the rounding of numbers of the size of an
 
 @dataclass(frozen=True)
 class JointQuality:
-    """One joint in a recording.
+    """Describe one joint in a recording.
 
     Attributes:
         name: of the joint, or its number from 1.
@@ -68,7 +68,7 @@ class JointQuality:
 
 @dataclass(frozen=True)
 class Quality:
-    """A recording's stamps and joints.
+    """Describe the quality of a recording's stamps and joints.
 
     Attributes:
         samples: their number after trimming.
@@ -81,7 +81,7 @@ class Quality:
         repeats: samples left out because they repeat the one before.
         arrival: whether the motion goes on evenly where the stamps do not, so that they say when a sample arrived and
             not when it was taken; None where too few steps are off by more than 5 % to tell.
-        declared: what the stamps were taken for.
+        declared: kind of stamps that the configuration states.
         resampled: whether the samples are read off curves between the recorded ones.
         torn: whether the file was cut off or damaged.
         first_ns: stamp of the first sample [ns].
@@ -106,7 +106,7 @@ class Quality:
     skipped: int = 0
 
     def warnings(self) -> tuple[str, ...]:
-        """What a person should know, in words; empty for a good recording."""
+        """Return warnings about the recording for a person, in words; empty for a good recording."""
         found = []
         if self.torn:
             found.append(f"the file is torn; it was read up to {self.duration_s:.4g} s after its first sample")
@@ -146,11 +146,11 @@ class Quality:
 def quality(
     recording: Recording, fmt: RecordingFormat, torque_limit: Array | None = None, known: Grid | None = None
 ) -> Quality:
-    """Judge a recording, in constant memory.
+    """Assess a recording, in constant memory.
 
     Args:
-        recording: what to read, through once more after `grid`.
-        fmt: what to trim, and what a gap is.
+        recording: read once more after `grid`.
+        fmt: seconds to trim, and length of a gap.
         torque_limit: of each joint [N m or N], shape (joints,), NaN where it is not known.
         known: `grid(recording, fmt)`, where that has been found already.
 
@@ -186,7 +186,7 @@ def quality(
 
 
 class _Joints:
-    """Sees the blocks one after the other."""
+    """Collect the statistics of all joints, block by block."""
 
     def __init__(self, names: Sequence[str], limit: Array, stamps: Grid) -> None:
         joints = len(names)
@@ -205,7 +205,7 @@ class _Joints:
         self._plateaus = [(_Plateau(), _Plateau()) for _ in names]
 
     def add(self, block: Block) -> None:
-        """Take the next samples."""
+        """Add the next samples to the statistics."""
         position, torque = block.position, block.torque
         for side, (index, farther) in enumerate(
             ((position.argmin(axis=0), np.less), (position.argmax(axis=0), np.greater))
@@ -257,11 +257,11 @@ class _Joints:
         self._largest = np.where(size > self._largest[0], now, self._largest)
 
     def arrival(self) -> bool | None:
-        """Whether stamps are of arrival; see `Quality`."""
+        """Return whether stamps are of arrival; see `Quality`."""
         return self._timing.arrival()
 
     def result(self) -> tuple[JointQuality, ...]:
-        """All joints."""
+        """Return the quality of all joints."""
         samples = self._stamps.samples
         found = []
         for k, name in enumerate(self._names):
@@ -293,7 +293,7 @@ def _wider(extremes: tuple[Array, Array], values: Matrix) -> tuple[Array, Array]
 
 
 class _Plateau:
-    """Counts the samples in long runs at the largest value seen so far."""
+    """Count the samples in long runs at the largest value seen so far."""
 
     def __init__(self) -> None:
         self._value = -np.inf
@@ -301,7 +301,7 @@ class _Plateau:
         self._run = 0  # samples at the value at the end of what was seen
 
     def add(self, values: Array) -> None:
-        """Take the next samples, shape (samples,)."""
+        """Add the next samples, shape (samples,)."""
         if (largest := float(values.max())) > self._value:
             self._value, self._counted, self._run = largest, 0, 0
         at_value = np.concatenate([[False], values == self._value, [False]])
@@ -317,5 +317,5 @@ class _Plateau:
         self._run = int(lengths[-1]) if open_end else 0
 
     def samples(self) -> int:
-        """Samples in runs of at least `PLATEAU`."""
+        """Return the number of samples in runs of at least `PLATEAU`."""
         return self._counted + (self._run if self._run >= PLATEAU else 0)

@@ -1,8 +1,8 @@
-"""What the recorder process does: takes records from the ring and writes them, until there is nobody to write for.
+"""Run the recorder process: take records from the ring and write them, until their writer and its parent have ended.
 
 Started by `recorder_process.py` as `python -m ident_service.record.recorder_loop RING CHANNEL WORK ROOM`, all four file
 descriptors. The channel is a socket to the parent: one line of JSON comes in (what to record), one goes out when the
-file is open, one when it is finished; its end is the parent's end. The ring is looked at every 5 ms, and at once when
+file is open, one when it is finished; its end is the parent's end. The ring is polled every 5 ms, and at once when
 a sink waits in lock step.
 
 ======================================== ====================================================================
@@ -51,14 +51,14 @@ _ERROR_LEVEL: Final = 40
 
 @dataclass(frozen=True)
 class RecorderReport:
-    """How a recording ended.
+    """Describe how a recording ended.
 
     Attributes:
         samples: cycles written.
         events: events of the motion written.
         lost: records of the ring that were overrun.
         complete: whether the file says that it is complete.
-        error: what failed, empty if nothing did.
+        error: description of the failure, empty without one.
     """
 
     samples: int
@@ -69,17 +69,17 @@ class RecorderReport:
 
 
 def message_of(error: Exception) -> str:
-    """An error in one sentence, without the path that a RecordingError begins with."""
+    """Return an error in one sentence, without the path that a RecordingError begins with."""
     if isinstance(error, RecordingError):
         return str(error).removeprefix(f"{error.path}: ")
     return str(error) if isinstance(error, IdentError) else f"recording failed: {error or type(error).__name__}"
 
 
 class Drain:
-    """The loop between an attached reader and an open writer."""
+    """Write the records of an attached ring reader with an open recording writer, until the end."""
 
     def __init__(self, reader: RingReader, writer: RecordingWriter, channel: int, work: int, room: int | None) -> None:
-        """Take over both.
+        """Use the given reader and writer.
 
         Args:
             reader: attached as the recorder.
@@ -106,7 +106,7 @@ class Drain:
         try:
             complete = self._take_until_end() and not self._reader.lost
             self._writer.finish(complete=complete)
-        except Exception as caught:  # noqa: BLE001 - whatever it is, the motion loop has to hear of it
+        except Exception as caught:  # noqa: BLE001 - whatever it is, the motion loop has to learn of it
             error, complete = message_of(caught), False
             self._tell_end(error)
             with suppress(RecordingError):
@@ -119,7 +119,7 @@ class Drain:
         return RecorderReport(self._samples, self._events, self._reader.lost, complete, error)
 
     def _take_until_end(self) -> bool:
-        """Record; whether the writer said that the motion was finished."""
+        """Record until the writer's end; returns whether the writer said that the motion was finished."""
         while True:
             # Asked before the ring is emptied, so that nothing put before the end is left in it.
             end = self._end()
@@ -158,7 +158,7 @@ class Drain:
             self._events += 1
 
     def _end(self) -> Closed | None:
-        """Why what is in the ring now is all there will be, None while more may come."""
+        """Return why no more records will come than are in the ring now, None while more may come."""
         if (closed := self._reader.closed) is not Closed.OPEN:
             return closed
         alive = self._writer_lives()
@@ -169,7 +169,7 @@ class Drain:
         return None
 
     def _writer_lives(self) -> bool | None:
-        """Whether the writer's process lives, None where there is none yet."""
+        """Return whether the writer's process lives, None where there is none yet."""
         if self._pidfd is None:
             if not (pid := self._reader.writer_pid):
                 return None
@@ -200,7 +200,7 @@ def serve(channel: socket.socket, ring: int, work: int, room: int) -> None:
         with suppress(OSError):
             line = lines.readline()
         if not line.endswith(b"\n"):
-            return  # whoever wanted to ask was killed, perhaps in the middle of a word
+            return  # the parent was killed, perhaps in the middle of its request
         asked: dict[str, Any] = json.loads(line)
         attachments = {name: base64.b64decode(data) for name, data in asked["attachments"].items()}
         with RingReader(ring, recorder=True) as reader:
@@ -223,7 +223,7 @@ def serve(channel: socket.socket, ring: int, work: int, room: int) -> None:
 
 
 def main() -> None:
-    """Entry of the process."""
+    """Run the recorder process, started with its four file descriptors as arguments."""
     for number in IGNORED:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, IGNORED)  # the parent blocked them until here

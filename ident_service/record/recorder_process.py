@@ -1,4 +1,4 @@
-"""A recorder that lives in a process of its own: started, watched and ended here, on the parent's side.
+"""Start, watch and end a recorder in a process of its own, on the parent's side.
 
 The parent makes the ring, an event counter for each direction, and a socket pair, starts the process with exactly these
 descriptors, and tells it over the socket what to record. Everything is anonymous, so whoever is killed, nothing stays
@@ -38,7 +38,7 @@ _FAREWELL_S: Final = 10.0
 
 
 class RecorderProcess:
-    """A context manager: entering starts the process and opens the file, leaving finishes both.
+    """Manage a recorder process: entering starts the process and opens the file, leaving finishes both.
 
     Attributes:
         report: how the recording ended, None until it has, or where the process died.
@@ -64,7 +64,7 @@ class RecorderProcess:
             path: as for `RecordingWriter`, and so are the next five.
             joint_names: in the order of every vector.
             robot_description: URDF, as text.
-            utc_offset_ns: what to add to a stamp to get UTC [ns since 1970].
+            utc_offset_ns: offset from a stamp to UTC [ns since 1970].
             attachments: file name to content.
             metadata: added to the record `ident`.
             lock_step: whether time waits for the recorder (a clock's `lock_step`).
@@ -130,7 +130,7 @@ class RecorderProcess:
 
     @property
     def ends(self) -> SinkEnds:
-        """What another process needs for a `RingSink`.
+        """Return the file descriptors that another process needs for a `RingSink`.
 
         Raises:
             RecordingError: not entered, or closed.
@@ -141,17 +141,17 @@ class RecorderProcess:
 
     @property
     def overruns(self) -> int:
-        """How often `put` or `event` answered False."""
+        """Return how often `put` or `event` returned False."""
         return self._overruns if self._sink is None else self._sink.overruns
 
     @property
     def error(self) -> str:
-        """Why the recording failed, empty as long as it has not."""
+        """Return why the recording failed, empty as long as it has not."""
         return self._error if self._sink is None else self._sink.error
 
     @property
     def pid(self) -> int:
-        """Of the recorder's process, 0 when there is none."""
+        """Return the recorder's process id, 0 when there is none."""
         return 0 if self._process is None else self._process.pid
 
     def put(self, cycle: Cycle) -> bool:
@@ -224,7 +224,7 @@ class RecorderProcess:
             self._channel.sendall(json.dumps(self._request).encode() + b"\n")
 
     def _answer(self, patience: float) -> dict[str, Any] | None:
-        """The process's next line, None when it died instead or said nothing for so long [s]."""
+        """Return the process's next line, None when it died instead or said nothing for so long [s]."""
         assert self._channel is not None  # noqa: S101 - there is one from the start to the release
         self._channel.settimeout(patience)
         line = b""
@@ -238,7 +238,7 @@ class RecorderProcess:
         return answer
 
     def _died(self, when: str) -> str:
-        """How the process ended, or that it hangs."""
+        """Describe how the process ended, or that it hangs."""
         code = None
         if self._process is not None:
             with suppress(subprocess.TimeoutExpired):
@@ -253,7 +253,7 @@ class RecorderProcess:
         return self._sink
 
     def _release(self, *, patience: float) -> None:
-        """End the process, at the latest after some time [s], and give everything back."""
+        """End the process, at the latest after some time [s], and release its resources."""
         process, self._process = self._process, None
         try:
             if process is not None:

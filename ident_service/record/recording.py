@@ -1,6 +1,6 @@
-"""What a recording is to the rooms above: a name, a hash, joints, and blocks of samples in order of time.
+"""Define the interface of a recording: path, hash, joints, and blocks of samples in order of time.
 
-A block is what passes the door; how it lies in a file is `mcap_file.py`'s and `csv_file.py`'s business.
+Readers implement it; how samples lie in a file is known to `mcap_file.py` and `csv_file.py` alone.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ BLOCK_SAMPLES = 4096
 
 @dataclass(frozen=True)
 class Block:
-    """Consecutive samples.
+    """Hold consecutive samples.
 
     Attributes:
         stamp_ns: times [ns], strictly increasing, shape (samples,).
@@ -43,7 +43,7 @@ class Block:
 
 
 def join(blocks: Sequence[Block]) -> Block:
-    """Consecutive blocks, at least one, as one."""
+    """Join consecutive blocks, at least one, into one."""
     if len(blocks) == 1:
         return blocks[0]
     velocities = [block.velocity for block in blocks if block.velocity is not None]
@@ -62,7 +62,7 @@ def join(blocks: Sequence[Block]) -> Block:
 
 
 def cut(block: Block, start: int, stop: int) -> Block:
-    """Samples `start` to `stop` of a block, as views; its repeats count in the part with its first sample."""
+    """Return samples `start` to `stop` of a block, as views; its repeats count in the part with its first sample."""
     part = slice(start, stop)
     velocity = None if block.velocity is None else block.velocity[part]
     repeats = block.repeats if start == 0 else 0
@@ -71,7 +71,7 @@ def cut(block: Block, start: int, stop: int) -> Block:
 
 
 class Recording(Protocol):
-    """A file of samples that can be read through any number of times, one block at a time.
+    """Define a file of samples that can be read any number of times, one block at a time.
 
     Attributes:
         path: the file.

@@ -1,4 +1,4 @@
-"""The ring: one writer who never waits, any number of readers who notice what they missed.
+"""Implement a ring buffer in shared memory: one writer that never waits, readers that notice which records they missed.
 
 Record n goes into slot `n mod slots`. The writer stores, in this order: the slot's sequence `2 n + 1`; its content;
 the sequence `2 n + 2`; the count of records written, `n + 1`. A reader whose cursor is n loads the sequence, copies the
@@ -43,12 +43,12 @@ _RETRIES: Final = 16
 
 
 def create_ring(joints: int, slots: int = SLOTS) -> int:
-    """Make an empty ring; see `create_memory` for the file descriptor that it returns and what it raises."""
+    """Create an empty ring; see `create_memory` for the file descriptor that it returns and the errors it raises."""
     return at.create_memory(joints, slots, slot.slot_bytes(joints))
 
 
 class RingWriter:
-    """The one writer of a ring.
+    """Write records to a ring as its only writer.
 
     Attributes:
         memory: the ring's.
@@ -56,7 +56,7 @@ class RingWriter:
     """
 
     def __init__(self, fd: int) -> None:
-        """Become the writer.
+        """Attach to a ring as its writer.
 
         Args:
             fd: of the ring; stays the caller's.
@@ -159,7 +159,7 @@ class RingWriter:
 
 
 class RingReader:
-    """A context manager: one reader of a ring, with a cursor of its own.
+    """Read records of a ring with a cursor of its own; a context manager.
 
     Attributes:
         memory: the ring's; writable only for the recorder.
@@ -194,7 +194,7 @@ class RingReader:
         self.lost = 0
 
     def __enter__(self) -> Self:
-        """Nothing more to do."""
+        """Return this reader."""
         return self
 
     def __exit__(
@@ -205,21 +205,21 @@ class RingReader:
 
     @property
     def closed(self) -> Closed:
-        """Whether the writer has written its last record; load this before the `read` that is to be the last."""
+        """Return whether the writer has written its last record; load this before the `read` that is to be the last."""
         return Closed(self._words[at.CLOSED])
 
     @property
     def writer_pid(self) -> int:
-        """Process id of the writer, 0 before there is one."""
+        """Return the process id of the writer, 0 before there is one."""
         return self._words[at.WRITER_PID]
 
     @property
     def writer_heartbeat_ns(self) -> int:
-        """Monotonic time of the writer's last record [ns]."""
+        """Return the monotonic time of the writer's last record [ns]."""
         return self._words[at.WRITER_HEARTBEAT]
 
     def read(self) -> Record | None:
-        """Take the next record that still exists, None while there is none; never waits."""
+        """Return the next record that still exists, None while there is none; never waits."""
         words, torn = self._words, 0
         while True:
             number = self.cursor
@@ -227,7 +227,7 @@ class RingReader:
             expected = 2 * number + 2
             sequence = words[word]
             if sequence < expected:
-                # Loaded once more behind the count: what the count says was written has its sequence by then.
+                # Loaded once more after the count: a record that the count includes has its sequence by then.
                 if words[at.WRITTEN] <= number:
                     return None
                 if words[word] < expected:
@@ -251,15 +251,15 @@ class RingReader:
                         torn = 0
 
     def taken(self) -> None:
-        """As the recorder: tell the motion loop that everything before the cursor is dealt with."""
+        """Tell the motion loop, as the recorder, that everything before the cursor has been processed."""
         self._words[at.CURSOR] = self.cursor
 
     def beat(self) -> None:
-        """As the recorder: show that this process lives."""
+        """Renew the recorder's heartbeat."""
         self._words[at.RECORDER_HEARTBEAT] = time.monotonic_ns()
 
     def end(self, error: str | None = None) -> None:
-        """As the recorder: say that no record will be taken any more, and why if something failed."""
+        """Announce, as the recorder, that no record will be taken any more, and why if something failed."""
         if error is not None:
             self.memory.set_text(error)
         self._words[at.STATE] = State.ENDED if error is None else State.FAILED

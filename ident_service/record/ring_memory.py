@@ -1,7 +1,7 @@
-"""The memory of the ring between motion and recorder: who owns which byte, and how a stranger is recognised.
+"""Map the shared memory of the ring between motion and recorder, with its layout and a check of its identity.
 
 The memory is anonymous (`memfd_create`) and passed by file descriptor, so that it vanishes with the last process that
-has it, however that ends. It is sealed against growing and shrinking: nobody can cut it off under a reader. All words
+has it, however that ends. It is sealed against growing and shrinking: it cannot be cut off under a reader. All words
 are unsigned 64-bit in the machine's order, since both sides run on one machine.
 
 ====== ===== ===================================================== =============
@@ -71,7 +71,7 @@ _SEALS: Final = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
 
 
 class Closed(enum.IntEnum):
-    """What the writer says about its end."""
+    """Name the states of the writer's end."""
 
     OPEN = 0
     FINISHED = 1
@@ -79,7 +79,7 @@ class Closed(enum.IntEnum):
 
 
 class State(enum.IntEnum):
-    """What the recorder says about itself."""
+    """Name the states of the recorder."""
 
     NONE = 0
     RUNNING = 1
@@ -88,7 +88,7 @@ class State(enum.IntEnum):
 
 
 def create_memory(joints: int, slots: int, slot_bytes: int) -> int:
-    """Make the memory of a ring, all of it present, and nothing written yet.
+    """Create the memory of a ring, all of it allocated, and nothing written yet.
 
     Args:
         joints: of every record, 1 to 64.
@@ -121,7 +121,7 @@ def create_memory(joints: int, slots: int, slot_bytes: int) -> int:
 
 
 class RingMemory:
-    """One process's view of a ring's memory.
+    """Map a ring's memory into one process.
 
     Attributes:
         joints: of every record.
@@ -132,7 +132,7 @@ class RingMemory:
     """
 
     def __init__(self, fd: int, *, writable: bool) -> None:
-        """Map the memory; everything about it is read from its header.
+        """Map the memory; its layout is read from its header.
 
         Args:
             fd: from `create_memory`, in whatever process; stays the caller's.
@@ -165,22 +165,22 @@ class RingMemory:
         self.words = self._bytes.cast("Q")
 
     def word_of(self, number: int) -> int:
-        """Index of the word that record `number`'s slot begins with."""
+        """Return the index of the word that record `number`'s slot begins with."""
         return (HEADER_BYTES + number % self.slots * self.slot_bytes) >> 3
 
     def set_text(self, text: str) -> None:
-        """Leave the reason of a failure; the state that announces it is stored afterwards."""
+        """Store the reason of a failure; the state that announces it is stored afterwards."""
         data = text.encode("utf-8", "backslashreplace")[:_TEXT_MOST]
         self.content[_TEXT : _TEXT + len(data)] = data
         self.words[_TEXT_BYTES] = len(data)
 
     def text(self) -> str:
-        """The reason that was left, empty if there is none."""
+        """Return the stored reason of a failure, empty if there is none."""
         length = min(self.words[_TEXT_BYTES], _TEXT_MOST)
         return self.content[_TEXT : _TEXT + length].decode("utf-8", "replace")
 
     def close(self) -> None:
-        """Give the view back; does nothing the second time."""
+        """Release the mapping; does nothing the second time."""
         with suppress(ValueError):
             self.words.release()
             self._bytes.release()

@@ -1,14 +1,14 @@
-"""The motion loop's side of the ring: takes what the loop puts, and says whether it is still being recorded.
+"""Put the motion loop's records into the ring, and report whether they are still being recorded.
 
 `put` copies the record, looks at words that the recorder keeps in the ring's memory and, now and then, asks the kernel
 whether the recorder lives. It answers False in real time, and goes on writing into the ring, when
 
 * the recorder has said that it failed (a full disk) or that it ended;
-* the recorder's process is gone, or has not looked at the ring for two seconds;
+* the recorder's process is gone, or has not read the ring for two seconds;
 * more than a share of the ring waits to be taken.
 
 In lock step time stands still meanwhile, so that `put` may wait: for the third, until the recorder has made room, woken
-by an event counter. The first two, or a wait without end, raise there: whoever waits does not want to hear False. Which
+by an event counter. The first two, or a wait without end, raise there instead of returning False. Which
 samples reach the file is thus the same every time; the loop and the disk still work side by side.
 """
 
@@ -38,7 +38,7 @@ _DIED: Final = "the recorder's process died"
 
 @dataclass(frozen=True)
 class SinkEnds:
-    """The file descriptors that a sink needs, in whatever process; `astuple` lists them for `pass_fds`.
+    """Hold the file descriptors that a sink needs, in whatever process; `astuple` lists them for `pass_fds`.
 
     Attributes:
         ring: the ring's memory.
@@ -53,13 +53,13 @@ class SinkEnds:
     room: int
 
     def close(self) -> None:
-        """Close all of them."""
+        """Close all descriptors."""
         for fd in astuple(self):
             os.close(fd)
 
 
 class RingSink:
-    """A motion loop's sink (`motion/run.py`, `Sink`) on a ring that a recorder process drains.
+    """Implement the motion loop's sink (`motion/run.py`, `Sink`) on a ring that a recorder process drains.
 
     Attributes:
         overruns: how often `put` or `event` answered False.
@@ -75,7 +75,7 @@ class RingSink:
         share: float = SHARE,
         patience: float = PATIENCE,
     ) -> None:
-        """Become the ring's writer.
+        """Attach to the ring as its writer.
 
         Args:
             ends: to the recorder, which is running; they stay the caller's, and open as long as this is used.
@@ -104,7 +104,7 @@ class RingSink:
 
     @property
     def error(self) -> str:
-        """Why the recorder takes nothing any more, in its own words where it had time for some; else empty."""
+        """Return why the recorder takes nothing any more, in its own words where it left some; else empty."""
         if self._words[at.STATE] == State.FAILED:
             return self.writer.memory.text()
         return self._gone
@@ -135,16 +135,16 @@ class RingSink:
         return self._wait() if self._lock_step else self._kept()
 
     def close(self, *, complete: bool = True) -> None:
-        """Tell the recorder that this was all; does not wait for it, and does nothing the second time."""
+        """Announce the last record to the recorder; does not wait for it, and does nothing the second time."""
         if self.writer.close(finished=complete):
             os.eventfd_write(self._ends.work, 1)
 
     def release(self) -> None:
-        """Give the ring's memory back; nothing can be put or asked any more."""
+        """Release the ring's memory; nothing can be put or asked any more."""
         self.writer.memory.close()
 
     def _kept(self) -> bool:
-        """Whether the recorder is running, alive and near enough."""
+        """Check that the recorder is running, alive and near enough to the writer."""
         words, written = self._words, self.writer.written
         if written % _LOOK_EVERY == 0 and self._recorder.poll(0):
             self._gone = _DIED
@@ -159,7 +159,7 @@ class RingSink:
         return kept
 
     def _wait(self) -> bool:
-        """Return when little enough waits to be taken.
+        """Wait until few enough records are waiting to be taken; returns True.
 
         Raises:
             RecordingError: the recorder failed or died, or took nothing for longer than our patience.

@@ -1,4 +1,4 @@
-"""One record in one slot of the ring: its bytes, and what makes a reader believe them.
+"""Encode and decode one record in one slot of the ring, with the checksum that validates it.
 
 ====== ========= ==============================================================================
 offset bytes     what
@@ -50,7 +50,7 @@ _CUT: Final = b" [cut]"
 
 
 class EventRecord(NamedTuple):
-    """One event, in the order of `RecordingWriter.event`'s arguments."""
+    """Represent one event, in the order of `RecordingWriter.event`'s arguments."""
 
     stamp_ns: int
     level: int
@@ -61,17 +61,17 @@ Record = Cycle | EventRecord
 
 
 def cycle_bytes(joints: int) -> int:
-    """Bytes of a cycle's content behind the checksum."""
+    """Return the size of a cycle's content behind the checksum [bytes]."""
     return AT_VECTORS - BODY + 8 * (VECTORS + 1) * joints + joints
 
 
 def slot_bytes(joints: int) -> int:
-    """Bytes of a slot, in whole cache lines, so that two slots never share one."""
+    """Return the size of a slot [bytes], in whole cache lines, so that two slots never share one."""
     return max(_LEAST_BYTES, -(-(8 + BODY + cycle_bytes(joints)) // 64) * 64)
 
 
 def message_bytes(message: str, room: int) -> bytes:
-    """A message in UTF-8, cut at a whole character and marked as cut where it does not fit `room` [bytes]."""
+    """Encode a message in UTF-8, cut at a whole character and marked as cut where it does not fit `room` [bytes]."""
     data = message.encode("utf-8", "backslashreplace")
     if len(data) <= room:
         return data
@@ -79,7 +79,7 @@ def message_bytes(message: str, room: int) -> bytes:
 
 
 def decode(content: bytes, number: int, joints: int) -> Record | None:
-    """What a slot's content says, None unless it is record `number`, whole."""
+    """Decode a slot's content, None unless it is record `number`, whole."""
     checksum, length = CHECK.unpack_from(content)
     if not HEAD.size <= length <= len(content) - BODY or zlib.crc32(content[BODY : BODY + length]) != checksum:
         return None

@@ -1,4 +1,4 @@
-"""From a recording's own stamps to stretches of exactly uniform samples; nothing is invented across a gap.
+"""Resample a recording to stretches of exactly uniform samples; nothing is interpolated across a gap.
 
 A filter and a central difference count samples, so a step that is a tenth off puts a tenth of the velocity's change
 into the acceleration. Where stamps are irregular, the samples between them are read off the cubic through the four
@@ -38,7 +38,7 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Piece:
-    """Consecutive samples of a segment, as far apart as `Grid.period_s`.
+    """Hold consecutive samples of a segment, as far apart as `Grid.period_s`.
 
     Attributes:
         block: at least one sample; the stamps are the uniform times rounded to whole nanoseconds.
@@ -67,8 +67,8 @@ def uniform(
     result.
 
     Args:
-        recording: what to read.
-        fmt: what to trim, what a gap is, and the rate.
+        recording: to be read.
+        fmt: seconds to trim, length of a gap, and the rate.
         known: its `grid(recording, fmt)`, where that has been found already.
         shortest_s: segments shorter than `Grid.least_s` of this are left out [s].
         samples: how many samples to read at a time.
@@ -98,7 +98,7 @@ def uniform(
 
 
 def _parts(blocks: Iterable[Block], segments: tuple[Segment, ...]) -> Iterator[tuple[Segment, Block]]:
-    """The blocks, cut where segments end."""
+    """Yield the blocks, cut where segments end."""
     index = 0
     for block in blocks:
         start, length = 0, len(block.stamp_ns)
@@ -112,7 +112,7 @@ def _parts(blocks: Iterable[Block], segments: tuple[Segment, ...]) -> Iterator[t
 
 
 def _marked(blocks: Iterable[Block]) -> Iterator[Piece]:
-    """One segment's blocks, each held back until it is known whether it is the last one."""
+    """Yield one segment's blocks as pieces, each held back until it is known whether it is the last one."""
     start, waiting = True, None
     for block in blocks:
         if waiting is not None:
@@ -124,7 +124,7 @@ def _marked(blocks: Iterable[Block]) -> Iterator[Piece]:
 
 
 def _evenly(blocks: Iterable[Block], stamps: Grid, segment: Segment) -> Iterator[Block]:
-    """One segment's samples, a usual period apart from its first."""
+    """Yield one segment's samples, restamped a usual period apart from its first."""
     number = 0
     for block in blocks:
         numbers = np.arange(number, number + len(block.stamp_ns))
@@ -160,7 +160,7 @@ def _resampled(blocks: Iterable[Block], stamps: Grid, segment: Segment, held: bo
 
 
 def _at(run: Block, stamps: Grid, numbers: NDArray[np.int64], held: bool) -> Block:
-    """The samples of these numbers on the grid."""
+    """Return the samples of the given numbers on the grid."""
     period = stamps.period_s * 1e9
     # Times count from the first sample, as floats that are exact for a hundred days.
     old = (run.stamp_ns - stamps.first_ns).astype(np.float64)
@@ -180,7 +180,7 @@ def _at(run: Block, stamps: Grid, numbers: NDArray[np.int64], held: bool) -> Blo
 
 
 def _cubic(old: Vector, new: Vector) -> tuple[NDArray[np.intp], Matrix]:
-    """Lagrange's cubic: index of the first of four samples, shape (new,), and their weights, shape (new, 4)."""
+    """Return Lagrange's cubic: index of the first of four samples, shape (new,), and their weights, shape (new, 4)."""
     inside = np.searchsorted(old, new, side="right") - 1
     first = np.clip(inside - 1, 0, len(old) - 4)
     nodes = old[first[:, None] + np.arange(4)]
@@ -193,7 +193,7 @@ def _cubic(old: Vector, new: Vector) -> tuple[NDArray[np.intp], Matrix]:
 
 
 def _mean_of_held(old: Vector, values: Matrix, edges: Vector) -> Matrix:
-    """Mean of a value that is held from each stamp to the next, between edges; shape (edges - 1, joints)."""
+    """Return the mean of a value held from each stamp to the next, between edges; shape (edges - 1, joints)."""
     integral = np.zeros_like(values)
     np.cumsum(values[:-1] * np.diff(old)[:, None], axis=0, out=integral[1:])
     inside = np.clip(np.searchsorted(old, edges, side="right") - 1, 0, None)
@@ -202,7 +202,7 @@ def _mean_of_held(old: Vector, values: Matrix, edges: Vector) -> Matrix:
 
 
 def _spaced(block: Block, last_ns: int | None, least: float) -> Block:
-    """Samples at least `least` [ns] behind the one kept before."""
+    """Return the samples at least `least` [ns] behind the one kept before."""
     stamps = block.stamp_ns
     before = stamps[0] - least if last_ns is None else last_ns
     if bool((np.diff(stamps, prepend=np.int64(before)) >= least).all()):

@@ -1,8 +1,7 @@
-"""Follows one of our own recordings while it grows: what the recorder has flushed, each sample once.
+"""Follow one of this package's recordings while it grows: read what the recorder has flushed, each sample once.
 
-A look reads on from where the last one ended, a bounded number of bytes at most, and stops before a record that is not
-whole yet. The file is opened once and so stays readable when the finished recording gets its name.
-Boundary: a file in, samples out; the ring and the motion process are never touched.
+Each read goes on from where the last one ended, a bounded number of bytes at most, and stops before an incomplete
+record. The file is opened once and so stays readable when the finished recording gets its name.
 """
 
 from __future__ import annotations
@@ -26,17 +25,17 @@ from ident_service.record.recording import Matrix, Stamps
 MOST_BYTES: Final = 1 << 20
 _HEAD: Final = struct.Struct("<BQ")
 _STATES, _COMMANDS, _EVENTS = "/joint_states", "/joint_commands", "/events"
-_EXCITING = "exciting"  # the word of `motion/states.py`
+_EXCITING = "exciting"  # value of `State.EXCITING` in `motion/states.py`
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Consecutive cycles.
+    """Hold consecutive cycles of a growing recording.
 
     Attributes:
         stamp_ns: [ns since 1970 in UTC], shape (samples,).
         position: measured [rad or m], shape (samples, joints).
-        torque: that was really commanded [N m or N], shape (samples, joints).
+        torque: commanded, after clipping [N m or N], shape (samples, joints).
         reference: position that was asked for [rad or m], shape (samples, joints).
     """
 
@@ -47,7 +46,7 @@ class Samples:
 
 
 class RecordingTail:
-    """Reads a recording as it grows.
+    """Read a recording as it grows.
 
     Attributes:
         ended: whether the recording's data has come to its end.
@@ -69,10 +68,10 @@ class RecordingTail:
         self.exciting_ns: int | None = None
 
     def read(self, most: int = MOST_BYTES) -> Samples | None:
-        """The next samples, from `most` bytes of the file or one record; None where nothing new is whole.
+        """Return the next samples, from `most` bytes of the file or one record; None where no new record is complete.
 
         Raises:
-            RecordingError: it is damaged, or no recording of ours.
+            RecordingError: the file is damaged, or no recording of this package.
         """
         stamps: list[int] = []
         states: list[bytes] = []
@@ -98,11 +97,11 @@ class RecordingTail:
             raise RecordingError(self._path, f"is no recording of ours: {error}") from None
 
     def close(self) -> None:
-        """Let the file go."""
+        """Close the file."""
         self._stream.close()
 
     def _records(self, content: bytes) -> list[tuple[int, bytes]]:
-        """Whole records of what was read; one that is longer is read by itself."""
+        """Return the whole records of what was read; one that is longer is read by itself."""
         found, position = list[tuple[int, bytes]](), 0
         while position + _HEAD.size <= len(content):
             opcode, length = _HEAD.unpack_from(content, position)
@@ -157,5 +156,5 @@ class RecordingTail:
 
 
 def _rows(payloads: list[bytes]) -> NDArray[np.uint8]:
-    """Payloads of one length as rows; raises ValueError where lengths differ."""
+    """Return payloads of one length as rows; raises ValueError where lengths differ."""
     return np.frombuffer(b"".join(payloads), np.uint8).reshape(len(payloads), len(payloads[0]))

@@ -1,4 +1,4 @@
-"""Do irregular stamps say when a sample was taken, or only when it arrived?
+"""Tell whether irregular stamps are times of sampling, or only of arrival.
 
 Across a step that is longer or shorter than usual the motion goes on in proportion to the step if the sample was taken
 then, and by as much as across the steps beside it if it was taken on time. Both are predicted from the steps before and
@@ -16,14 +16,14 @@ from ident_service.record.recording import Block, cut, join
 
 _IRREGULAR: Final = 0.05  # of a period
 _LEAST: Final = 10  # irregular steps
-_CLEAR: Final = 4.0  # ratio of the squared errors below which nothing is said
+_CLEAR: Final = 4.0  # ratio of the squared errors below which it is not decided
 
 
 class Timing:
-    """Sees a recording's blocks one after the other."""
+    """Compare both predictions of the motion over a recording's blocks, one after the other."""
 
     def __init__(self, stamps: Grid) -> None:
-        """Take what is known of the stamps."""
+        """Use the period and gap of the stamps."""
         self._period = stamps.own_period_s * 1e9
         self._gap = stamps.gap_s * 1e9
         self._tail: Block | None = None
@@ -31,7 +31,7 @@ class Timing:
         self._even = self._in_proportion = 0.0
 
     def add(self, block: Block) -> None:
-        """Take the next samples."""
+        """Add the next samples."""
         run = block if self._tail is None else join([self._tail, block])
         self._tail = cut(run, max(0, len(run.stamp_ns) - 3), len(run.stamp_ns))
         if len(run.stamp_ns) < 4:
@@ -49,7 +49,7 @@ class Timing:
         self._in_proportion += float((in_proportion**2).sum())
 
     def arrival(self) -> bool | None:
-        """True for stamps of arrival, False for stamps of sampling, None where it cannot be told."""
+        """Return True for stamps of arrival, False for stamps of sampling, None where it cannot be told."""
         if self._steps < _LEAST:
             return None
         if _CLEAR * self._even < self._in_proportion:

@@ -1,4 +1,4 @@
-"""A recording of the motors, or of the motors' torques alone, seen from the joints.
+"""Convert a recording of motor positions and torques, or of motor torques alone, to the joint side.
 
 `q = C^-1 diag(1/r) q_motor + q0`, `dq = C^-1 diag(1/r) dq_motor`, `tau = C^T diag(r) tau_motor`: what the motors put
 in, the joints give out (`config/recording.py` has the symbols). Losses in the gears are the joints' friction.
@@ -16,7 +16,7 @@ from ident_service.record.recording import BLOCK_SAMPLES, Block, Matrix, Recordi
 
 
 class JointSideRecording:
-    """A Recording whose blocks are those of another one, of the motors, brought to the joint side.
+    """Convert another recording's blocks from the motor side to the joint side.
 
     Attributes are the other recording's.
     """
@@ -24,7 +24,7 @@ class JointSideRecording:
     def __init__(
         self, motors: Recording, transmission: Transmission, *, positions: bool = True, torques: bool = True
     ) -> None:
-        """Take the motors' recording.
+        """Wrap the motors' recording.
 
         Args:
             motors: one column a motor, position [rad] and torque [N m] at the motor.
@@ -52,7 +52,7 @@ class JointSideRecording:
         self._coupling = None if transmission.coupling is None else np.array(transmission.coupling)
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
-        """Read the samples in order, as the other recording does; see `Recording.blocks`."""
+        """Read the samples in order, converted to the joint side; see `Recording.blocks`."""
         for block in self._motors.blocks(samples):
             position, velocity, torque = block.position, block.velocity, block.torque
             if self._positions:
@@ -67,6 +67,6 @@ class JointSideRecording:
             yield Block(block.stamp_ns, position, torque, velocity, block.repeats, block.skipped)
 
     def _turned(self, motors: Matrix) -> Matrix:
-        """Turns of the motors as turns of the joints, shape (samples, joints)."""
+        """Convert motor angles to joint angles, shape (samples, joints)."""
         turns: Matrix = motors / self._ratios
         return turns if self._coupling is None else np.linalg.solve(self._coupling, turns.T).T

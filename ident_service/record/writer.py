@@ -1,4 +1,4 @@
-"""Writes one recording: MCAP, profile `ros2`, in chunks that reach the file soon enough to survive a kill -9.
+"""Write one recording: MCAP, profile `ros2`, in chunks that reach the file soon enough to survive a kill -9.
 
 A chunk ends before it passes 64 KiB or 100 ms of sample time and is handed to the operating system at once, so that a
 process that is killed loses less than 0.2 s. While it grows the file is called `<path>.partial`; `finish` gives it its
@@ -37,7 +37,7 @@ Vector = NDArray[np.float64]
 
 
 class _McapWriter(Protocol):
-    """The part of `mcap.writer.Writer` used here, with the return types that it leaves out."""
+    """Define the part of `mcap.writer.Writer` used here, with the return types that it leaves out."""
 
     def start(self, profile: str) -> None: ...
     def register_schema(self, name: str, encoding: str, data: bytes) -> int: ...
@@ -50,7 +50,7 @@ class _McapWriter(Protocol):
 
 
 class RecordingWriter:
-    """A context manager: entering opens `<path>.partial`, leaving finishes it and renames it to `path`.
+    """Write a recording as a context manager: entering opens `<path>.partial`, leaving finishes it as `path`.
 
     A motion that ended in an exception is worth reading too: its recording is finished the same way, with
     `complete = "false"` in the metadata. Only a file that can no longer be written stays under its `.partial` name.
@@ -71,7 +71,7 @@ class RecordingWriter:
             path: the finished file; neither it nor `<path>.partial` may exist.
             joint_names: in the order of every vector.
             robot_description: URDF, as text.
-            utc_offset_ns: what to add to a stamp to get UTC [ns since 1970].
+            utc_offset_ns: offset from a stamp to UTC [ns since 1970].
             attachments: file name to content, such as the arm's configuration and the excitation.
             metadata: added to the record `ident`.
 

@@ -1,1 +1,1 @@
-"""The CANopen face of an emulated motor controller (CiA 301, CiA 402): frames in, frames out, no clock."""
+"""Emulate the CANopen protocol of a motor controller (CiA 301, CiA 402): frames in, frames out, no clock."""

@@ -1,4 +1,4 @@
-"""An emulated CANopen torque drive: frames and times in, frames out; it has neither clock nor bus.
+"""Emulate a CANopen torque drive: frames and times in, frames out; it has neither clock nor bus.
 
 A host configures it by SDO alone; all it does follows from its object dictionary. At a SYNC the position is sampled
 and told, then the torque that came before the SYNC begins to act.
@@ -36,34 +36,34 @@ _PDO_PARAMETERS = {index for group in (*COMMUNICATION, *MAPPING) for index in gr
 _DRIVE_OBJECTS = 0x6000
 _FAULT = 1  # of 6007h
 _WARNING, _REMOTE, _LIMITED, _FOLLOWS, _VOLTAGE = 0x0080, 0x0200, 0x0800, 0x1000, 0x0010
-# What tells where the motor is; anything else that is sent is no feedback.
+# Key of the position entry; a TPDO without it is no feedback.
 _POSITION = 0x606400
 
 
 class CanopenDrive:
-    """One node with its motor; `sim_backend/pucks/face.py` says what every protocol's has.
+    """Emulate one node with its motor; implements the interface of `sim_backend/pucks/face.py`.
 
     Attributes:
-        objects: its dictionary.
-        motor: what it drives.
+        objects: its object dictionary.
+        motor: that it drives.
         emergency: its errors.
         nmt: its state in the network.
         power: its state as a drive.
-        sync_identifier: which frames are a SYNC.
-        deaf: whether a defect has it go on, whatever stays away.
+        sync_identifier: identifier of SYNC frames.
+        deaf: whether a defect makes it go on when its watchdogs should stop it.
     """
 
     def __init__(
         self, eds: str, number: int, motor: Motor, own: dict[int, int] | None = None, like: Personality = LIKE_NEW
     ) -> None:
-        """Make a drive without power.
+        """Create a drive without power.
 
         Args:
             eds: text of its electronic data sheet.
             number: node id.
             motor: that it drives.
             own: numbers that its entries have instead of what the EDS says, by key.
-            like: how it is besides its EDS.
+            like: its properties that are not in the EDS.
 
         Raises:
             DriverError: an EDS that cannot be read.
@@ -94,36 +94,36 @@ class CanopenDrive:
 
     @property
     def number(self) -> int:
-        """Its node id."""
+        """Return the node id."""
         return self._node.number
 
     @property
     def next_deadline_ns(self) -> int | None:
-        """When `tick` has something to do; None for never."""
+        """Return when `tick` has something to do [ns]; None for never."""
         timers = self._node.timers
         return min(timers.values()) if timers else None
 
     @property
     def state(self) -> str:
-        """In words: the state of the network, of the drive, and its errors."""
+        """Describe the state of the network, of the drive, and its errors, in words."""
         errors = "".join(f", error 0x{code:04X}" for code in self.emergency.active)
         return f"{self.nmt.state.name}, {self.power.state.name}".lower().replace("_", " ") + errors
 
     @property
     def released(self) -> bool:
-        """Whether a host has switched it off and has left, all in order."""
+        """Return whether a host has switched the drive off and has left it pre-operational."""
         off = self.power.state is PowerState.SWITCH_ON_DISABLED
         return off and self.nmt.commanded and self.nmt.state is State.PRE_OPERATIONAL
 
     def power_up(self, now_ns: int) -> None:
-        """Power comes: the boot-up message follows at once."""
+        """Power the drive up; the boot-up message follows at once."""
         self._node.now_ns = now_ns
         self.motor.power_up(now_ns)
         self._like_new()
         self.nmt.boot(0)
 
     def receive(self, frame: Frame, now_ns: int) -> list[Frame]:
-        """A frame of another node has come.
+        """Process a frame of another node.
 
         Args:
             frame: of any kind; what is not for this drive does nothing.
@@ -157,7 +157,7 @@ class CanopenDrive:
         return self._finish()
 
     def tick(self, now_ns: int) -> list[Frame]:
-        """Time has passed: do what is due, in its order; returns what the drive sends."""
+        """Process the timers that are due, in their order; returns the frames that the drive sends."""
         timers = self._node.timers
         while timers:
             name = min(timers, key=timers.__getitem__)
@@ -172,17 +172,17 @@ class CanopenDrive:
         return self._finish()
 
     def watch(self, now_ns: int) -> None:
-        """Look at position and speed between frames, as a drive does all the time."""
+        """Sample position and speed between frames, as a drive does all the time."""
         if self.power.state is PowerState.OPERATION_ENABLED:
             self._sample(now_ns)
             self._torque.evaluate(now_ns)
 
     def listens(self, identifier: int) -> bool:
-        """Whether a frame of this identifier means anything to this drive."""
+        """Return whether a frame of this identifier means anything to this drive."""
         return identifier in self._ears or 0x700 < identifier < 0x780
 
     def traffic(self, frame: Frame) -> Traffic:
-        """What kind of frame of its own this is."""
+        """Return the kind of a frame that this drive has sent."""
         if frame.identifier == 0x700 + self._node.number:
             return Traffic.HEARTBEAT
         for number, index in enumerate(COMMUNICATION[1]):
@@ -193,7 +193,7 @@ class CanopenDrive:
         return Traffic.OTHER
 
     def fail(self, code: int, now_ns: int, *, lasting: bool = False) -> list[Frame]:
-        """The drive finds a fault in itself.
+        """Simulate a fault that the drive finds in itself.
 
         Args:
             code: of the emergency message, which is also in 603Fh.
@@ -209,11 +209,11 @@ class CanopenDrive:
         return self._finish()
 
     def repaired(self) -> None:
-        """A lasting fault is gone; it still has to be reset."""
+        """End a lasting fault; it still has to be reset."""
         self._failure = 0
 
     def ignore_watchdogs(self, deaf: bool) -> None:
-        """A defect has it go on although its host is gone, or is mended."""
+        """Set whether a defect makes the drive go on although its host is gone."""
         self.deaf = deaf
 
     def warn(self, warned: bool, now_ns: int) -> list[Frame]:
@@ -223,7 +223,7 @@ class CanopenDrive:
         return self._finish()
 
     def supply(self, on: bool, now_ns: int) -> list[Frame]:
-        """Power of the motor, not of the firmware, comes or goes."""
+        """Switch the power of the motor, not of the firmware, on or off."""
         self._node.now_ns = now_ns
         self.power.supply(on)
         if on:
@@ -233,16 +233,16 @@ class CanopenDrive:
         return self._finish()
 
     def reboot(self, now_ns: int) -> list[Frame]:
-        """The firmware starts again by itself, as after a brown-out."""
+        """Restart the firmware by itself, as after a brown-out."""
         self._node.now_ns = now_ns
         self.nmt.reset(nmt.Command.RESET_NODE)
         return self._finish()
 
     def evaluate(self, now_ns: int) -> None:
-        """A defect has changed: what the motor does may be another thing now."""
+        """Evaluate position, speed and torque anew after a defect has changed."""
         self.watch(now_ns)
 
-    # What the parts ask for.
+    # Called by the parts of the drive.
 
     def _sync(self, data: bytes) -> None:
         if data:
@@ -263,7 +263,7 @@ class CanopenDrive:
         values[0x606C00] = round(speed)
 
     def _arrived(self, keys: tuple[int, ...]) -> None:
-        """An RPDO, or an SDO, has set these."""
+        """Handle objects that an RPDO or an SDO has set."""
         if self._personality.target in keys and self.nmt.state is State.OPERATIONAL:
             self._makers.targeted()
         self._firmware.arrived(keys)
@@ -374,7 +374,7 @@ class CanopenDrive:
             self._arrived((key,))
 
     def _refresh(self) -> None:
-        """The statusword as it is now (CiA 402-2, table 29)."""
+        """Update the statusword (CiA 402-2, table 29)."""
         state = self.power.state
         if state is not PowerState.OPERATION_ENABLED and (self._torque.follows or self._torque.limited):
             self._torque.release()

@@ -1,7 +1,4 @@
-"""Emergency messages, error register and error history of an emulated node (CiA 301, 7.2.7; objects 1001h, 1003h).
-
-Boundary: what has gone wrong and who is told; what the drive does about it is `reactions.py` and `power.py`.
-"""
+"""Emulate emergency messages, error register and error history of a node (CiA 301, 7.2.7; objects 1001h, 1003h)."""
 
 from __future__ import annotations
 
@@ -20,30 +17,30 @@ _REGISTER = {0x2: CURRENT, 0x3: VOLTAGE, 0x4: TEMPERATURE, 0x81: COMMUNICATION, 
 
 
 class Emergency:
-    """The errors that a node has, in the order in which they came."""
+    """Hold the errors of a node, in the order in which they came, and send emergency messages."""
 
     def __init__(self, node: Node) -> None:
-        """A node without errors."""
+        """Start without errors."""
         self._node = node
         self._waiting: list[bytes] = []
         self.active: list[int] = []
 
     def reset(self) -> None:
-        """Forget all errors, without a word."""
+        """Discard all errors without a message."""
         self.active.clear()
         self._waiting.clear()
         self._node.stop(_INHIBIT)
 
     @property
     def register(self) -> int:
-        """Object 1001h."""
+        """Return the error register, object 1001h."""
         bits = 0
         for code in self.active:
             bits |= GENERIC | _REGISTER.get(code >> 12, 0) | _REGISTER.get(code >> 8, 0)
         return bits
 
     def occurs(self, code: int) -> None:
-        """An error has come; one that is there already is told once."""
+        """Add an error, record it in the history and send its emergency message; do nothing if it is active already."""
         if code in self.active:
             return
         self.active.append(code)
@@ -56,14 +53,14 @@ class Emergency:
         self._tell(code)
 
     def is_over(self, *codes: int) -> None:
-        """Errors have gone; tells `error reset` for those that were there."""
+        """Remove errors; sends `error reset` if some of them were active."""
         gone = [code for code in self.active if code in codes]
         if gone:
             self.active = [code for code in self.active if code not in codes]
             self._tell(0)
 
     def due(self, name: str) -> None:
-        """A timer of this name is due."""
+        """Handle the due timer of this name."""
         if name == _INHIBIT and self._waiting:
             self._transmit(self._waiting.pop(0))
 

@@ -1,4 +1,4 @@
-"""Watchdogs of an emulated drive that no standard has, in place of those of real makers.
+"""Emulate watchdogs that no standard has, in place of those of real makers.
 
 2F70h says after how many periods (1006h) without SYNC, and 2F75h after how many milliseconds without a target torque,
 the drive takes its host for gone; 0 is never.
@@ -17,29 +17,29 @@ _SYNC, _TARGET = "sync", "target"
 
 
 class MakersWatchdogs:
-    """Both of one drive; each begins with the first thing that it watches."""
+    """Emulate both watchdogs of one drive; each starts with the first event that it supervises."""
 
     def __init__(self, node: Node, emergency: Emergency, late: Callable[[], None], *, there: bool) -> None:
-        """Take the drive's parts; `late` is called when the host is gone, `there` is whether the drive has them."""
+        """Use the drive's parts; `late` is called when the host is gone, `there`: whether the drive has watchdogs."""
         self._there = there
         self._node, self._emergency, self._late = node, emergency, late
 
     def synced(self) -> None:
-        """A SYNC has come."""
+        """Restart the watchdog of SYNC."""
         number = self._node.objects.number
         self._wait(_SYNC, NO_SYNC, number(_PERIODS) * number(_SYNC_PERIOD) * 1_000)
 
     def targeted(self) -> None:
-        """A target torque has come."""
+        """Restart the watchdog of target torques."""
         self._wait(_TARGET, NO_TARGET, self._node.objects.number(_MILLISECONDS) * 1_000_000)
 
     def stop(self) -> None:
-        """Nothing is waited for any more."""
+        """Stop both watchdogs."""
         self._node.stop(_SYNC)
         self._node.stop(_TARGET)
 
     def due(self, name: str) -> None:
-        """A timer of this name is due."""
+        """Handle the due timer of this name."""
         if name in (_SYNC, _TARGET):
             self._emergency.occurs(NO_SYNC if name == _SYNC else NO_TARGET)
             self._late()

@@ -1,7 +1,6 @@
-"""How values lie in a PDO: mapping parameters to a struct layout, and rules for both parameter sets (CiA 301, 7.5.2).
+"""Map values to the bytes of a PDO: mapping parameters to a struct layout, and rules for both (CiA 301, 7.5.2).
 
-A dummy object takes its bytes and stands for nothing. Boundary: layout and rules; when a PDO is sent or acts is
-`pdo.py`.
+A dummy object takes its bytes and stands for nothing.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ _RESTRICTED = (
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the values of one PDO lie.
+    """Hold the byte layout of one PDO.
 
     Attributes:
         packing: of all its bytes.
@@ -41,7 +40,7 @@ class Layout:
 
 
 def layout(objects: Objects, index: int, count: int | None = None) -> Layout:
-    """Make the layout of a mapping parameter.
+    """Derive the layout from a mapping parameter.
 
     Args:
         objects: that hold it.
@@ -74,7 +73,7 @@ def layout(objects: Objects, index: int, count: int | None = None) -> Layout:
 
 
 def check_write(objects: Objects, key: int, value: int) -> None:
-    """Whether a host may write this value into a PDO parameter now; raises SdoAbort where not.
+    """Check whether a host may write this value into a PDO parameter now; raises SdoAbort where not.
 
     A PDO's identifier and mapping only change while it does not exist (bit 31), entries only while there are none.
     Where the identifier is fixed, the number of entries alone says whether it exists.

@@ -1,7 +1,4 @@
-"""The NMT state machine of an emulated node, its heartbeats, sent and awaited, its guarding (CiA 301, 7.2.8, 7.3.2).
-
-Boundary: states and their frames; what a node does in a state, and about a heartbeat that stays away, is `drive.py`.
-"""
+"""Emulate the NMT state machine of a node, its heartbeats, sent and awaited, and guarding (CiA 301, 7.2.8, 7.3.2)."""
 
 from __future__ import annotations
 
@@ -16,12 +13,12 @@ _PRODUCER = "heartbeat"
 _CONSUMER = "heartbeat of "
 _BOOT = "boot"
 _LIFE = "life guarding"
-_HOST = 0  # stands for whoever asks by remote frames, who has no number
+_HOST = 0  # stands for the host that asks by remote frames, which has no number
 _CONSUMERS = range(1, 5)
 
 
 class State(IntEnum):
-    """As a heartbeat tells it; INITIALISING is told once, as the boot-up message."""
+    """Name the NMT states by their heartbeat values; INITIALISING is sent once, as the boot-up message."""
 
     INITIALISING = 0x00
     STOPPED = 0x04
@@ -30,7 +27,7 @@ class State(IntEnum):
 
 
 class Command(IntEnum):
-    """First byte of an NMT message."""
+    """Name the NMT commands by the first byte of their message."""
 
     START = 0x01
     STOP = 0x02
@@ -47,7 +44,7 @@ _TARGETS = {
 
 
 class Nmt:
-    """State and heartbeats of one node.
+    """Emulate state and heartbeats of one node.
 
     Attributes:
         state: the present one.
@@ -65,7 +62,7 @@ class Nmt:
         lost: Callable[[int], None],
         found: Callable[[int], None],
     ) -> None:
-        """A node without power.
+        """Start as a node without power.
 
         Args:
             node: whose state it is.
@@ -84,7 +81,7 @@ class Nmt:
         self._toggle = 0
 
     def boot(self, delay_ns: int) -> None:
-        """Initialise, and say so after a while."""
+        """Initialise the node, and send the boot-up message after a delay."""
         self.commanded = False
         self._to(State.INITIALISING)
         self._node.stop(_PRODUCER)
@@ -94,7 +91,7 @@ class Nmt:
         self._node.after(_BOOT, delay_ns)
 
     def command(self, data: bytes) -> None:
-        """An NMT message has come; one of a wrong length, or for another node, does nothing."""
+        """Process an NMT message; one of a wrong length, or for another node, has no effect."""
         if len(data) != 2 or data[1] not in (0, self._node.number) or self.state is State.INITIALISING:
             return
         if data[0] in (Command.RESET_NODE, Command.RESET_COMMUNICATION):
@@ -104,23 +101,23 @@ class Nmt:
             self._to(_TARGETS[Command(data[0])])
 
     def reset(self, command: Command) -> None:
-        """Start again: the whole node, or its communication."""
+        """Restart the whole node, or its communication."""
         self._reset(command)
         self.boot(self._boot_ns)
 
     def leave_operational(self) -> None:
-        """What a communication error does where object 1029h:01 does not say otherwise."""
+        """Leave `operational` after a communication error, where object 1029h:01 does not say otherwise."""
         self.commanded = False
         self._to(State.PRE_OPERATIONAL)
 
     def configure_producer(self) -> None:
-        """Object 1017h has changed; a new heartbeat begins at once."""
+        """Apply a change of object 1017h; a new heartbeat begins at once."""
         self._node.stop(_PRODUCER)
         if self.state is not State.INITIALISING:
             self._beat()
 
     def configure_consumers(self) -> None:
-        """Object 1016h has changed; awaiting begins with the next heartbeat heard (CiA 301, 7.2.8.2.2.3).
+        """Apply a change of object 1016h; awaiting begins with the next heartbeat received (CiA 301, 7.2.8.2.2.3).
 
         A heartbeat that is awaited no longer, or anew, is not missing.
         """
@@ -130,11 +127,11 @@ class Nmt:
             self._found(self.silent_nodes.pop())
 
     def configure_guarding(self) -> None:
-        """Object 100Ch or 100Dh has changed; guarding begins with the next question (CiA 301, 7.2.8.2.2.1)."""
+        """Apply a change of object 100Ch or 100Dh; guarding begins with the next request (CiA 301, 7.2.8.2.2.1)."""
         self._node.stop(_LIFE)
 
     def asked(self) -> None:
-        """A remote frame asks for the state: answer it, and wait for the next one where life is guarded."""
+        """Answer a remote frame that asks for the state, and await the next one where life is guarded."""
         objects = self._node.objects
         if objects.number(0x1017):
             return  # a node that sends heartbeats is not guarded
@@ -147,7 +144,7 @@ class Nmt:
                 self._found(_HOST)
 
     def heard(self, frame: Frame) -> None:
-        """A heartbeat of another node."""
+        """Process a heartbeat of another node."""
         number = frame.identifier - 0x700
         for subindex in _CONSUMERS:
             entry = self._node.objects.number(0x1016, subindex)
@@ -158,7 +155,7 @@ class Nmt:
                     self._found(number)
 
     def due(self, name: str) -> None:
-        """A timer of this name is due."""
+        """Handle the due timer of this name."""
         if name == _BOOT:
             self._node.send(0x700 + self._node.number, b"\0")
             self._to(State.PRE_OPERATIONAL)

@@ -1,6 +1,6 @@
-"""What the parts of one emulated node share: objects, frames to send, timers, the present time.
+"""Hold what the parts of one emulated node share: objects, frames to send, timers, the present time.
 
-Boundary: no behaviour; every part keeps its own timers under its own names.
+Every part has its own timers under its own names.
 """
 
 from __future__ import annotations
@@ -10,25 +10,25 @@ from sim_backend.canopen.objects import Objects
 
 
 class Node:
-    """One node.
+    """Hold the shared state of one node.
 
     Attributes:
         number: its node id.
-        objects: its dictionary.
-        now_ns: when what is being handled happens.
+        objects: its object dictionary.
+        now_ns: time of the event that is being handled [ns].
         out: frames to send, in order.
-        timers: when what falls due [ns], by name.
+        timers: due times [ns], by name.
     """
 
     def __init__(self, number: int, objects: Objects) -> None:
-        """A node with nothing to do."""
+        """Create a node without frames and timers."""
         self.number, self.objects = number, objects
         self.now_ns = 0
         self.out: list[Frame] = []
         self.timers: dict[str, int] = {}
 
     def send(self, identifier: int, data: bytes = b"") -> None:
-        """Have a frame sent."""
+        """Queue a frame to send."""
         self.out.append(Frame(identifier, data))
 
     def after(self, name: str, delay_ns: int) -> None:
@@ -36,5 +36,5 @@ class Node:
         self.timers[name] = self.now_ns + delay_ns
 
     def stop(self, name: str) -> None:
-        """Stop a timer; nothing when it does not run."""
+        """Stop a timer; does nothing when it does not run."""
         self.timers.pop(name, None)

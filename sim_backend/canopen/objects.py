@@ -1,11 +1,8 @@
-"""The object dictionary of an emulated drive: every value, who may touch it, and within which limits (CiA 301, 7.4).
+"""Emulate a drive's object dictionary: every value, its access, and its limits (CiA 301, 7.4).
 
-It is made from an EDS or DCF (CiA 306). Values are integers, or bytes for what is no number here, and may
-be any bytes; a key is `index << 8 | subindex`. Limits of 1016h are not kept: a maker's file has 65535, which no entry
-of it fits.
-
-Boundary: storage and its rules. What a value does is its reader's; `veto` and `written` let the drive know of a host's
-writes.
+It is made from an EDS or DCF (CiA 306). Values are integers, or bytes for types that are not numbers here, and may be
+any bytes; a key is `index << 8 | subindex`. Limits of 1016h are not checked: a maker's file has 65535, which no entry
+of it fits. The effect of a value is its reader's; `veto` and `written` inform the drive of a host's writes.
 """
 
 from __future__ import annotations
@@ -28,7 +25,7 @@ _FIRST, _HEARTBEAT_CONSUMERS = 0x1000, 0x1016
 
 
 class SdoAbort(Exception):
-    """A transfer that the drive refuses; `code` is one of CiA 301, 7.2.4.3.17."""
+    """Report a transfer that the drive refuses; `code` is one of CiA 301, 7.2.4.3.17."""
 
     def __init__(self, code: int) -> None:
         super().__init__(f"0x{code:08X}")
@@ -53,7 +50,7 @@ WRONG_STATE = 0x08000022
 
 @dataclass(frozen=True)
 class Entry:
-    """One value of the dictionary.
+    """Describe one value of the dictionary.
 
     Attributes:
         form: its struct format character; None for what is no number here.
@@ -77,7 +74,7 @@ class Entry:
 
 
 class Objects:
-    """All values of one node.
+    """Hold all values of one node.
 
     Attributes:
         entries: by key.
@@ -112,18 +109,18 @@ class Objects:
         self.reset()
 
     def reset(self, first: int = 0x1000, last: int = 0xFFFF) -> None:
-        """Give the objects of these indices their values after power-up."""
+        """Reset the objects of these indices to their values after power-up."""
         for key, entry in self.entries.items():
             if first <= key >> 8 <= last:
                 self.values[key] = entry.default
 
     def number(self, index: int, subindex: int = 0) -> int:
-        """A value that is a number; 0 where the EDS has no such object."""
+        """Return a value that is a number; 0 where the EDS has no such object."""
         value = self.values.get(index << 8 | subindex, 0)
         return value if isinstance(value, int) else 0
 
     def put(self, index: int, value: int, subindex: int = 0) -> None:
-        """Set a number from inside, cut off at what its type holds; nothing where the EDS has no such object."""
+        """Set a number from inside the drive, limited to its type; does nothing where the EDS has no such object."""
         key = index << 8 | subindex
         entry = self.entries.get(key)
         if entry is None or entry.form is None:
@@ -131,7 +128,7 @@ class Objects:
         self.values[key] = _cut(entry.form, value)
 
     def read(self, index: int, subindex: int) -> bytes:
-        """What a host gets; raises SdoAbort."""
+        """Return the bytes that a host's upload gets; raises SdoAbort."""
         key = index << 8 | subindex
         entry = self._entry(index, subindex)
         if not entry.readable:
@@ -141,7 +138,7 @@ class Objects:
         return value if isinstance(value, bytes) else struct.pack(f"<{entry.form}", value)
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
-        """What a host sets; raises SdoAbort, and nothing has changed then."""
+        """Set a value by a host's download; raises SdoAbort, and then nothing has changed."""
         key = index << 8 | subindex
         entry = self._entry(index, subindex)
         if not entry.writable:
@@ -162,7 +159,7 @@ class Objects:
         self.written(key)
 
     def size(self, index: int, subindex: int) -> int:
-        """Bytes of an object, 0 for a string; raises SdoAbort when there is none."""
+        """Return the size of an object [bytes], 0 for a string; raises SdoAbort when there is none."""
         return self._entry(index, subindex).size
 
     def _entry(self, index: int, subindex: int) -> Entry:

@@ -1,10 +1,10 @@
-"""The process data objects of an emulated node: when they are sent, and when what came acts (CiA 301, 7.2.2, 7.5.2.35).
+"""Emulate a node's process data objects: when they are sent, and when received ones act (CiA 301, 7.2.2, 7.5.2.35).
 
 Received: transmission types up to 240 act at the next SYNC, 254 and 255 at once. An RPDO with an event timer must come
 again within it. Sent: type 0 at a SYNC after a change, 1 to 240 at every so many SYNCs, 254 and 255 on a change, not
 within the inhibit time, and again after the event timer.
 
-Boundary: only while the node is operational; how values lie in a frame is `mapping.py`.
+All of this happens only while the node is operational.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ class _Sent:
 
 
 class Pdos:
-    """All PDOs of one node."""
+    """Emulate all PDOs of one node."""
 
     def __init__(
         self, node: Node, emergency: Emergency, received: Callable[[tuple[int, ...]], None], late: Callable[[], None]
     ) -> None:
-        """PDOs that do not exist yet.
+        """Start with PDOs that do not exist yet.
 
         Args:
             node: whose they are.
@@ -69,7 +69,7 @@ class Pdos:
         self._synced_ns = 0
 
     def configure(self) -> None:
-        """Read the parameters again, after one has changed."""
+        """Read the communication and mapping parameters again, after one has changed."""
         objects = self._node.objects
         waiting = {p.number: p.waiting for group in self.rpdos.values() for p in group}
         lasts = {p.number: p for p in self._tpdos}
@@ -108,13 +108,13 @@ class Pdos:
             )
 
     def start(self) -> None:
-        """The node is operational: everything is told once."""
+        """Start PDOs when the node is operational: each is sent once."""
         self._active = True
         for tpdo in self._tpdos:
             tpdo.last, tpdo.syncs = None, 0
 
     def stop(self) -> None:
-        """The node is not operational any more."""
+        """Stop PDOs when the node is not operational any more."""
         self._active = False
         for group in self.rpdos.values():
             for rpdo in group:
@@ -123,7 +123,7 @@ class Pdos:
             self._node.stop(name)
 
     def receive(self, identifier: int, data: bytes) -> None:
-        """A frame with the identifier of an RPDO."""
+        """Process a frame with the identifier of an RPDO."""
         if not self._active:
             return
         for rpdo in self.rpdos.get(identifier, ()):
@@ -146,7 +146,7 @@ class Pdos:
                 self._act(rpdo, data[:size])
 
     def sync(self) -> None:
-        """A SYNC: what is to be sent is sent as it is now, then what has come acts."""
+        """Process a SYNC: send synchronous TPDOs with present values, then let received torques act."""
         self._synced_ns = self._node.now_ns
         if not self._active:
             return
@@ -167,7 +167,7 @@ class Pdos:
                     self._act(rpdo, data)
 
     def changes(self) -> None:
-        """Something may have changed: send what goes on a change."""
+        """Send the TPDOs that are sent on a change, where their values have changed."""
         if not self._active:
             return
         for tpdo in self._tpdos:
@@ -177,7 +177,7 @@ class Pdos:
                     self._event(tpdo, data)
 
     def due(self, name: str) -> None:
-        """A timer of this name is due; what was inhibited goes with the next look at changes."""
+        """Handle the due timer of this name; inhibited TPDOs are sent with the next `changes`."""
         if name.startswith(_DEADLINE):
             self._emergency.occurs(RPDO_TIMEOUT)
             self._late()
@@ -207,7 +207,7 @@ class Pdos:
         return tpdo.layout.packing.pack(*[values[key] for key in tpdo.layout.keys])
 
     def _layout(self, index: int) -> Layout | None:
-        """A PDO that maps nothing does not exist either."""
+        """Return the layout of a PDO, None for one that maps nothing and so does not exist."""
         try:
             found = layout(self._node.objects, index)
         except SdoAbort:

@@ -1,4 +1,4 @@
-"""What an emulated drive is like: how it makes torque, and how promptly its firmware works.
+"""Describe an emulated drive: how it makes torque, and how promptly its firmware works.
 
 The shipped data sheet's drive does all at once. A drive made from a maker's file is like its family says
 (`drivers/canopen/profiles`), and where neither says anything like the worst drive known: two control words within a
@@ -33,7 +33,7 @@ def _key(text: str) -> int:
 
 @dataclass(frozen=True)
 class Personality:
-    """How one drive is; the defaults are the shipped data sheet's.
+    """Describe the properties of one drive; the defaults are the shipped data sheet's.
 
     Attributes:
         modes: of operation in which it follows a torque, as 6061h tells them.
@@ -65,7 +65,7 @@ class Personality:
         return min(found)
 
     def torque(self, counts: float, objects: Objects) -> float:
-        """Return what so many counts are [N m]."""
+        """Convert counts of torque to [N m]."""
         if self.rated is None:
             return counts * self.scale
         return counts * self.scale * objects.number(self.rated >> 8, self.rated & 0xFF) * 1e-3
@@ -75,7 +75,7 @@ LIKE_NEW = Personality()
 
 
 def personality_of(text: str, drive: CanopenDrive, families: Sequence[Family] = ()) -> Personality:
-    """Return what a drive of a maker's file is like, with the motor of a description.
+    """Derive the properties of a drive from a maker's file, with the motor of a description.
 
     Args:
         text: of the EDS or DCF.
@@ -106,7 +106,7 @@ def personality_of(text: str, drive: CanopenDrive, families: Sequence[Family] = 
 
 
 def _unspecified(sheet: DataSheet, limits: list[int]) -> list[tuple[int, int]]:
-    """What every drive has, where the file lists an entry without a value."""
+    """Return values that every drive has, for entries that the file lists without a value."""
     modes = sum(1 << mode - 1 for mode, needs in _MODES.items() if all(sheet.has(index) for index in needs))
     values = [(0x100000, _SERVO), (0x650200, modes), (0x608F02, 1), (0x608000, 0xFFFF), (0x608500, 0xFFFF)]
     values += [(0x101800 | sub, number) for sub, number in sheet.identity.items()]
@@ -115,10 +115,10 @@ def _unspecified(sheet: DataSheet, limits: list[int]) -> list[tuple[int, int]]:
 
 
 class Firmware:
-    """When a mode of operation and a control word take effect."""
+    """Delay the effect of modes of operation and control words as a drive's firmware does."""
 
     def __init__(self, node: Node, personality: Personality, control: Callable[[int], None]) -> None:
-        """Take the node; `control` is called with each control word that is read."""
+        """Use the given node; `control` is called with each control word that takes effect."""
         self._node, self._personality, self._control = node, personality, control
 
     def arrived(self, keys: tuple[int, ...]) -> None:
@@ -130,7 +130,7 @@ class Firmware:
                 self._node.after(name, delay)
 
     def due(self, name: str) -> None:
-        """Do what a timer of this name is for."""
+        """Handle the due timer of this name."""
         number = self._node.objects.number
         if name == _CONTROL:
             self._control(number(0x6040))

@@ -1,11 +1,9 @@
-"""The power drive system's state machine of an emulated drive (CiA 402-2, 6.2): states, commands, transitions.
+"""Emulate the state machine of the power drive system (CiA 402-2, 6.2): states, commands, transitions.
 
 `TRANSITIONS` is the standard's table, `_LEAVING` says what the motor does when the drive function ends. A quick stop,
 and a fault reaction by ramp, brake with shorted windings for as long as the configured deceleration would take, and on
 for up to 0.1 s until the motor is slow; this drive has no other way to slow down. After that, and without power, the
 motor coasts, unless the description says that the drive leaves the windings shorted or that the joint has a brake.
-
-Boundary: states and what the power stage does in them; torque while enabled is `torque.py`.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ _SLOW, _LONGEST_NS = 0.1, 100 * _MS
 
 
 class PowerState(IntEnum):
-    """As bits 0 to 3, 5 and 6 of the statusword tell it."""
+    """Name the states by bits 0 to 3, 5 and 6 of the statusword."""
 
     NOT_READY = 0x00
     SWITCH_ON_DISABLED = 0x40
@@ -36,7 +34,7 @@ class PowerState(IntEnum):
 
 
 class Command(Enum):
-    """What bits 0 to 3 of the controlword ask for."""
+    """Name the commands of bits 0 to 3 of the controlword."""
 
     DISABLE_VOLTAGE = 0
     QUICK_STOP = 1
@@ -72,7 +70,7 @@ _RESET = 0x80
 
 
 def command_of(word: int) -> Command:
-    """The command in a controlword (CiA 402-2, table 27)."""
+    """Return the command in a controlword (CiA 402-2, table 27)."""
     if not word & 2:
         return Command.DISABLE_VOLTAGE
     if not word & 4:
@@ -83,7 +81,7 @@ def command_of(word: int) -> Command:
 
 
 class PowerStage:
-    """State of one drive.
+    """Emulate the power stage of one drive.
 
     Attributes:
         state: the present one.
@@ -91,7 +89,7 @@ class PowerStage:
     """
 
     def __init__(self, node: Node, motor: Motor) -> None:
-        """Before self-test."""
+        """Start before the self-test."""
         self._node, self._motor = node, motor
         self._word = 0
         self._slow, self._ramp_ends_ns = 0.0, 0
@@ -99,17 +97,17 @@ class PowerStage:
         self.voltage = True
 
     def start(self) -> None:
-        """Self-test is over (transitions 0 and 1)."""
+        """End the self-test (transitions 0 and 1)."""
         self._word = 0
         self.state = PowerState.SWITCH_ON_DISABLED
 
     def down(self) -> None:
-        """The firmware stops."""
+        """Stop the firmware."""
         self._node.stop(_RAMP)
         self.state = PowerState.NOT_READY
 
     def control(self, word: int) -> bool:
-        """A controlword has come; returns whether it resets a fault."""
+        """Process a controlword; returns whether it resets a fault."""
         before, self._word = self._word, word
         rising = bool(word & _RESET and not before & _RESET)
         if self.state is PowerState.FAULT:
@@ -127,16 +125,16 @@ class PowerStage:
         return False
 
     def reset_fault(self) -> None:
-        """Transition 15: the cause is gone, and somebody has seen it."""
+        """Leave the state `fault` (transition 15): the cause is gone, and a host has reset it."""
         self.state = PowerState.SWITCH_ON_DISABLED
 
     def disable_voltage(self) -> None:
-        """As the command of that name."""
+        """Do what the command disable voltage does."""
         if (target := TRANSITIONS.get((self.state, Command.DISABLE_VOLTAGE))) is not None:
             self._to(target)
 
     def quick_stop(self) -> None:
-        """Transition 11, or what a quick stop is in another state; option code 605Ah."""
+        """Start a quick stop (transition 11), or its counterpart in another state; option code 605Ah."""
         if self.state is PowerState.OPERATION_ENABLED:
             if self._node.objects.number(0x605A) == 0:
                 self._to(PowerState.SWITCH_ON_DISABLED)
@@ -147,7 +145,7 @@ class PowerStage:
             self._to(target)
 
     def trip(self, *, coasting: bool = False) -> None:
-        """Transitions 13 and 14; option code 605Eh, which a power stage that failed does not heed (`coasting`)."""
+        """Enter the fault states (transitions 13, 14) by option 605Eh, unless the power stage failed (`coasting`)."""
         if self.state in (*_FAULTS, PowerState.NOT_READY):
             return
         if coasting or self._node.objects.number(0x605E) == 0:
@@ -162,7 +160,7 @@ class PowerStage:
             self.state = PowerState.FAULT
 
     def supply(self, on: bool) -> None:
-        """Power comes, or is taken from outside."""
+        """Switch the supply of the power stage on or off, from outside the drive."""
         self.voltage = on
         if not on:
             self._motor.switch_off(self._node.now_ns)
@@ -172,7 +170,7 @@ class PowerStage:
                 self.state = PowerState.FAULT if faulty else PowerState.SWITCH_ON_DISABLED
 
     def due(self, name: str) -> None:
-        """A timer of this name is due."""
+        """Handle the due timer of this name."""
         if name != _RAMP:
             return
         now = self._node.now_ns

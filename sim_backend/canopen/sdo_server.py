@@ -1,7 +1,6 @@
-"""The SDO server of an emulated drive: expedited and segmented transfers, one at a time (CiA 301, 7.2.4).
+"""Emulate the SDO server of a drive: expedited and segmented transfers, one at a time (CiA 301, 7.2.4).
 
-Block transfers are refused with an abort code, as a server without them does. Boundary: 8 bytes in, 8 bytes out; what
-may be read and written is `objects.py`.
+Block transfers are refused with an abort code, as a server without them does.
 """
 
 from __future__ import annotations
@@ -14,15 +13,15 @@ _LARGEST = 4096  # bytes of a segmented download; no object is larger
 
 
 class SdoServer:
-    """One server, one client."""
+    """Serve one client."""
 
     def __init__(self, objects: Objects) -> None:
-        """Serve these objects."""
+        """Serve the given objects."""
         self._objects = objects
         self.reset()
 
     def reset(self) -> None:
-        """Forget a transfer that has begun."""
+        """Discard a transfer that has begun."""
         self._multiplexer = (0, 0)
         self._upload: bytes | None = None
         self._download: bytearray | None = None
@@ -30,7 +29,7 @@ class SdoServer:
         self._toggle = 0
 
     def answer(self, request: bytes) -> bytes | None:
-        """The response to one request; None to what deserves none (wrong length, a client's abort)."""
+        """Return the response to one request; None where there is none (wrong length, a client's abort)."""
         if len(request) != 8:
             return None
         command = request[0] >> 5
@@ -104,7 +103,7 @@ class SdoServer:
         return struct.pack("<B7s", toggle | (7 - len(part)) << 1 | (not rest), part)
 
     def _toggled(self, request: bytes) -> int:
-        """The toggle bit, which must alternate from 0."""
+        """Return the toggle bit, which must alternate from 0."""
         toggle = request[0] & 0x10
         if toggle != self._toggle:
             raise SdoAbort(TOGGLE)

@@ -1,11 +1,9 @@
-"""The torque loop of an emulated drive in cyclic synchronous torque mode (CiA 402-2, 14): demand, limits, what is told.
+"""Emulate the torque loop of a drive in cyclic synchronous torque mode (CiA 402-2, 14): demand, limits, status.
 
 Demand is target plus offset, in counts of the target, cut off at the drive's limits (of CiA 402: thousandths of the
 rated torque, 6072h and 6073h). Above the speed limit (6080h) no torque acts that leads faster; the target is ignored
 then, and the statusword says so (bit 12). Software position limits (607Dh) are of the position modes: torque acts
 beyond them. Current is told as torque, since the motor is linear.
-
-Boundary: one evaluation; when there is one is `drive.py`.
 """
 
 from __future__ import annotations
@@ -20,7 +18,7 @@ _RPM = 60.0 / (2.0 * math.pi)
 
 
 class TorqueLoop:
-    """Demand and limits of one motor.
+    """Compute demand and limits of one motor.
 
     Attributes:
         limited: whether a limit of the drive holds the torque back (bit 11 of the statusword).
@@ -28,18 +26,18 @@ class TorqueLoop:
     """
 
     def __init__(self, objects: Objects, motor: Motor, personality: Personality) -> None:
-        """A loop that is not closed."""
+        """Start with a loop that is not closed."""
         self._objects, self._motor, self._personality = objects, motor, personality
         self.limited = self.follows = False
 
     def release(self) -> None:
-        """The drive function has ended; what the motor does now is the power stage's."""
+        """End the torque loop; the power stage decides what the motor does now."""
         self.limited = self.follows = False
         for index in (0x6074, 0x6077, 0x6078):
             self._objects.values[index << 8] = 0
 
     def evaluate(self, now_ns: int) -> None:
-        """Make the motor do what is asked for, as far as limits let it."""
+        """Make the motor give the torque that is asked for, as far as limits let it."""
         number = self._objects.number
         values = self._objects.values
         cyclic = number(0x6061) in self._personality.modes

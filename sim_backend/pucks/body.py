@@ -1,11 +1,9 @@
-"""The arm behind emulated motors: the simulated arm's plant, moved to whatever time somebody looks at it.
+"""Simulate the arm behind emulated motors: the plant, moved to whatever time it is queried at.
 
 Between two instants at which something changes, motors do the same, and the plant moves in one step; a longer silence
 is divided into steps near the nominal period, between which `watch` is called, so that whoever limits torques by
-position and speed can. A step of exactly the nominal period is the simulated arm's. Somebody holds the arm until all
+position and speed can. A step of exactly the nominal period is the simulated arm's. The arm is supported until all
 motors are powered and one of them has been given torque: drives are enabled with none.
-
-Boundary: motors to plant; no protocol, no clock.
 """
 
 from __future__ import annotations
@@ -28,22 +26,22 @@ _OVERDUE = 1.2  # periods; less than one step
 
 
 class Body:
-    """A plant, gears and motors.
+    """Simulate a plant moved by motors through gears.
 
     Attributes:
-        plant: what moves.
+        plant: body of the arm.
         gears: between motors and joints.
         motors: in the order of the configuration.
         now_ns: the time that the plant has been moved to.
         watch: called after each step but the last of a longer silence, with the time.
-        supported: whether somebody still holds the arm.
+        supported: whether the arm is still supported.
     """
 
     def __init__(self, plant: Plant, gears: Gears, noise: Vector, seed: int) -> None:
-        """Put the arm at rest at time 0.
+        """Place the arm at rest at time 0.
 
         Args:
-            plant: what moves; its period is the nominal one.
+            plant: body of the arm; its period is the nominal one.
             gears: between motors and joints.
             noise: standard deviation per cycle of what acts on powered joints besides the torque, shape (joints,).
             seed: of the noise.
@@ -66,28 +64,28 @@ class Body:
         self._driven = np.zeros(plant.chain.joints)
 
     def start(self, now_ns: int) -> None:
-        """Begin at this time, before anything has happened."""
+        """Start at this time, before anything has happened."""
         self.now_ns = now_ns
         self._drawn_ns = now_ns - self._period_ns
 
     def angle(self, motor: int, now_ns: int) -> float:
-        """Of a motor [rad]."""
+        """Return the angle of a motor [rad]."""
         self.advance(now_ns)
         self._look()
         return self._angles[motor]
 
     def speed(self, motor: int, now_ns: int) -> float:
-        """Of a motor [rad/s]."""
+        """Return the speed of a motor [rad/s]."""
         self.advance(now_ns)
         self._look()
         return self._speeds[motor]
 
     def changes(self, now_ns: int) -> None:
-        """A motor, or a load, changes at this time: what went before acts until then."""
+        """Advance the plant to a time at which a motor or a load changes: the old state acts until then."""
         self.advance(now_ns)
 
     def advance(self, now_ns: int) -> None:
-        """Move the plant to this time; nothing when it is there.
+        """Advance the plant to this time; does nothing when it is there.
 
         Raises:
             DriverError: the plant ran away.
@@ -104,7 +102,7 @@ class Body:
                 self.watch(end)
 
     def support(self, now_ns: int) -> None:
-        """Somebody holds the arm where it stands, until all motors are powered and given torque again."""
+        """Support the arm where it stands, until all motors are powered and given torque again."""
         if not self.supported:
             self.advance(now_ns)
             self.plant.rest()
@@ -112,14 +110,14 @@ class Body:
             self.supported = True
 
     def lead(self, position: Vector, now_ns: int) -> None:
-        """Whoever holds the arm puts it somewhere else, at rest.
+        """Move the supported arm to another position, at rest.
 
         Args:
             position: of the joints [rad or m], shape (joints,).
-            now_ns: when.
+            now_ns: time of the move.
 
         Raises:
-            DriverError: nobody holds it.
+            DriverError: the arm is not supported.
         """
         if not self.supported:
             raise DriverError("nobody holds the arm: its drives have it, or it sinks")
@@ -133,11 +131,11 @@ class Body:
 
     @property
     def overdue_ns(self) -> int | None:
-        """When a moving plant has waited for the next cycle for clearly more than its period; None while it is held."""
+        """Return when a moving plant's next cycle is clearly overdue [ns]; None while the arm is supported."""
         return None if self.supported else self.now_ns + round(_OVERDUE * self._period_ns)
 
     def truth(self, stamp_ns: int) -> Truth:
-        """What the plant does now; torques at the joints, without noise and braking."""
+        """Return the present motion of the plant; torques at the joints, without noise and braking."""
         plant = self.plant
         self._collect()
         return Truth(stamp_ns, plant.position, plant.velocity, plant.acceleration, self._torque)
@@ -161,7 +159,7 @@ class Body:
             self.plant.step(torque, interval * 1e-9)
 
     def _collect(self) -> None:
-        """What the motors do, at the joints; computed again only when one of them changed."""
+        """Collect the motors' torques and braking at the joints; computed again only when a motor changed."""
         outputs = tuple([(motor.power, motor.torque) for motor in self.motors])
         if outputs == self._outputs:
             return
@@ -179,7 +177,7 @@ class Body:
         self.plant.brake(damping if (damping != np.diag(np.diag(damping))).any() else np.diag(damping).copy())
 
     def _look(self) -> None:
-        """The motors where the plant is; its arrays are replaced, never written into."""
+        """Compute the motors' angles and speeds where the plant is; its arrays are replaced, never written into."""
         if self._seen is not self.plant.position:
             self._seen = self.plant.position
             self._angles = self.gears.motor_position(self.plant.position).tolist()

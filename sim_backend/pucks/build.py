@@ -1,7 +1,7 @@
-"""From a configuration with CANopen drives to the emulator of these drives and of the arm behind them.
+"""Build the emulator of a configuration's CANopen drives and of the arm behind them.
 
 The arm is the simulated one's: same plant, same noise, same braking of idle axes, which the motors share so that no
-joint is braked less than asked while all brake. Boundary: construction only.
+joint is braked less than asked while all brake.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from sim_backend.pucks.motor import Motor, Power
 
 
 def build_emulator(config: ArmConfig, faults: Sequence[PuckFault] = ()) -> Emulator:
-    """The drives a configuration describes, on an arm at its home position and at rest, without power.
+    """Build the drives that a configuration describes, on an arm at its home position and at rest, without power.
 
     Args:
         config: its section `driver.emulation` says what the arm really is.
@@ -85,7 +85,7 @@ def build_emulator(config: ArmConfig, faults: Sequence[PuckFault] = ()) -> Emula
 
 
 def _identity(drive: CanopenDrive) -> dict[int, int]:
-    """What entries of 1018h answer, by key, where the configuration asks for something."""
+    """Return the configured identity as values of 1018h, by key."""
     asked = drive.identity
     values = (asked.vendor, asked.product, asked.revision, asked.serial)
     return {0x101800 | sub: value for sub, value in enumerate(values, 1) if value is not None}

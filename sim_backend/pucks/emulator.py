@@ -1,10 +1,10 @@
-"""Emulated drives on their buses, with one arm behind them: frames and times in, frames out.
+"""Emulate drives on their buses, with one arm behind them: frames and times in, frames out.
 
 It has neither a clock nor a bus: `lock_step.py` runs it in virtual time, `process.py` on real interfaces. Callers call
 `tick` for what is due before they hand over what has come since.
 
-Faults of the configuration count from the first SYNC. Whoever watches the arm holds it where it stands when its host
-has switched all drives off and has left in order; after anything else it sinks.
+Faults of the configuration count from the first SYNC. The arm is supported where it stands when its host has switched
+all drives off and has left in order; after anything else it sinks.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ _IDLE_NS = 20_000_000
 
 
 class Emulator:
-    """All drives of an arm.
+    """Emulate all drives of an arm.
 
     Attributes:
         body: the arm.
-        faces: of the drives, in the order of the motors.
+        faces: the drives' protocol implementations, in the order of the motors.
         names: of the joints.
         observer: called with the truth at every SYNC, when the last bus has had it.
     """
@@ -41,11 +41,11 @@ class Emulator:
         names: Sequence[str],
         faults: Sequence[PuckFault] = (),
     ) -> None:
-        """Put the pieces together; nothing has power yet.
+        """Assemble the emulator; nothing has power yet.
 
         Args:
             body: the arm.
-            faces: of the drives, in the order of the motors.
+            faces: the drives' protocol implementations, in the order of the motors.
             buses: index of each one's bus.
             names: of the joints.
             faults: to inject, counted from the first SYNC.
@@ -68,27 +68,27 @@ class Emulator:
 
     @property
     def bus_numbers(self) -> tuple[int, ...]:
-        """Index of each drive's bus."""
+        """Return the index of each drive's bus."""
         return self._buses
 
     @property
     def gone(self) -> bool:
-        """Whether a fault has taken the bus."""
+        """Return whether a fault has taken the bus."""
         return any(fault.kind == "bus_gone" for fault in self._injection.active)
 
     @property
     def states(self) -> tuple[str, ...]:
-        """Of the drives, in words."""
+        """Describe the state of each drive, in words."""
         return tuple("dead" if self._injection.dead(drive) else face.state for drive, face in enumerate(self.faces))
 
     @property
     def active(self) -> tuple[PuckFault, ...]:
-        """The faults that act at present."""
+        """Return the faults that act at present."""
         return tuple(self._injection.active)
 
     @property
     def next_deadline_ns(self) -> int | None:
-        """When `tick` has something to do; None for never."""
+        """Return when `tick` has something to do [ns]; None for never."""
         if self._deadline is not None:
             return self._deadline[0]
         times = [begin for begin, _, _ in self._to_begin] + [end for end, _ in self._to_end]
@@ -110,12 +110,12 @@ class Emulator:
         self._deadline = None
 
     def receive(self, bus: int, frame: Frame, now_ns: int, sender: int | None = None) -> list[Sent]:
-        """A frame has come over a bus.
+        """Process a frame that has come over a bus.
 
         Args:
             bus: its index.
             frame: of any kind.
-            now_ns: when.
+            now_ns: time of reception.
             sender: the drive that sent it, which does not hear it; None for the host.
 
         Returns:
@@ -143,7 +143,7 @@ class Emulator:
         return sent
 
     def tick(self, now_ns: int) -> list[Sent]:
-        """Time has passed: faults come and go, drives do what is due; everything in its order.
+        """Process everything that is due: faults begin and end, drives act on their timers, in order of time.
 
         Raises:
             DriverError: the plant ran away.
@@ -164,9 +164,9 @@ class Emulator:
         return sent
 
     def go_on(self, now_ns: int) -> None:
-        """The next cycle is late, by `Body.overdue_ns`: the arm moves meanwhile instead of when the cycle comes.
+        """Advance the arm when the next cycle is late, by `Body.overdue_ns`, instead of when the cycle comes.
 
-        To move it is what takes longest; a cycle that came late would have its answers late, too.
+        Moving the arm takes longest; without this, a cycle that came late would have its answers late, too.
         """
         overdue = self.body.overdue_ns
         if overdue is not None and overdue <= now_ns:
@@ -176,7 +176,7 @@ class Emulator:
             self._deadline = None
 
     def inject(self, faults: Iterable[PuckFault], now_ns: int) -> None:
-        """Have faults come, counted from now on; what they do comes with `tick`."""
+        """Schedule faults, counted from now on; they take effect with `tick`."""
         for fault in faults:
             if fault.drive is not None and not 0 <= fault.drive < len(self.faces):
                 raise DriverError(f"{fault} is of no drive")
@@ -185,11 +185,11 @@ class Emulator:
         self._deadline = None
 
     def add_configured(self, faults: Iterable[PuckFault]) -> None:
-        """Have faults come, counted from the first SYNC, as those of the configuration."""
+        """Schedule faults counted from the first SYNC, as those of the configuration."""
         self._configured += tuple(faults)
 
     def clear(self, now_ns: int) -> None:
-        """End all faults that act, and forget those that have not come yet."""
+        """End all faults that act, and drop those that have not begun yet."""
         self._to_begin.clear()
         self._to_end = [(now_ns, fault) for fault in self._injection.active]
         self._deadline = None

@@ -1,4 +1,4 @@
-"""What an emulated motor controller is to the emulator, whatever protocol it speaks: its face on the bus.
+"""Define the interface between an emulated motor controller and the emulator, whatever its protocol.
 
 Sans-I/O: frames and times in, frames out. A face owns its motor's power stage; the arm is the emulator's.
 """
@@ -13,73 +13,73 @@ from sim_backend.pucks.motor import Motor
 
 
 class Traffic(Enum):
-    """What a frame of a drive's own is, for faults that take away or falsify only that."""
+    """Name the kinds of frames of a drive, for faults that remove or falsify only one kind."""
 
-    FEEDBACK = "feedback"  # tells where the motor is, in a cycle
+    FEEDBACK = "feedback"  # has the motor's position, in a cycle
     HEARTBEAT = "heartbeat"
     OTHER = "other"
 
 
 class Face(Protocol):
-    """One motor controller. No call goes back in time; each returns the frames that follow from it, in order."""
+    """Define one emulated motor controller; no call goes back in time, each returns the frames that follow in order."""
 
     motor: Motor
 
     @property
     def number(self) -> int:
-        """On its bus."""
+        """Return the drive's number on its bus."""
 
     @property
     def next_deadline_ns(self) -> int | None:
-        """When `tick` has something to do; None for never."""
+        """Return when `tick` has something to do [ns]; None for never."""
 
     @property
     def state(self) -> str:
-        """In words, for people."""
+        """Describe the state in words, for people."""
 
     @property
     def released(self) -> bool:
-        """Whether a host has led it, has switched it off and has left, all in order."""
+        """Return whether a host has led the drive, has switched it off and has left, all in order."""
 
     @property
     def sync_identifier(self) -> int:
-        """Of the frames with which the host begins a cycle."""
+        """Return the identifier of the frames with which the host begins a cycle."""
 
     def power_up(self, now_ns: int) -> None:
-        """The firmware starts."""
+        """Start the firmware."""
 
     def receive(self, frame: Frame, now_ns: int) -> list[Frame]:
-        """A frame of another node."""
+        """Process a frame of another node."""
 
     def tick(self, now_ns: int) -> list[Frame]:
-        """Time has passed."""
+        """Process the timers that are due."""
 
     def watch(self, now_ns: int) -> None:
-        """Limit the torque by where the motor is and how fast, in a longer silence."""
+        """Limit the torque by position and speed of the motor, during a longer silence."""
 
     def listens(self, identifier: int) -> bool:
-        """Whether a frame of this identifier means anything to it."""
+        """Return whether a frame of this identifier means anything to the drive."""
 
     def traffic(self, frame: Frame) -> Traffic:
-        """What kind of frame of its own this is."""
+        """Return the kind of a frame that the drive has sent."""
 
     def evaluate(self, now_ns: int) -> None:
-        """A defect of the motor has changed."""
+        """Evaluate the motor anew after one of its defects has changed."""
 
     def fail(self, code: int, now_ns: int, *, lasting: bool = False) -> list[Frame]:
-        """A fault, told with this code; a lasting one is of the power stage and stays until `repaired`."""
+        """Begin a fault with this error code; a lasting one is of the power stage and stays until `repaired`."""
 
     def repaired(self) -> None:
-        """A lasting fault is gone."""
+        """End a lasting fault."""
 
     def ignore_watchdogs(self, deaf: bool) -> None:
-        """It goes on although its host is gone, or does not any more."""
+        """Set whether the drive goes on although its host is gone."""
 
     def warn(self, warned: bool, now_ns: int) -> list[Frame]:
-        """A warning comes or goes."""
+        """Set or clear a warning."""
 
     def supply(self, on: bool, now_ns: int) -> list[Frame]:
-        """The motors' power comes or goes (emergency stop)."""
+        """Switch the motors' power on or off (emergency stop)."""
 
     def reboot(self, now_ns: int) -> list[Frame]:
-        """The firmware starts again by itself."""
+        """Restart the firmware by itself."""

@@ -1,7 +1,7 @@
-"""Faults to inject into emulated drives: kinds, how they are written, when they strike.
+"""Define faults to inject into emulated drives: their kinds, notation, and times.
 
 `PUCK_FAULTS` says what each kind does. Where the simulated arm has a kind too, it is of the same name and means the
-same, seen through a bus. Boundary: words and times; what a kind does to drives and frames is `injection.py`.
+same, seen through a bus.
 """
 
 from __future__ import annotations
@@ -54,14 +54,14 @@ _LARGEST_CODE = 0xFFFF
 
 @dataclass(frozen=True)
 class PuckFault:
-    """One fault.
+    """Describe one fault to inject.
 
     Attributes:
         kind: a key of `PUCK_FAULTS`.
         drive: index of the drive; None for all.
-        at: when, from the moment it is counted from [s].
+        at: its beginning, from the moment it is counted from [s].
         duration: how long [s]; None for one cycle or for good, as `PUCK_FAULTS` says.
-        size: what `PUCK_FAULTS` says.
+        size: quantity that `PUCK_FAULTS` defines.
         offset: of a load, in the frame of the last link [m].
     """
 
@@ -73,10 +73,10 @@ class PuckFault:
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def window(self, start_ns: int, period_ns: int) -> tuple[int, int | None]:
-        """First and last moment [ns]; None where it stays.
+        """Return the first and last moment of the fault [ns]; None where it stays.
 
         Args:
-            start_ns: what `at` counts from.
+            start_ns: moment that `at` counts from.
             period_ns: of a nominal cycle.
         """
         begins = start_ns + round(self.at * 1e9)
@@ -86,7 +86,7 @@ class PuckFault:
 
 
 def configured(faults: Sequence[SimulatedFault], names: Sequence[str], period: float) -> tuple[PuckFault, ...]:
-    """Faults as a configuration describes them.
+    """Convert the faults of a configuration.
 
     Args:
         faults: of the section `driver.emulation`.
@@ -108,7 +108,7 @@ def configured(faults: Sequence[SimulatedFault], names: Sequence[str], period: f
 
 
 def parse_fault(text: str, names: Sequence[str]) -> PuckFault:
-    """A fault as people write it: `KIND [joint=NAME] [at=S] [duration=S] [size=X] [offset=X,Y,Z]`.
+    """Parse a fault as people write it: `KIND [joint=NAME] [at=S] [duration=S] [size=X] [offset=X,Y,Z]`.
 
     Args:
         text: the words.

@@ -1,10 +1,10 @@
-"""The gears of the emulated arm: joints to motors, and torques back.
+"""Convert between joints and motors through the gears of the emulated arm.
 
 `q_motor = J (q - q0)` with `J = diag(r) C`, hence `dq_motor = J dq`, and since gears lose nothing here,
 `tau = J^T tau_motor`. A motor's braking `b_i` is felt by the joints as `J^T diag(b) J`, which couples the joints of a
 differential. (`config/recording.py` has the symbols.)
 
-Boundary: matrices. It is written apart from the driver's, so that one can be checked against the other.
+This is written apart from the driver's conversion, so that one can be checked against the other.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ident_service.errors import DriverError
 
 
 class Gears:
-    """Gears of one arm.
+    """Represent the gears of one arm.
 
     Attributes:
         matrix: J, shape (motors, joints), read-only.
@@ -25,7 +25,7 @@ class Gears:
     """
 
     def __init__(self, transmission: Transmission, joints: int) -> None:
-        """Take them from an arm's description.
+        """Take the gears from an arm's description.
 
         Args:
             transmission: its section.
@@ -44,19 +44,19 @@ class Gears:
         self.matrix.setflags(write=False)
 
     def motor_position(self, position: Vector) -> Vector:
-        """Motor angles [rad] of joint positions [rad or m], shape (motors,)."""
+        """Return the motor angles [rad] of joint positions [rad or m], shape (motors,)."""
         return np.asarray(self.matrix @ (position - self._offsets))
 
     def motor_velocity(self, velocity: Vector) -> Vector:
-        """Motor speeds [rad/s] of joint velocities [rad/s or m/s], shape (motors,)."""
+        """Return the motor speeds [rad/s] of joint velocities [rad/s or m/s], shape (motors,)."""
         return np.asarray(self.matrix @ velocity)
 
     def joint_torque(self, torque: Vector) -> Vector:
-        """Joint torques [N m or N] of motor torques [N m], shape (joints,)."""
+        """Return the joint torques [N m or N] of motor torques [N m], shape (joints,)."""
         return np.asarray(self.matrix.T @ torque)
 
     def joint_damping(self, damping: Vector) -> Vector:
-        """What braked motors are to the joints: [N m s/rad or N s/m], symmetric, shape (joints, joints).
+        """Return the joints' damping by braked motors [N m s/rad or N s/m], symmetric, shape (joints, joints).
 
         Args:
             damping: of each motor [N m s/rad], shape (motors,).
@@ -64,7 +64,7 @@ class Gears:
         return np.asarray(self.matrix.T @ (damping[:, None] * self.matrix))
 
     def motor_damping(self, damping: Vector) -> Vector:
-        """Motor brakings [N m s/rad] that brake no joint less than asked when all motors brake, shape (motors,).
+        """Return motor dampings [N m s/rad] that brake no joint less than asked when all motors brake, shape (motors,).
 
         Args:
             damping: asked for, per joint [N m s/rad or N s/m], shape (joints,).
@@ -74,7 +74,7 @@ class Gears:
         return np.asarray(np.where(squares > 0.0, needed, 0.0).max(axis=1))
 
     def driven(self, motors: Vector) -> Vector:
-        """Which joints have all of their motors among these: 1 or 0, shape (joints,).
+        """Return which joints have all of their motors among the given ones: 1 or 0, shape (joints,).
 
         Args:
             motors: 1 for each of these, else 0, shape (motors,).

@@ -1,7 +1,4 @@
-"""What faults do to emulated drives, their motors, the arm, and the frames on their way to the host.
-
-Boundary: effects; when a fault strikes is `faults.py`, and whoever has the time (`emulator.py`) says that it has come.
-"""
+"""Apply faults to emulated drives, their motors, the arm, and the frames on their way to the host."""
 
 from __future__ import annotations
 
@@ -24,12 +21,12 @@ _CUT_OFF = ("bus_gone", "bus_off")
 
 @dataclass(frozen=True)
 class Sent:
-    """A frame on its way.
+    """Represent a frame on its way.
 
     Attributes:
         bus: index of the bus.
         drive: index of the drive that sends it; None for what no drive sends.
-        frame: itself.
+        frame: sent.
         ready_ns: when its node wants to send it.
     """
 
@@ -40,18 +37,18 @@ class Sent:
 
 
 class Injection:
-    """The faults that act at present.
+    """Hold the faults that act at present, and apply them.
 
     Attributes:
         active: in the order in which they came.
     """
 
     def __init__(self, body: Body, faces: Sequence[Face], buses: Sequence[int]) -> None:
-        """Nothing is wrong.
+        """Start without faults.
 
         Args:
             body: the arm.
-            faces: of the drives, in the order of the motors.
+            faces: the drives' protocol implementations, in the order of the motors.
             buses: index of each one's bus.
         """
         self._body, self._faces, self._buses = body, faces, buses
@@ -60,25 +57,25 @@ class Injection:
 
     @property
     def cut_off(self) -> bool:
-        """Whether no frame gets through."""
+        """Return whether no frame gets through."""
         return any(fault.kind in _CUT_OFF for fault in self.active)
 
     def dead(self, drive: int) -> bool:
-        """Whether a node neither hears nor says anything."""
+        """Return whether a node neither receives nor sends anything."""
         return drive in self._dead
 
     def begin(self, fault: PuckFault, now_ns: int) -> list[Sent]:
-        """A fault comes; returns what the drives say to it."""
+        """Begin a fault; returns the frames that the drives send because of it."""
         self.active.append(fault)
         return self._changed(fault, now_ns, begins=True)
 
     def end(self, fault: PuckFault, now_ns: int) -> list[Sent]:
-        """A fault goes; returns what the drives say to it."""
+        """End a fault; returns the frames that the drives send because of it."""
         self.active.remove(fault)
         return self._changed(fault, now_ns, begins=False)
 
     def on_the_way(self, drive: int, frames: Sequence[Frame], now_ns: int) -> list[Sent]:
-        """What becomes of the frames that a drive has sent."""
+        """Apply faults to the frames that a drive has sent; returns those that get through."""
         bus = self._buses[drive]
         if not self.active:
             return [Sent(bus, drive, frame, now_ns) for frame in frames]
@@ -136,7 +133,7 @@ class Injection:
         return sent
 
     def _drive_changed(self, fault: PuckFault, drive: int, now_ns: int, *, begins: bool) -> list[Frame]:
-        """What a fault does at once, and what its end does."""
+        """Apply the immediate effect of a fault, or of its end, to a drive."""
         face = self._faces[drive]
         match fault.kind, begins:
             case "drive_fault", True:
@@ -160,7 +157,7 @@ class Injection:
         return []
 
     def _defects(self, drive: int) -> Defects:
-        """All that is wrong with a motor."""
+        """Return all defects of a motor."""
         motor = self._faces[drive].motor
         # A joint's position, as if this motor moved it alone.
         counts = motor.counts_per_turn * self._body.gears.ratios[drive] / (2.0 * math.pi)

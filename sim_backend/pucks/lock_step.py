@@ -1,4 +1,4 @@
-"""Emulated drives in this process and in virtual time: a Link without a bus, for runs that repeat to the bit.
+"""Emulate drives in this process and in virtual time: a Link without a bus, for runs that repeat to the bit.
 
 All buses of an arm share one emulator, one arm and one clock. Nothing happens but by calls: `receive` moves the clock
 to the next frame, or to its deadline; whoever moves the clock otherwise finds at the next call that the drives have
@@ -29,7 +29,7 @@ INTERFACE = "lock_step"
 
 
 class LockStepArm:
-    """The drives of one arm, their buses and their clock.
+    """Emulate the drives of one arm, their buses and their clock.
 
     Attributes:
         emulator: of the drives.
@@ -37,7 +37,7 @@ class LockStepArm:
     """
 
     def __init__(self, config: ArmConfig, faults: Sequence[PuckFault] = (), clock: VirtualClock | None = None) -> None:
-        """Build the arm and give it power.
+        """Build the arm and power it up.
 
         Args:
             config: whose buses are all of this interface.
@@ -72,7 +72,7 @@ class LockStepArm:
         return LockStepLink(self, bus)
 
     def inject(self, *faults: PuckFault) -> None:
-        """Have faults come, counted from now on."""
+        """Inject faults, counted from now on."""
         self._run(self.clock.now_ns())
         self.emulator.inject(faults, self._now_ns)
         self._run(self._now_ns)
@@ -83,7 +83,7 @@ class LockStepArm:
         self._run(self.clock.now_ns())
 
     def send(self, bus: int, frame: Frame) -> None:
-        """A frame of the host's; see `LockStepLink.send`."""
+        """Send a frame of the host; see `LockStepLink.send`."""
         self._run(self.clock.now_ns())
         self._require_bus(bus)
         frame = self._wires[bus].as_sent(frame)
@@ -91,7 +91,7 @@ class LockStepArm:
         self._carry(self.emulator.receive(bus, frame, self._now_ns))
 
     def receive(self, bus: int, deadline_ns: int) -> Frame | None:
-        """The next frame; see `LockStepLink.receive`."""
+        """Return the next frame; see `LockStepLink.receive`."""
         heard = self._heard[bus]
         self._run(self.clock.now_ns())
         while not heard:
@@ -107,7 +107,7 @@ class LockStepArm:
         return heard.popleft() if heard else None
 
     def drain(self, bus: int) -> list[Frame]:
-        """All frames until now; see `LockStepLink.drain`."""
+        """Return all frames until now; see `LockStepLink.drain`."""
         self._run(self.clock.now_ns())
         self._require_bus(bus)
         frames = list(self._heard[bus])
@@ -115,7 +115,7 @@ class LockStepArm:
         return frames
 
     def leave(self, bus: int) -> None:
-        """The link of a bus is closed; the drives go on."""
+        """Close the link of a bus; the drives go on."""
         self._open.discard(bus)
 
     def _require_bus(self, bus: int) -> None:
@@ -125,7 +125,7 @@ class LockStepArm:
             raise DriverError(f"bus {bus} is gone")
 
     def _due(self) -> tuple[int | None, int | None]:
-        """When something happens next, and the bus on which a frame has come then, if that is what happens."""
+        """Return when the next event happens, and the bus on which a frame arrives then, if it is an arrival."""
         due = arrived = None
         for bus, wire in enumerate(self._wires):
             time = wire.next_ns
@@ -137,7 +137,7 @@ class LockStepArm:
         return due, arrived
 
     def _run(self, now_ns: int) -> None:
-        """Everything that happens until this time, in its order."""
+        """Process all events until this time, in their order."""
         while True:
             due, arrived = self._due()
             if due is None or due > now_ns:
@@ -161,40 +161,40 @@ class LockStepArm:
 
 
 class LockStepLink:
-    """One bus of emulated drives in virtual time; `drivers/canopen/link.py` has the contract.
+    """Implement a Link on one bus of emulated drives in virtual time.
 
     Attributes:
         arm: behind it; for tests and scoring.
     """
 
     def __init__(self, arm: LockStepArm, bus: int) -> None:
-        """Opened by `LockStepArm.link`."""
+        """Use an arm; opened by `LockStepArm.link`."""
         self.arm = arm
         self._bus = bus
         self._closed = False
 
     @property
     def clock(self) -> VirtualClock:
-        """Virtual time of all buses of the arm."""
+        """Return the virtual clock of all buses of the arm."""
         return self.arm.clock
 
     def send(self, frame: Frame) -> None:
-        """The drives hear it now, the wire is taken for as long as it takes; raises DriverError on a dead bus."""
+        """Send a frame: drives receive it now, and it occupies the wire for its duration; DriverError on a dead bus."""
         self._require_open()
         self.arm.send(self._bus, frame)
 
     def receive(self, deadline_ns: int) -> Frame | None:
-        """The next frame, with the time moved to it, or to the deadline; raises DriverError on a dead bus."""
+        """Return the next frame and move the time to it, or to the deadline; raises DriverError on a dead bus."""
         self._require_open()
         return self.arm.receive(self._bus, deadline_ns)
 
     def drain(self) -> list[Frame]:
-        """All that came until now; raises DriverError on a dead bus."""
+        """Return all frames that came until now; raises DriverError on a dead bus."""
         self._require_open()
         return self.arm.drain(self._bus)
 
     def close(self) -> None:
-        """Leave the bus; any number of times."""
+        """Close the link; any number of times."""
         if not self._closed:
             self._closed = True
             self.arm.leave(self._bus)
@@ -211,7 +211,7 @@ _standing: dict[int, LockStepArm] = {}
 def standing(
     config: ArmConfig, faults: Sequence[PuckFault] = (), clock: VirtualClock | None = None
 ) -> Iterator[LockStepArm]:
-    """An arm that is there before links to it are opened, and stays as it is when they are closed.
+    """Keep an emulated arm alive before links to it are opened and after they are closed.
 
     While this lasts, every link that is opened from this very configuration object leads to it. Otherwise each opening
     of the first bus builds an arm anew.

@@ -1,8 +1,8 @@
-"""One emulated motor with its encoder and power stage, as the firmware in front of it sees it.
+"""Emulate one motor with its encoder and power stage, as the firmware in front of it sees it.
 
 A power stage makes a torque, leaves the windings open (the motor coasts), or shorts them (it brakes, as idle WAM pucks
-do). Without power a holding brake, where there is one, has the shaft. Boundary: no protocol; the firmware says what the
-power stage does, `body.py` moves the rotor, and `faults.py` sets the defects.
+do). Without power a holding brake, where there is one, has the shaft. The firmware sets the power stage, `body.py`
+moves the rotor, and `faults.py` sets the defects.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _HOLDING = 1e3  # times the braking of shorted windings: creeps by mrad/s where 
 
 
 class Power(Enum):
-    """What the power stage does."""
+    """Name the states of the power stage."""
 
     COAST = "coasts"
     BRAKE = "brakes"
@@ -28,31 +28,31 @@ class Power(Enum):
 
 
 class Rotor(Protocol):
-    """What turns, at whatever time it is asked about."""
+    """Define the rotors of an arm, queried at any time."""
 
     def angle(self, motor: int, now_ns: int) -> float:
-        """Angle of a motor [rad]."""
+        """Return the angle of a motor [rad]."""
 
     def speed(self, motor: int, now_ns: int) -> float:
-        """Speed of a motor [rad/s]."""
+        """Return the speed of a motor [rad/s]."""
 
     def changes(self, now_ns: int) -> None:
-        """Something that moves the arm changes at this time: bring the arm there first."""
+        """Advance the arm to this time before something that moves it changes."""
 
 
 @dataclass
 class Defects:
-    """What is wrong with a motor; nothing at first.
+    """Describe the defects of a motor; none at first.
 
     Attributes:
         reversed: the torque acts the other way round.
         stuck: the power stage goes on doing what it does.
         torque_share: of the largest torque, which is all the power stage can make.
-        torque_fraction: of what it is told, which is what the power stage makes; only what it measures says so.
-        frozen: the encoder shows what it showed.
+        torque_fraction: of the commanded torque, which is what the power stage makes; only measured torque shows it.
+        frozen: the encoder repeats its last reading.
         mirrored: the encoder counts the wrong way.
-        shift: counts added to what the encoder shows.
-        delay_ns: how old what the encoder shows is [ns].
+        shift: counts added to the encoder's reading.
+        delay_ns: age of the encoder's reading [ns].
     """
 
     reversed: bool = False
@@ -66,13 +66,13 @@ class Defects:
 
 
 class Motor:
-    """A motor, encoder and power stage.
+    """Emulate a motor, its encoder and its power stage.
 
     Attributes:
-        power: what the power stage does.
+        power: state of the power stage.
         torque: that acts when `power` is TORQUE, at the motor [N m].
-        braking: with what it brakes when `power` is BRAKE [N m s/rad]; a thousand times that when it is HELD.
-        defects: what is wrong with it.
+        braking: damping when `power` is BRAKE [N m s/rad]; a thousand times that when it is HELD.
+        defects: of the motor.
     """
 
     def __init__(
@@ -86,16 +86,16 @@ class Motor:
         relative: bool = False,
         unpowered: Power = Power.COAST,
     ) -> None:
-        """Take the place on the arm.
+        """Use a motor's place on the arm.
 
         Args:
-            rotor: what turns.
+            rotor: of the arm.
             index: of the motor.
             counts: of the encoder per turn.
-            scale: torque that acts for one that is asked for.
+            scale: acting torque over commanded torque.
             braking: with shorted windings [N m s/rad].
             relative: whether the encoder counts from where it was when power came, instead of from angle zero.
-            unpowered: what the power stage does when it is off: COAST, BRAKE or HELD.
+            unpowered: state of the power stage when it is off: COAST, BRAKE or HELD.
         """
         self._rotor = rotor
         self._index = index
@@ -113,13 +113,13 @@ class Motor:
         self.defects = Defects()
 
     def power_up(self, now_ns: int) -> None:
-        """The firmware starts without power for the motor; a relative encoder counts from here."""
+        """Start the firmware without power for the motor; a relative encoder counts from here."""
         if self._relative:
             self._origin = round(self._rotor.angle(self._index, now_ns) * self._per_radian)
         self.switch_off(now_ns)
 
     def encoder(self, now_ns: int) -> int:
-        """What the encoder shows [counts], in 32 bits with sign."""
+        """Return the encoder's reading [counts], a signed number of 32 bits."""
         counts = round(self._rotor.angle(self._index, now_ns) * self._per_radian) - self._origin
         self._history.append((now_ns, counts))
         defects = self.defects
@@ -133,7 +133,7 @@ class Motor:
         return self._shown
 
     def speed(self, now_ns: int) -> float:
-        """True speed [rad/s]."""
+        """Return the true speed [rad/s]."""
         return self._rotor.speed(self._index, now_ns)
 
     def drive(self, torque: float, now_ns: int) -> None:
@@ -142,7 +142,7 @@ class Motor:
 
     @property
     def damping(self) -> float:
-        """What the shaft is braked with now [N m s/rad]."""
+        """Return the present damping of the shaft [N m s/rad]."""
         return {Power.BRAKE: self.braking, Power.HELD: _HOLDING * self.braking}.get(self.power, 0.0)
 
     def switch_off(self, now_ns: int) -> None:
@@ -158,7 +158,7 @@ class Motor:
         self._do(Power.HELD if self._unpowered is Power.HELD else Power.COAST, 0.0, now_ns)
 
     def brake(self, now_ns: int) -> None:
-        """Short the windings."""
+        """Brake the motor by shorting its windings."""
         self._do(Power.BRAKE, 0.0, now_ns)
 
     def _do(self, power: Power, torque: float, now_ns: int) -> None:

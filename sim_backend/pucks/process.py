@@ -1,9 +1,8 @@
-"""Emulated drives on real interfaces, in real time: the work of `ident emulate`.
+"""Run emulated drives on real interfaces, in real time, for `ident emulate`.
 
 The arm behind them goes on falling or braking when the host is gone. While it runs, lines on `commands` inject faults:
 a fault as `parse_fault` has it, `clear` to end all of them, `state` to be told everything again, `quit`.
 
-Boundary: time and interfaces; the drives are `emulator.py`.
 """
 
 from __future__ import annotations
@@ -28,19 +27,19 @@ from sim_backend.pucks.station import Station
 from sim_backend.pucks.wires import INTERFACE as OUR_WIRE
 from sim_backend.pucks.wires import Wires
 
-_POLL_NS = 20_000_000  # commands, stop and states are looked at this often
-_AT_ONCE = 256  # frames handled before time is looked at again
-# Speed below which an arm is said to rest when it has been so for a while, and above which to move [rad/s or m/s].
+_POLL_NS = 20_000_000  # commands, stop and states are polled this often
+_AT_ONCE = 256  # frames handled before the clock is read again
+# Speed below which, for a while, an arm is reported to rest, and above which to move [rad/s or m/s].
 _RESTS, _MOVES = 1e-2, 3e-2  # closed brakes creep by some 1e-3
 _RESTING_NS = 500_000_000
 
 
 @dataclass(frozen=True)
 class Emulated:
-    """What has been done.
+    """Summarise an emulation.
 
     Attributes:
-        seconds: how long.
+        seconds: its duration.
         heard: frames received.
         sent: frames sent.
         unsent: frames that an interface did not take.
@@ -76,10 +75,10 @@ def emulate(
         commands: gives the next line of commands, None while there is none; never waits.
 
     Returns:
-        What has been done.
+        The summary.
 
     Raises:
-        DriverError: as `build_emulator`, an interface that cannot be had or is lost, a fault that nobody understands.
+        DriverError: as `build_emulator`, an interface that cannot be had or is lost, a malformed fault.
     """
     driver = config.driver
     if isinstance(driver, CanopenDriver) and any(bus.interface == INTERFACE for bus in driver.buses):
@@ -118,13 +117,13 @@ class _Run:
         self._rested = True
         self._stirred_ns = 0
         self._quit = False
-        self._streaming = False  # whether somebody sends cycles
+        self._streaming = False  # whether a host sends cycles
 
     def until(self, seconds: float | None, stop_requested: Callable[[], bool]) -> Emulated:
         emulator, clock = self._emulator, self._clock
         begun = looked = heard_ns = clock.now_ns()
         end = None if seconds is None else begun + round(seconds * 1e9)
-        # What has been built stays; the collector need not look at it again in the middle of a cycle.
+        # What has been built stays; the garbage collector need not scan it again in the middle of a cycle.
         collecting = gc.isenabled()
         gc.collect()
         gc.freeze()
@@ -171,7 +170,7 @@ class _Run:
         return max(0, min(due) - now_ns) * 1e-9
 
     def _pass_on(self, sent: Sequence[Sent]) -> None:
-        """Send what is ready, the lowest identifiers first, as a bus would."""
+        """Send the frames that are ready, the lowest identifiers first, as a bus would."""
         now = self._clock.now_ns()
         ready = []
         for item in sent:

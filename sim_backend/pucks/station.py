@@ -1,7 +1,4 @@
-"""One python-can interface of the emulator's: frames in, frames out, and what may go wrong with an interface.
-
-Boundary: python-can; nothing of drives.
-"""
+"""Connect the emulator to python-can interfaces: frames in, frames out, and errors of interfaces."""
 
 from __future__ import annotations
 
@@ -16,15 +13,15 @@ from drivers.canopen.frame import Frame
 from ident_service.config.canopen import CanBus
 from ident_service.errors import DriverError
 
-# Interfaces of a driver that python-can knows by another name.
+# Names that python-can has for interfaces of a driver.
 _NAMES = {"raw": "socketcan"}
 
 
 class Station:
-    """The buses of one arm."""
+    """Connect to the buses of one arm."""
 
     def __init__(self, buses: Sequence[CanBus]) -> None:
-        """Open all of them.
+        """Open all buses.
 
         Args:
             buses: as the arm's description names them.
@@ -54,7 +51,7 @@ class Station:
             thread.start()
 
     def receive(self, timeout: float) -> tuple[int, Frame] | None:
-        """The next frame with its bus, None when none comes.
+        """Return the next frame with its bus, None when none comes in time.
 
         Args:
             timeout: how long to wait [s].
@@ -84,7 +81,7 @@ class Station:
                 self.unsent += 1
 
     def close(self) -> None:
-        """Give all buses back; any number of times."""
+        """Close all buses; any number of times."""
         self._closing = True
         for thread in getattr(self, "_threads", ()):
             thread.join()

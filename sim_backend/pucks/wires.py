@@ -1,10 +1,8 @@
-"""The drives' side of wires of our own (`ident_wire`), which this process hosts while the drives have power.
+"""Host wires (`ident_wire`) in the drives' process while the drives have power.
 
 Hosting them here saves a hop: the drives' frames reach the host in one packet, without a third process. A wire keeps
 the pace of its bit rates where the description says `options: {pace: true}`. Where it says `data_bitrate`, all data
 frames of drives are CAN FD's.
-
-Boundary: wires; nothing of drives.
 """
 
 from __future__ import annotations
@@ -23,14 +21,14 @@ INTERFACE = "ident_wire"
 
 
 class Wires:
-    """The buses of one arm, all of them ours.
+    """Host the buses of one arm, all of them wires.
 
     Attributes:
         unsent: frames that a wire did not take.
     """
 
     def __init__(self, buses: Sequence[CanBus]) -> None:
-        """Make all of them.
+        """Open all wires.
 
         Args:
             buses: as the arm's description names them.
@@ -52,7 +50,7 @@ class Wires:
             raise
 
     def receive(self, timeout: float) -> tuple[int, Frame] | None:
-        """The next frame with its bus, None when none comes.
+        """Return the next frame with its bus, None when none comes in time.
 
         Args:
             timeout: how long to wait [s].
@@ -65,7 +63,7 @@ class Wires:
         return self._heard.popleft() if self._heard else None
 
     def send(self, frames: Iterable[tuple[int, Frame]]) -> None:
-        """Send frames, those of a bus in one packet; what a wire does not take counts as `unsent`."""
+        """Send frames, those of a bus in one packet; frames that a wire does not take count as `unsent`."""
         of: dict[int, list[Frame]] = {}
         for number, frame in frames:
             of.setdefault(number, []).append(frame)
@@ -73,14 +71,14 @@ class Wires:
             self.unsent += len(some) - self._ports[number].offer(some)
 
     def close(self) -> None:
-        """Cut everybody off; any number of times."""
+        """Close all wires and their connections; any number of times."""
         for wire in self._wires:
             wire.close()
         self._wires.clear()
         self._ports.clear()
 
     def _listen(self, deadline_ns: int) -> None:
-        """Move all wires until something is heard or it is late."""
+        """Move all wires until a frame is received or the deadline has passed."""
         while True:
             if len(self._wires) > 1:
                 self._wait(deadline_ns)
@@ -91,7 +89,7 @@ class Wires:
                 return
 
     def _wait(self, deadline_ns: int) -> None:
-        """Until one of several wires has something to do."""
+        """Wait until one of several wires has something to do."""
         watched: list[int] = []
         for wire in self._wires:
             descriptors, end_ns = wire.watched()

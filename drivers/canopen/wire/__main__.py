@@ -12,7 +12,7 @@ from ident_service.errors import DriverError
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Host a wire; 0 when it was ended, 1 when it could not begin."""
+    """Host a wire until interrupted; returns 0 when it was ended, 1 when it could not begin."""
     parser = argparse.ArgumentParser(prog="python -m drivers.canopen.wire", description=__doc__)
     parser.add_argument("name", help="what ends connect to: a name, or the path of a socket file")
     parser.add_argument("--bitrate", type=int, default=0, help="pace to keep [bit/s]; 0: none")

@@ -1,10 +1,8 @@
-"""Where a wire is found, and whether the other side may be trusted.
+"""Find the socket address of a wire, and check whether the process on the other side may be trusted.
 
 A name is an abstract socket address of this user, which vanishes with its process. A channel with a slash is a socket
 file, which only its owner can open. Either way both sides check that the other runs as the same user or as root:
 abstract addresses have no permissions.
-
-Boundary: sockets and addresses; no packet.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ _MAX_ADDRESS = 100
 
 
 def address_of(channel: str) -> str:
-    """The socket address of a channel.
+    """Return the socket address of a channel.
 
     Raises:
         BusError: a channel that cannot be one.
@@ -35,7 +33,7 @@ def address_of(channel: str) -> str:
 
 
 def listen(channel: str) -> socket.socket:
-    """A socket that takes connections.
+    """Open the socket of a wire that takes connections.
 
     Raises:
         BusError: another process runs this wire, or the address cannot be had.
@@ -63,10 +61,10 @@ def listen(channel: str) -> socket.socket:
 
 
 def connect(channel: str) -> socket.socket:
-    """A connection to the wire.
+    """Connect to the wire.
 
     Raises:
-        BusError: nobody runs it, or somebody else does.
+        BusError: no process runs it, or one of another user does.
     """
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     name = f"ident_wire {channel}"
@@ -88,13 +86,13 @@ def connect(channel: str) -> socket.socket:
 
 
 def trusted(sock: socket.socket) -> bool:
-    """Whether the other side runs as this user or as root."""
+    """Return whether the process on the other side runs as this user or as root."""
     _, uid, _ = _CREDENTIALS.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
     return uid in (os.getuid(), 0)
 
 
 def peer_pid(sock: socket.socket) -> int:
-    """The process on the other side."""
+    """Return the id of the process on the other side."""
     return int(_CREDENTIALS.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))[0])
 
 
@@ -112,7 +110,7 @@ def _bind(sock: socket.socket, address: str) -> None:
 
 
 def _forsaken(address: str) -> bool:
-    """Whether a socket file is left of a process that is gone."""
+    """Return whether a socket file is left of a process that is gone."""
     if address.startswith("\0") or not Path(address).is_socket():
         return False
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:

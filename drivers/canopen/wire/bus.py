@@ -1,4 +1,4 @@
-"""The wire as an interface of python-can: `can.Bus(interface="ident_wire", channel=NAME)`.
+"""Make the wire an interface of python-can: `can.Bus(interface="ident_wire", channel=NAME)`.
 
 For the configuration plane and for python-can's tools: `python -m can.logger -i ident_wire -c NAME`. Registered in the
 entry-point group `can.interface`.
@@ -25,7 +25,7 @@ _CODES = {"absent": errno.ENODEV, "down": errno.ENETDOWN, "off": errno.ENETDOWN,
 
 
 class IdentWireBus(can.BusABC):
-    """An end of the wire; one thread may receive while another one sends."""
+    """Implement an end of the wire for python-can; one thread may receive while another one sends."""
 
     def __init__(
         self,
@@ -39,7 +39,7 @@ class IdentWireBus(can.BusABC):
         data_bitrate: int | None = None,
         **kwargs: Any,
     ) -> None:
-        """Connect.
+        """Connect to the wire, and host it if asked to.
 
         Args:
             channel: name or path of the wire.
@@ -53,7 +53,7 @@ class IdentWireBus(can.BusABC):
             kwargs: ignored, as python-can's own interfaces do.
 
         Raises:
-            can.CanInitializationError: nobody runs the wire, or it cannot be run here.
+            can.CanInitializationError: no process runs the wire, or it cannot be run here.
         """
         self._thread: WireThread | None = None
         self.channel, self.channel_info = channel, f"ident_wire channel {channel!r}"
@@ -73,7 +73,7 @@ class IdentWireBus(can.BusABC):
         super().__init__(channel=channel, can_filters=can_filters, **kwargs)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send at once; a wire that takes no more is an error, whatever the timeout.
+        """Send a message at once; a wire that takes no more is an error, whatever the timeout.
 
         Raises:
             can.CanOperationError: the wire is gone, or takes no more.
@@ -113,7 +113,7 @@ class IdentWireBus(can.BusABC):
         return message, False
 
     def fileno(self) -> int:
-        """The socket's descriptor."""
+        """Return the socket's descriptor."""
         return self._connection.fileno()
 
     def shutdown(self) -> None:

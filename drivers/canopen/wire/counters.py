@@ -1,9 +1,9 @@
-"""Error counters of one controller and what they make of it (ISO 11898-1, fault confinement).
+"""Count the errors of one CAN controller and derive its state (ISO 11898-1, fault confinement).
 
 An error while sending counts 8, while receiving 1; a success takes one back. From 96 the controller warns, from 128 it
 is error-passive, a send counter above 255 takes it off the bus until it is restarted.
 
-Boundary: pure computation. Changes come out as the error frames that the kernel would hand on (linux/can/error.h).
+Changes of state come out as the error frames that the kernel would pass on (linux/can/error.h).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _PASSIVE_SUCCESS: Final = 127  # what a success sets the receive counter of a pa
 
 
 class ErrorCounters:
-    """Two counters, and the state they stand for.
+    """Count send and receive errors of a controller, and derive its state.
 
     Attributes:
         sending, receiving: the counters, each at most 256.
@@ -41,28 +41,28 @@ class ErrorCounters:
         self.state: State = "active"
 
     def set(self, sending: int, receiving: int, stamp_ns: int) -> Frame | None:
-        """Set both; the error frame when the state changes."""
+        """Set both counters; returns the error frame when the state changes."""
         self.sending, self.receiving = min(max(sending, 0), _OFF), min(max(receiving, 0), _OFF)
         return self._change(stamp_ns)
 
     def send_error(self, stamp_ns: int) -> Frame | None:
-        """A frame of this controller was destroyed."""
+        """Count a destroyed frame of this controller."""
         return self.set(self.sending + 8, self.receiving, stamp_ns)
 
     def receive_error(self, stamp_ns: int) -> Frame | None:
-        """A frame of another one was."""
+        """Count a destroyed frame of another controller."""
         return self.set(self.sending, self.receiving + 1, stamp_ns)
 
     def sent(self, stamp_ns: int) -> Frame | None:
-        """A frame went out."""
+        """Count a frame sent without error."""
         return self.set(self.sending - 1, self.receiving, stamp_ns) if self.sending else None
 
     def received(self, stamp_ns: int) -> Frame | None:
-        """A frame came in."""
+        """Count a frame received without error."""
         return self.set(self.sending, min(self.receiving - 1, _PASSIVE_SUCCESS), stamp_ns) if self.receiving else None
 
     def restart(self, stamp_ns: int) -> Frame:
-        """Back on the bus, both counters zero."""
+        """Return to the bus with both counters zero; returns the error frame that says so."""
         self.sending = self.receiving = 0
         self.state = "active"
         return Frame(RESTARTED, bytes(8), error=True, stamp_ns=stamp_ns)

@@ -1,4 +1,4 @@
-"""Two ways to host a wire within a process: in one's own loop, with a port on it, or in a thread.
+"""Host a wire within a process: in its own loop, with a port on the wire, or in a thread.
 
 A thread shares Python's interpreter lock with everything else in its process and so disturbs a loop that must be on
 time; for that, host the wire in the drives' process or in one of its own.
@@ -24,17 +24,17 @@ _LOOK_NS = 1_000_000_000
 
 
 class LocalPort:
-    """A Link of the process that hosts the wire: waiting for a frame is what moves the wire.
+    """Implement a Link in the process that hosts the wire; waiting for a frame is what moves the wire.
 
     One thread hosts the wire and uses its local ports; there may be several.
     """
 
     def __init__(self, wire: Wire, label: str) -> None:
-        """Put a port on an entered wire.
+        """Add a port to an entered wire.
 
         Args:
-            wire: to be on.
-            label: who this is, for people.
+            wire: that the port is added to.
+            label: of the port, for people.
         """
         self.clock = RealClock()
         self.port = Port(label, fd=wire.fd)
@@ -52,7 +52,7 @@ class LocalPort:
         self.send_all((frame,))
 
     def send_all(self, frames: Sequence[Frame]) -> None:
-        """Queue several at once, which costs hardly more than one; raises as `send` does."""
+        """Queue several frames at once, which costs hardly more than one; raises as `send` does."""
         now = time.monotonic_ns()
         for frame in frames:
             check_sendable(frame, fd=self._wire.fd)
@@ -64,7 +64,7 @@ class LocalPort:
         self._wire.turn(now)
 
     def offer(self, frames: Sequence[Frame]) -> int:
-        """As `send_all`, but raises nothing: how many frames were taken, from the first on."""
+        """Queue frames as `send_all` does, but without raising; returns how many were taken, from the first on."""
         now, taken = time.monotonic_ns(), 0
         for frame in frames:
             if self.port.counters.state == "off" or not self._wire.medium.offer(self.port, self._as_sent(frame), now):
@@ -77,7 +77,7 @@ class LocalPort:
         return frame._replace(fd=True) if self._wire.fd and not frame.remote else frame
 
     def receive(self, deadline_ns: int) -> Frame | None:
-        """The next frame, None when there is none until the deadline [ns of the clock].
+        """Return the next frame, None when there is none until the deadline [ns of the clock].
 
         Raises:
             BusError: the wire is closed.
@@ -90,7 +90,7 @@ class LocalPort:
         return self._waiting.pop()
 
     def drain(self) -> Sequence[Frame]:
-        """All frames that wait; returns at once.
+        """Return all frames that wait; does not wait.
 
         Raises:
             BusError: the wire is closed.
@@ -101,15 +101,15 @@ class LocalPort:
         return frames
 
     def close(self) -> None:
-        """Take the port off the wire, which goes on."""
+        """Remove the port from the wire, which goes on."""
         self._wire.medium.remove(self.port)
 
 
 class WireThread:
-    """Hosts a wire in a thread; a context manager."""
+    """Host a wire in a thread; a context manager."""
 
     def __init__(self, wire: Wire) -> None:
-        """Take a wire that is not entered yet."""
+        """Prepare to host a wire that is not entered yet."""
         self.wire = wire
         self._ended = False
         self._thread = threading.Thread(target=self._run, name=f"ident_wire {wire.name}", daemon=True)
@@ -127,11 +127,11 @@ class WireThread:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Cut everybody off."""
+        """Close the wire and all its connections."""
         self.close()
 
     def close(self) -> None:
-        """Cut everybody off; any number of times."""
+        """Close the wire and all its connections; any number of times."""
         self._ended = True
         self.wire.wake()
         if self._thread.is_alive():

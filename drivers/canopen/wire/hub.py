@@ -1,10 +1,9 @@
-"""The wire itself: takes connections, moves frames between their sockets and the medium.
+"""Host a wire: take connections, and move frames between their sockets and the medium.
 
 Whoever hosts a wire calls `poll` in its loop: emulated drives, which also have a `LocalPort` on it without any socket;
-a thread (`WireThread`); or a process of its own (`python -m drivers.canopen.wire NAME`). An end that sends nonsense is
-thrown out, one that vanishes is forgotten, one that does not read loses frames and is told so; none can stop the wire.
-
-Boundary: sockets only; order, pace and errors are the medium's.
+a thread (`WireThread`); or a process of its own (`python -m drivers.canopen.wire NAME`). An end that sends malformed
+packets is disconnected, one that vanishes is forgotten, one that does not read loses frames and is told so; none can
+stop the wire. Order, pace and errors are the medium's.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ _SELECT_LIMIT: Final = 1024  # descriptors that select, whose timeout alone is f
 
 
 class _End:
-    """A connection, and the port it has once it has greeted."""
+    """Hold a connection, and the port it has once it has greeted."""
 
     def __init__(self, sock: socket.socket) -> None:
         self.socket, self.dropped = sock, False
@@ -42,12 +41,12 @@ class _End:
 
 
 class Wire:
-    """A CAN bus for the processes of one user; a context manager.
+    """Emulate a CAN bus for the processes of one user; a context manager.
 
     Attributes:
         medium: ports, counters of frames, and the errors that can be injected (under `lock`, from another thread).
         lock: held whenever the medium is touched.
-        expelled: ends that were thrown out because they sent nonsense.
+        expelled: ends that were disconnected because they sent malformed packets.
     """
 
     def __init__(
@@ -59,7 +58,7 @@ class Wire:
         fd: bool = False,
         duration_ns: Callable[[Frame], int] | None = None,
     ) -> None:
-        """Describe a wire; nobody can connect before the context is entered.
+        """Configure a wire; nobody can connect before the context is entered.
 
         Args:
             name: channel that ends connect to: a name, or the path of a socket file.
@@ -87,7 +86,7 @@ class Wire:
         self._wake = -1
 
     def __enter__(self) -> Self:
-        """Take connections from now on.
+        """Listen for connections from now on.
 
         Raises:
             BusError: another process runs this wire, or its address cannot be had.
@@ -99,11 +98,11 @@ class Wire:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Cut everybody off."""
+        """Close the wire and all its connections."""
         self.close()
 
     def close(self) -> None:
-        """Cut everybody off; any number of times."""
+        """Close the wire and all its connections; any number of times."""
         with self.lock:
             if self._listener is None:
                 return
@@ -119,7 +118,7 @@ class Wire:
             os.eventfd_write(self._wake, 1)
 
     def poll(self, deadline_ns: int) -> None:
-        """Take what has come, move frames, hand out what was heard; once.
+        """Receive from sockets, move frames, and deliver received ones; once.
 
         Args:
             deadline_ns: how long to wait for something to do [ns, monotonic]; one in the past only looks.
@@ -147,11 +146,11 @@ class Wire:
             self.turn(time.monotonic_ns())
 
     def watched(self) -> tuple[list[int], int | None]:
-        """What to wait for where one loop hosts several wires: descriptors, and when a frame ends."""
+        """Return the descriptors to wait for, and when a frame ends, where one loop hosts several wires."""
         with self.lock:
             if self._listener is None:
                 return [], None
-            # A port whose queue is full is not read: its socket fills up, and its sender is told.
+            # A port whose queue is full is not read: its socket fills up, and its sender gets an error.
             ends = [
                 number
                 for number, end in self._ends.items()
@@ -160,7 +159,7 @@ class Wire:
             return [self._listener.fileno(), self._wake, *ends], self.medium.end_ns
 
     def turn(self, now_ns: int) -> None:
-        """Move frames and hand out what was heard, without taking anything from a socket."""
+        """Move frames and deliver received ones, without taking anything from a socket."""
         self.medium.advance(now_ns)
         for end in list(self._ends.values()):
             if end.port is not None and end.port.inbox:
@@ -174,7 +173,7 @@ class Wire:
         except OSError:
             return
         sock.setblocking(False)
-        # Who comes in vain is told in answer to its greeting: closed before, its unread greeting would hide the answer.
+        # A refused end is told in answer to its greeting: closed before, its unread greeting would hide the answer.
         if address.trusted(sock) and len(self._ends) < 2 * MOST_ENDS and sock.fileno() < _SELECT_LIMIT:
             self._ends[sock.fileno()] = _End(sock)
         else:
@@ -244,7 +243,7 @@ class Wire:
 
 
 def _pace(bitrate: int, data_bitrate: int | None) -> Callable[[Frame], int]:
-    """How long frames occupy a wire of these bit rates [ns]."""
+    """Return the function for how long a frame occupies a wire of these bit rates [ns]."""
 
     def duration_ns(frame: Frame) -> int:
         if not frame.fd:

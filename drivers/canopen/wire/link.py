@@ -1,4 +1,4 @@
-"""An end of the wire: a connection, and the Link on it that needs no python-can.
+"""Connect to a wire: a connection, and the Link on it that needs no python-can.
 
 One system call a frame, or for several at once; the stamp of a frame is the wire's, when the frame ended on it, and the
 clock is the same in all processes of a machine.
@@ -30,11 +30,11 @@ _ANSWERS = {
 
 
 def from_config(config: ArmConfig, bus_number: int) -> WireLink:
-    """The link of one bus of an arm; entry point `ident_wire`.
+    """Open the link of one bus of an arm; entry point `ident_wire`.
 
     Raises:
-        BusError: nobody runs the wire, or it refuses.
-        DriverError: the driver section is not CANopen's, or an option that nobody knows; `pace` is the host's.
+        BusError: no process runs the wire, or it refuses.
+        DriverError: the driver section is not CANopen's, or an unknown option; `pace` is the host's.
     """
     if not isinstance(config.driver, CanopenDriver):
         raise DriverError(f"{config.name}: the driver is not CANopen's")
@@ -46,22 +46,22 @@ def from_config(config: ArmConfig, bus_number: int) -> WireLink:
 
 
 class Connection:
-    """A connection that has been greeted.
+    """Connect to a wire and exchange greetings.
 
     Attributes:
         name: of the bus, for messages.
-        welcome: what the wire said of itself.
+        welcome: answer of the wire, with its properties.
     """
 
     def __init__(self, channel: str, hello: packets.Hello) -> None:
-        """Connect and greet.
+        """Connect to the wire and greet it.
 
         Args:
             channel: name or path of the wire.
-            hello: who this is, and what it wants to hear.
+            hello: label, filters and CAN FD of this end.
 
         Raises:
-            BusError: nobody runs the wire, or it refuses.
+            BusError: no process runs the wire, or it refuses.
         """
         self.name = f"ident_wire {channel}"
         self._socket = address.connect(channel)
@@ -78,7 +78,7 @@ class Connection:
         self._socket.setblocking(False)
 
     def fileno(self) -> int:
-        """The socket's descriptor, -1 when closed."""
+        """Return the socket's descriptor, -1 when closed."""
         return self._socket.fileno()
 
     def send(self, frames: Sequence[Frame]) -> None:
@@ -94,7 +94,7 @@ class Connection:
             raise self._failure(error) from None
 
     def take(self, until_ns: int = 0) -> list[tuple[Frame, bool]]:
-        """Frames of the next packet, and whether they are our own; empty when none came until a time [ns, monotonic].
+        """Return the frames of the next packet, with whether they are this end's own; empty from `until_ns` on.
 
         Raises:
             BusError: the wire is gone.
@@ -115,7 +115,7 @@ class Connection:
             return unpack_frames(data)
 
     def close(self) -> None:
-        """Leave the wire."""
+        """Close the connection to the wire."""
         self._socket.close()
 
     def _wait(self, seconds: float) -> None:
@@ -133,10 +133,10 @@ class Connection:
 
 
 class WireLink:
-    """A Link on a connection; the thread that opened it is its only user."""
+    """Implement a Link on a connection; the thread that opened it is its only user."""
 
     def __init__(self, connection: Connection, *, fd: bool | None = None) -> None:
-        """Take a connection over.
+        """Use an open connection, and close it with the link.
 
         Args:
             connection: greeted.
@@ -149,7 +149,7 @@ class WireLink:
         self._watch = BusOffWatch()
 
     def send(self, frame: Frame) -> None:
-        """Hand one frame to the wire.
+        """Send one frame to the wire.
 
         Raises:
             BusError: bus-off, the wire is gone or takes no more.
@@ -158,7 +158,7 @@ class WireLink:
         self.send_all((frame,))
 
     def send_all(self, frames: Sequence[Frame]) -> None:
-        """Hand several over in one system call, in their order; raises as `send` does, and then nothing is sent."""
+        """Send several frames in one system call, in their order; raises as `send` does, and then nothing is sent."""
         for frame in frames:
             check_sendable(frame, fd=self._fd)
         if self._watch.off:
@@ -169,7 +169,7 @@ class WireLink:
         self._connection.send(frames)
 
     def receive(self, deadline_ns: int) -> Frame | None:
-        """The next frame, None when there is none until the deadline [ns of the clock].
+        """Return the next frame, None when there is none until the deadline [ns of the clock].
 
         Raises:
             BusError: the wire is gone.
@@ -179,7 +179,7 @@ class WireLink:
         return self._waiting.popleft() if self._waiting else None
 
     def drain(self) -> Sequence[Frame]:
-        """All frames that wait, hardly more than `MOST_AT_ONCE`; returns at once.
+        """Return all frames that wait, hardly more than `MOST_AT_ONCE`; does not wait.
 
         Raises:
             BusError: the wire is gone.
@@ -191,7 +191,7 @@ class WireLink:
         return frames
 
     def close(self) -> None:
-        """Leave the wire."""
+        """Close the connection to the wire."""
         self._connection.close()
 
     def _keep(self, taken: list[tuple[Frame, bool]]) -> None:

@@ -1,4 +1,4 @@
-"""The wire without sockets: ports with queues, arbitration, pace, errors. Frames and times in, frames out.
+"""Emulate a CAN bus without sockets: ports with queues, arbitration, pace and errors.
 
 Whenever the wire is free, the first frame of every port's queue contends; the one whose arbitration field has the first
 dominant bit where others have a recessive one wins (ISO 11898-1). A port's own frames keep their order, as in the
@@ -7,7 +7,7 @@ kernel's queue of an interface. With a pace each frame occupies the wire for its
 A CAN FD frame on a wire that is classic, or with a classic controller on it, is destroyed each time: to that controller
 its bit FDF is a broken frame. Its sender goes on trying until it is off the bus.
 
-Boundary: pure, on any clock; so the pace is exact in virtual time, however late its host may be.
+It runs on any clock; so the pace is exact in virtual time, however late its host may be.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ INBOX = 1024  # frames that may wait to be taken; then the newest are lost, as i
 
 
 def priority(frame: Frame) -> tuple[int, int, int, int, int]:
-    """Arbitration field in the order of its bits; the smallest wins.
+    """Return the arbitration field in the order of its bits; the smallest wins.
 
     A standard data frame wins over its remote frame, and both over extended frames that begin with its identifier.
     """
@@ -34,13 +34,13 @@ def priority(frame: Frame) -> tuple[int, int, int, int, int]:
 
 
 class Port:
-    """One controller on the wire.
+    """Represent one controller on the wire.
 
     Attributes:
-        label: who it is, for people and for injecting errors.
+        label: name of the controller, for people and for injecting errors.
         pid: its process.
         counters: its error counters.
-        inbox: what it heard and has not taken yet, and whether it was its own.
+        inbox: frames that it received and that are not taken yet, each with whether it was its own.
         fd: whether its controller knows CAN FD; one that does not destroys such frames of others.
         lost: frames that found its inbox full.
     """
@@ -54,7 +54,7 @@ class Port:
         filters: Iterable[tuple[int, int]] = (),
         fd: bool = True,
     ) -> None:
-        """Make an end that is not on any wire yet.
+        """Create a port that is not on any wire yet.
 
         Args:
             label: for people.
@@ -75,7 +75,7 @@ class Port:
         )
 
     def hear(self, frame: Frame, own: bool = False) -> None:
-        """Put a frame into the inbox, and whether it is its own, if it passes the filters and finds room."""
+        """Put a frame into the inbox, with whether it is its own, if it passes the filters and finds room."""
         if self._passes is not None and not frame.error and (frame.extended or not self._passes[frame.identifier]):
             return
         if len(self.inbox) >= INBOX:
@@ -88,30 +88,30 @@ class Port:
         self.inbox.append((frame, own))
 
     def take(self) -> list[tuple[Frame, bool]]:
-        """What was heard, and whether it was its own; it is then forgotten."""
+        """Return the received frames, each with whether it was its own, and empty the inbox."""
         frames, self.inbox = self.inbox, []
         return frames
 
 
 def overflow(stamp_ns: int) -> Frame:
-    """The error frame that says that frames were lost before it, because nobody took them."""
+    """Return the error frame that says that frames before it were lost, because the inbox was full."""
     return Frame(CONTROLLER, bytes((0, RX_OVERFLOW, 0, 0, 0, 0, 0, 0)), error=True, stamp_ns=stamp_ns)
 
 
 class Medium:
-    """The wire and who is on it.
+    """Emulate the wire and its ports.
 
     Attributes:
         ports: in the order in which they came.
-        sent: frames that everybody heard.
-        destroyed: frames that nobody did.
+        sent: frames that all ports received.
+        destroyed: frames that no port received.
         collisions: frames that met one with the same arbitration field from another port: two nodes with one number.
     """
 
     def __init__(
         self, duration_ns: Callable[[Frame], int] | None = None, error_ns: int = 0, *, fd: bool = True
     ) -> None:
-        """Make an empty wire.
+        """Create a wire without ports.
 
         Args:
             duration_ns: how long a frame occupies the wire; None: not at all, and all that waits contends at once.
@@ -127,15 +127,15 @@ class Medium:
 
     @property
     def end_ns(self) -> int | None:
-        """When the frame that is being sent ends, None while the wire is free."""
+        """Return when the frame that is being sent ends, None while the wire is free."""
         return None if self._current is None else self._current[2]
 
     def add(self, port: Port) -> None:
-        """Put a port on the wire."""
+        """Add a port to the wire."""
         self.ports.append(port)
 
     def remove(self, port: Port) -> None:
-        """Take a port off; what it was sending breaks off, what it had queued is gone."""
+        """Remove a port; the frame it was sending breaks off, and its queued frames are dropped."""
         if port in self.ports:
             self.ports.remove(port)
         if self._current is not None and self._current[0] is port:
@@ -144,7 +144,7 @@ class Medium:
         self._to_destroy.pop(port, None)
 
     def room(self, port: Port) -> int:
-        """How many more frames a port may queue."""
+        """Return how many more frames a port may queue."""
         return QUEUE - len(port.pending)
 
     def offer(self, port: Port, frame: Frame, now_ns: int) -> bool:
@@ -157,7 +157,7 @@ class Medium:
         return True
 
     def advance(self, now_ns: int) -> None:
-        """Send what can be sent until `now_ns`; what is heard goes into the inboxes, stamped with its end."""
+        """Send what can be sent until `now_ns`; received frames go into the inboxes, stamped with their end."""
         while True:
             if self._current is None and not self._start(now_ns):
                 return
@@ -168,15 +168,15 @@ class Medium:
             self._finish(port, frame, end)
 
     def destroy(self, count: int, port: Port | None = None) -> None:
-        """Let the next `count` frames, of one port or of any, be destroyed by an error; they are sent again."""
+        """Destroy the next `count` frames, of one port or of any, by an error; they are sent again."""
         self._to_destroy[port] = count
 
     def set_counters(self, port: Port, sending: int, receiving: int, now_ns: int) -> None:
-        """Set a controller's error counters, with what follows from them; 256 sending is bus-off."""
+        """Set a controller's error counters, with the change of state that follows; 256 sending is bus-off."""
         self._note(port, port.counters.set(sending, receiving, now_ns))
 
     def restart(self, port: Port, now_ns: int) -> None:
-        """Bring a controller back on the bus."""
+        """Return a controller to the bus."""
         self._note(port, port.counters.restart(now_ns))
 
     def _start(self, now_ns: int) -> bool:

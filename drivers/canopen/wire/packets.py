@@ -1,9 +1,9 @@
-"""What travels between the wire and its ends: packets of a sequenced-packet socket, little-endian.
+"""Encode and decode the packets between the wire and its ends: sequenced-packet socket, little-endian.
 
 An end says `Hello` first and is answered with a `Welcome`; from then on each packet in either direction holds one or
 more frames in their order (`pack_frames`).
 
-Boundary: bytes in, values out; every malformed packet is one DriverError.
+Every malformed packet is one DriverError.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ident_service.errors import DriverError
 
 MAGIC: Final = b"IDCW"
 VERSION: Final = 2
-_OWN, _FD = 1, 2  # flags of Hello: hear own frames; its controller knows CAN FD
+_OWN, _FD = 1, 2  # flags of Hello: receive own frames; its controller supports CAN FD
 _HELLO: Final = struct.Struct("<4sBBBx32s")
 _FILTER: Final = struct.Struct("<HH")
 _WELCOME: Final = struct.Struct("<4sBBBxII")
@@ -27,7 +27,7 @@ ACCEPTED, OTHER_VERSION, CROWDED = 0, 1, 2  # answers
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """Who connects, whether it wants its own frames, which others (identifier, mask), and whether it knows CAN FD."""
+    """Represent an end's greeting: label, whether it wants its own frames, filters (identifier, mask), and CAN FD."""
 
     label: str
     own: bool = False
@@ -37,7 +37,7 @@ class Hello:
 
 @dataclass(frozen=True, slots=True)
 class Welcome:
-    """The wire's answer: whether it takes the end, its bit rates (0: no pace, no switch), whether it carries CAN FD."""
+    """Represent the wire's answer: acceptance, bit rates (0: no pace, no switch), and whether it carries CAN FD."""
 
     answer: int = ACCEPTED
     bitrate: int = 0
@@ -46,7 +46,7 @@ class Welcome:
 
 
 def pack_hello(hello: Hello) -> bytes:
-    """Bytes of the first packet; the label is cut to 32 bytes."""
+    """Encode the first packet of an end; the label is cut to 32 bytes."""
     if len(hello.filters) > _MAX_FILTERS:
         raise DriverError(f"{len(hello.filters)} filters, at most {_MAX_FILTERS}")
     label = hello.label.encode()[:32].decode(errors="ignore").encode()
@@ -56,10 +56,10 @@ def pack_hello(hello: Hello) -> bytes:
 
 
 def unpack_hello(data: bytes) -> Hello:
-    """The first packet of an end.
+    """Decode the first packet of an end.
 
     Raises:
-        DriverError: it is none, or of another version.
+        DriverError: it is no greeting, or of another version.
     """
     if len(data) < _HELLO.size or data[:4] != MAGIC:
         raise DriverError("no greeting")
@@ -73,15 +73,15 @@ def unpack_hello(data: bytes) -> Hello:
 
 
 def pack_welcome(welcome: Welcome) -> bytes:
-    """Bytes of the answer."""
+    """Encode the answer of a wire."""
     return _WELCOME.pack(MAGIC, VERSION, welcome.answer, welcome.fd, welcome.bitrate, welcome.data_bitrate)
 
 
 def unpack_welcome(data: bytes) -> Welcome:
-    """The answer of a wire.
+    """Decode the answer of a wire.
 
     Raises:
-        DriverError: it is none.
+        DriverError: it is no such answer.
     """
     if len(data) != _WELCOME.size or data[:4] != MAGIC:
         raise DriverError("not the answer of a wire")

@@ -1,1 +1,1 @@
-"""Every check between an arm that stands on its support and one that may move: what they find is a ticket."""
+"""Check an arm that stands on its support before it may move; the findings are a ticket."""

@@ -1,7 +1,4 @@
-"""What a preflight check says: a code, a verdict, what was measured against which limit, and what to do about it.
-
-Boundary: words and numbers; what is measured, and how, is in the files beside this one.
-"""
+"""Represent the result of a preflight check: code, verdict, measured values with limits, and what to do about it."""
 
 from __future__ import annotations
 
@@ -14,12 +11,12 @@ from ident_service.config.limits import Vector
 
 
 class Verdict(Enum):
-    """How a check ended."""
+    """Name the outcomes of a check."""
 
     PASSED = "passed"
     FAILED = "failed"
     SKIPPED = "skipped"  # it could not be made, or not safely; the reason says why
-    NEEDS_PERSON = "needs a person"  # it could be made, but nobody has agreed to it
+    NEEDS_PERSON = "needs a person"  # it could be made, but no person has agreed to it
 
 
 # Every check there is, in the order in which they are made.
@@ -46,13 +43,13 @@ INDISPENSABLE = ("gravity", "direction", "watchdog")
 
 @dataclass(frozen=True)
 class Measure:
-    """One number and its limits.
+    """Represent one measured number and its limits.
 
     Attributes:
-        what: it is.
+        what: name of the quantity.
         value: None where it could not be measured or is no finite number.
         unit: of the value and the limits.
-        joint: whose, or None.
+        joint: name of the joint concerned, or None.
         least: the value must not be below it, if given.
         most: the value must not be above it, if given.
     """
@@ -66,7 +63,7 @@ class Measure:
 
     @property
     def kept(self) -> bool:
-        """Whether the limits are kept; a number that is missing keeps none."""
+        """Return whether the value keeps its limits; a missing value keeps none."""
         if self.least is None and self.most is None:
             return True
         if self.value is None:
@@ -83,13 +80,13 @@ class Measure:
 
 @dataclass(frozen=True)
 class Check:
-    """What came of one check.
+    """Represent the result of one check.
 
     Attributes:
         code: one of `CODES`.
         verdict: how it ended.
-        measures: what was measured.
-        reason: what is wrong, or why the check was not made; empty when all is well.
+        measures: the measured numbers and their limits.
+        reason: failure, or why the check was not made; empty when all is well.
         remedy: one sentence that says what to do; empty when there is nothing to do.
     """
 
@@ -109,7 +106,7 @@ def measure(
     least: float | None = None,
     most: float | None = None,
 ) -> Measure:
-    """A measure of plain numbers; what is not finite counts as not measured."""
+    """Create a measure from plain numbers; a number that is not finite counts as not measured."""
 
     def plain(number: float | None) -> float | None:
         return None if number is None or not isfinite(number) else float(number)
@@ -126,7 +123,7 @@ def measures(
     least: Vector | None = None,
     most: Vector | None = None,
 ) -> tuple[Measure, ...]:
-    """One measure per joint, from arrays of shape (joints,)."""
+    """Create one measure per joint, from arrays of shape (joints,)."""
     return tuple(
         measure(
             what,
@@ -141,7 +138,7 @@ def measures(
 
 
 def judged(code: str, found: Sequence[Measure], remedy: str) -> Check:
-    """Passed where every measure keeps its limits, else failed, naming each that does not."""
+    """Return a check that passed where every measure keeps its limits, else failed, naming each that does not."""
     broken = [str(one) for one in found if not one.kept]
     if broken:
         return Check(code, Verdict.FAILED, tuple(found), "; ".join(broken), remedy)
@@ -149,15 +146,15 @@ def judged(code: str, found: Sequence[Measure], remedy: str) -> Check:
 
 
 def failed(code: str, reason: str, remedy: str, found: Sequence[Measure] = ()) -> Check:
-    """A check that failed."""
+    """Return a check that failed."""
     return Check(code, Verdict.FAILED, tuple(found), reason, remedy)
 
 
 def skipped(code: str, reason: str, remedy: str = "") -> Check:
-    """A check that was not made."""
+    """Return a check that was not made."""
     return Check(code, Verdict.SKIPPED, (), reason, remedy)
 
 
 def joint_units(revolute: Sequence[bool], turning: str, sliding: str) -> tuple[str, ...]:
-    """The unit of each joint's quantity."""
+    """Return the unit of each joint's quantity."""
     return tuple(turning if turns else sliding for turns in revolute)

@@ -1,4 +1,4 @@
-"""Delay from command to motion, by a small sinusoidal torque on top of a joint's test motion.
+"""Measure the delay from torque command to motion, by a small sinusoidal torque on top of a joint's test motion.
 
 A sliding joint accelerates as its torque says; when it does so later than that, the delay is hidden in the drive, on
 the bus, or in stale positions. Slow motions do not tell it: their torque hardly changes within a cycle. A loop with a
@@ -26,7 +26,7 @@ _SLIDING = 0.3  # of the largest speed asked for, above which the joint is taken
 _WINDOW = 0.02  # s, of the filter that differentiates: the sine must pass
 _STEPS, _FARTHEST = 4, 0.005  # s a step
 _LEAST = 3.0  # periods of the sine that it must slide for
-_SURE = 0.2  # of a cycle: a delay that is known worse says nothing
+_SURE = 0.2  # of a cycle: a delay with a larger deviation is not judged
 # Of a cycle, by which the delay may exceed the configured one. Measured on the emulated WAM at 500 Hz, all joints
 # together: -0.94 ms with a deviation of 0.27 ms; with a hidden cycle of 2 ms 1.31 ms, deviation 0.22 ms.
 MOST = 0.25
@@ -34,7 +34,7 @@ MOST = 0.25
 
 @dataclass(frozen=True)
 class Delay:
-    """What was measured at one joint: the hidden delay and its standard deviation [s]."""
+    """Represent the hidden delay measured at one joint and its standard deviation [s]."""
 
     joint: int
     seconds: float
@@ -42,7 +42,7 @@ class Delay:
 
 
 def dither(session: Session, limits_torque: Vector, joint: int) -> Vector:
-    """Return the torque's amplitude, of one joint [N m or N], shape (joints,); zero for a loop too slow for it."""
+    """Return the amplitude of a sinusoidal torque on one joint [N m or N], (joints,); zero in too slow a loop."""
     if FREQUENCY * session.period > 1.0 / _LEAST_SAMPLES:
         return np.zeros(len(limits_torque))
     size = min(_TORQUE * limits_torque[joint], _SPEED * session.inertia[joint, joint] * 2.0 * np.pi * FREQUENCY)
@@ -50,7 +50,7 @@ def dither(session: Session, limits_torque: Vector, joint: int) -> Vector:
 
 
 def delay_of(trace: Trace, expected: Vector, joint: int) -> Delay | None:
-    """Measure the hidden delay; None where the joint did not slide for long enough, or did not answer.
+    """Measure the hidden delay; None where the joint did not slide for long enough, or did not respond.
 
     With a the measured and b the expected acceleration, both through one filter, `a(t) = g b(t - d) + friction`, and so
     `a = g b - g d db/dt + f_c sign(v) + f_v v + c` to first order.
@@ -91,9 +91,9 @@ def delay_of(trace: Trace, expected: Vector, joint: int) -> Delay | None:
 
 
 def delay_measures(delays: Sequence[Delay], model: ArmModel, period: float) -> list[Measure]:
-    """Hold the delay of all joints together against the configured one (`identification.delay`).
+    """Compare the delay of all joints together with the configured one (`identification.delay`).
 
-    Each joint's own is told, too. Nothing is judged where all of them together do not know it to `_SURE` of a cycle.
+    Each joint's own delay is told, too. Nothing is judged where all together do not know it to `_SURE` of a cycle.
     """
     if not delays:
         return []

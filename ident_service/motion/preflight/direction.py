@@ -1,4 +1,4 @@
-"""Direction and scale of every joint, by a small jerk-limited motion there and back, one joint at a time.
+"""Check direction and scale of every joint, by a small jerk-limited motion there and back, one joint at a time.
 
 Two numbers per joint. How it follows: the displacement measured from dwell to dwell against the one asked for. And how
 it answers torque: measured acceleration against the one that the model expects of the torque that acted,
@@ -6,7 +6,6 @@ it answers torque: measured acceleration against the one that the model expects 
 the answer to torque shows it, as it shows a wrong gear ratio, squared. A joint whose sign is wrong runs away from its
 reference, until the guard ends that at twice the amplitude; what it did on the way says whether the sign was why.
 
-Boundary: the motions and the judgement; the loop is `session.py`.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ MORE_TORQUE = 1.25
 LEAST_ANSWER = 1.0 / (2.0 * INERTIA[1])  # and how much less, where the model knows the drive's inertia
 # Rotors by data sheet are the least that is there: of the shipped WAM's wrist, a fifth of what is.
 LEAST_DESCRIBED = 0.1
-ODD_ANSWER = 0.5  # below which an answer is told, although a joint with an unknown inertia may give it
+ODD_ANSWER = 0.5  # below which an answer is reported, although a joint with an unknown inertia may give it
 _NEAREST = "answer to torque, the nearest within its doubt"
 # Behind an inertia that is missing in the model even a healthy joint answers with next to nothing.
 _NEAREST_LOOSELY = "answer to torque (too low a scale cannot be judged until the prior has the drive inertia)"
@@ -50,7 +49,7 @@ _DOUBT = 3.0  # standard deviations
 _EXPLAINS = 0.5  # of what is unexplained must remain at most when a wrong sign is put right
 _LEAST_CYCLES = 8
 _BEGUN = 0.95  # of the way that ended at the guard is still to come when a joint has begun to move
-_SEEN = 2e-3  # rad or m that a joint must have moved before it says anything about its sign
+_SEEN = 2e-3  # rad or m that a joint must have moved before its sign can be judged
 _WINDOW = 0.06  # s, of the filter that differentiates
 _MOVING = 0.2  # of the largest speed
 SIGN_REMEDY = (
@@ -60,7 +59,7 @@ SIGN_REMEDY = (
 
 @dataclass(frozen=True)
 class Stroke:
-    """A small motion of one joint from where it stands and back.
+    """Represent a small test motion of one joint from where it stands and back.
 
     Attributes:
         joint: index.
@@ -75,11 +74,11 @@ class Stroke:
 
     @property
     def duration(self) -> float:
-        """Both ways and the dwells [s]."""
+        """Return the duration of both ways and the dwells [s]."""
         return self.there.duration + self.back.duration + 3.0 * DWELL
 
     def at(self, time: float) -> Setpoint:
-        """Setpoint at `time` [s]."""
+        """Return the setpoint at `time` [s]."""
         time -= DWELL
         if time < self.there.duration + DWELL:
             return self.there.at(max(time, 0.0))
@@ -88,12 +87,12 @@ class Stroke:
 
 @dataclass(frozen=True)
 class Answer:
-    """What a joint did.
+    """Represent the response of one joint to its test motion.
 
     Attributes:
-        follows: measured against commanded displacement; not a number where it was not moved.
-        answers: measured against expected acceleration, likewise.
-        doubt: its standard deviation.
+        follows: measured over commanded displacement; NaN where the joint was not moved.
+        answers: measured over expected acceleration; NaN likewise.
+        doubt: standard deviation of `answers`.
     """
 
     follows: float
@@ -102,7 +101,7 @@ class Answer:
 
 
 def strokes(session: Session, model: ArmModel, limits: MotionLimits, only: int | None = None) -> list[Stroke]:
-    """A small motion for every joint, or for one, by number.
+    """Plan a small test motion for every joint, or for one, by number.
 
     Raises:
         MotionRefused: a joint has no room within its position limits or its surroundings.
@@ -125,10 +124,10 @@ def strokes(session: Session, model: ArmModel, limits: MotionLimits, only: int |
 
 
 def follow_stroke(session: Session, stroke: Stroke) -> tuple[Rows, Rows]:
-    """Move one joint there and back, to learn its friction, and once more.
+    """Move one joint there and back three times: twice to learn its friction, the second time shaken, and once more.
 
     Returns:
-        What happened the last time, and the time before, when the joint was shaken on its way (`delay.py`).
+        The cycles of the last time, and of the time before, when the joint was shaken on its way (`delay.py`).
 
     Raises:
         ArmFault, DriverError: from the loop.
@@ -142,13 +141,13 @@ def follow_stroke(session: Session, stroke: Stroke) -> tuple[Rows, Rows]:
 
 
 def answer(trace: Trace, stroke: Stroke, session: Session) -> Answer:
-    """Judge a stroke that the loop could follow to its end."""
+    """Evaluate a test motion that the loop could follow to its end."""
     answers, doubt = _answer_to_torque(trace, stroke.joint, session)
     return Answer(_displaced(trace, stroke) / stroke.amplitude, answers, doubt)
 
 
 def _answer_to_torque(trace: Trace, joint: int, session: Session) -> tuple[float, float]:
-    """Measured against expected acceleration, and its standard deviation; no numbers where it hardly moved."""
+    """Return measured over expected acceleration and its standard deviation; NaN where the joint hardly moved."""
     nothing = float("nan"), float("nan")
     rate = trace.rate[:, joint]
     window = max(5, 2 * round(0.5 * _WINDOW / trace.period) + 1)
@@ -168,7 +167,7 @@ def _answer_to_torque(trace: Trace, joint: int, session: Session) -> tuple[float
 
 
 def _displaced(trace: Trace, stroke: Stroke) -> float:
-    """Mean way there and back, from dwell to dwell [rad or m]."""
+    """Return the mean displacement there and back, from dwell to dwell [rad or m]."""
     ends = (DWELL, stroke.there.duration + 2.0 * DWELL, stroke.duration)
     last = max(1, round(_SETTLED / trace.period))
     rows = [round(end / trace.period) for end in ends]
@@ -177,7 +176,7 @@ def _displaced(trace: Trace, stroke: Stroke) -> float:
 
 
 def went_against(trace: Trace, joint: int, session: Session) -> bool:
-    """Whether the joint that has gone astray went against its own torque, since it last stood.
+    """Return whether the joint that left its reference accelerated against its own torque, since it last stood.
 
     Friction holds it until the torque is large enough, and is constant afterwards, so that only what comes after it has
     begun to move counts, with a constant torque taken out.
@@ -197,7 +196,7 @@ def went_against(trace: Trace, joint: int, session: Session) -> bool:
 
 
 def wrong_signs(trace: Trace, session: Session) -> list[int]:
-    """Joints whose sign explains how a loop ended at the guard.
+    """Return the joints whose wrong sign explains how the guard ended a loop.
 
     Measured displacements against the twice integrated accelerations that the model expects, constant torques that the
     model does not know (gravity's for example) taken out on both sides. Joints are coupled, so that one wrong sign
@@ -245,7 +244,7 @@ def wrong_signs(trace: Trace, session: Session) -> list[int]:
 
 
 def sign_failure(joints: Sequence[int], model: ArmModel, why: str) -> Check:
-    """The direction check of an arm with joints that went the wrong way."""
+    """Return the failed direction check of an arm with joints that went the wrong way."""
     names = ", ".join(model.chain.names[joint] for joint in joints)
     return failed("direction", f"{names}: seems to move against its torque ({why})", SIGN_REMEDY)
 
@@ -253,7 +252,7 @@ def sign_failure(joints: Sequence[int], model: ArmModel, why: str) -> Check:
 def direction_check(
     answers: Sequence[Answer], model: ArmModel, session: Session, delays: Sequence[Delay] = ()
 ) -> Check:
-    """Judge all strokes of a session, and the delays that were measured on them."""
+    """Evaluate all test motions of a session, and the delays measured on them, as one check."""
     names, ones = model.chain.names, ("",) * model.chain.joints
     nothing = np.zeros(len(names))
     follows = np.array([one.follows for one in answers])
@@ -275,7 +274,7 @@ def direction_check(
         *(replace(one, what=_NEAREST if drive > 0.0 else _NEAREST_LOOSELY) for one, drive in zip(
             measures(_NEAREST, judged_at, ones, names, least=least, most=most), known + said, strict=True)),
     ]  # fmt: skip
-    # Where it cannot be told from friction how a joint answers torque, following is all there is to judge.
+    # Where the response to torque cannot be told from friction, only following can be judged.
     found = [one for one in found if one.value is not None or one.what.startswith("displacement")]
     found += delay_measures(delays, model, session.period)
     told = [
@@ -314,7 +313,7 @@ def _free_stroke(
 
 
 def expected_way(trace: Trace, session: Session, sign: Vector | float = 1.0) -> Vector:
-    """How far the model expects the torque that acted, times `sign`, to have moved the arm, shape (cycles, joints)."""
+    """Return the displacement that the model expects of the torque times `sign` [rad or m], (cycles, joints)."""
     acceleration = np.linalg.solve(session.inertia, (sign * (trace.torque - session.gravity)).T).T
     return _integrated_twice(np.asarray(acceleration, dtype=np.float64), trace.period)
 
@@ -337,7 +336,7 @@ def _integrated_twice(acceleration: Vector, period: float) -> Vector:
 
 
 def _fitted(columns: Vector, values: Vector, correlated: float) -> tuple[float, float]:
-    """The first coefficient of a least-squares fit and its standard deviation.
+    """Return the first coefficient of a least-squares fit and its standard deviation.
 
     Args:
         columns: shape (samples, unknowns).

@@ -1,4 +1,4 @@
-"""Gravity torque against the model: what it takes to hold the arm where it stands."""
+"""Check the gravity torque of the model against the torque that holds the arm where it stands."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ident_service.motion.preflight.remedy import remedy_of
 from ident_service.motion.preflight.session import Rows, Session
 
 SETTLE, HOLD = 0.3, 1.0  # s before the mean is taken, and over which
-_SUNK = 1e-3  # rad or m that a joint must have moved down before its load is told
+_SUNK = 1e-3  # rad or m that a joint must have moved down before a load is reported
 GRAVITY_ERROR = 0.1  # of the torque limit, beside Coulomb friction, which may carry as much of the weight
 _SIGNS = "Check the signs of encoders and torques too."
 REMEDY = (
@@ -27,7 +27,7 @@ REMEDY = (
 
 
 def holdable(gravity: Vector, model: ArmModel, limits: MotionLimits) -> Check | None:
-    """A failed check where the model says that the arm cannot be held in this posture; else None.
+    """Return a failed check where the model says that the arm cannot be held in this posture; else None.
 
     Args:
         gravity: the model's torque where the arm stands [N m or N], shape (joints,).
@@ -52,7 +52,7 @@ def holdable(gravity: Vector, model: ArmModel, limits: MotionLimits) -> Check | 
 
 
 def held_torque(rows: Rows, period: float) -> Vector:
-    """Mean torque that held the arm, after it had settled [N m or N], shape (joints,).
+    """Return the mean torque that held the arm, after it had settled [N m or N], shape (joints,).
 
     Args:
         rows: of holding still for `SETTLE + HOLD` seconds.
@@ -64,14 +64,14 @@ def held_torque(rows: Rows, period: float) -> Vector:
 def differences(
     held: Vector, gravity: Vector, limits: MotionLimits, friction: ExpectedFriction
 ) -> tuple[Vector, Vector]:
-    """How far two torques are apart, and how far they may be [N m or N], shape (joints,) each."""
+    """Return how far two torques are apart, and how far they may be [N m or N], shape (joints,) each."""
     return np.abs(held - gravity), GRAVITY_ERROR * limits.torque + friction.coulomb
 
 
 def gravity_check(
     held: Vector, gravity: Vector, model: ArmModel, limits: MotionLimits, friction: ExpectedFriction
 ) -> Check:
-    """Compare what held the arm with what the model says would.
+    """Compare the torque that held the arm with the model's gravity torque.
 
     Args:
         held: `held_torque` [N m or N], shape (joints,).
@@ -99,8 +99,8 @@ def not_held(
 ) -> Check:
     """Find out why a fault ended the holding of an arm.
 
-    A wrong sign that explains how the arm moved; what the fault says of itself; or a load: an arm that sinks, although
-    the torque that holds it is above the model's. Its joints stick on the way, which looks like a frozen encoder.
+    Causes: a wrong sign that explains how the arm moved; what the fault itself says; or a load: an arm that sinks,
+    although the torque that holds it is above the model's. Its joints stick on the way, like a frozen encoder.
 
     Args:
         session: in which it was held.
@@ -140,7 +140,7 @@ def not_held(
 
 
 def _weight(extra: Vector, gravity: Vector, most: Vector) -> str:
-    """Say which way the arm's weight is wrong, where all joints that differ agree; else nothing."""
+    """Describe whether the arm is heavier or lighter than described, where all joints that differ agree; else empty."""
     sides = np.sign(extra * gravity)[np.abs(extra) > most]
     if not len(sides) or (sides != sides[0]).any() or sides[0] == 0.0:
         return ""

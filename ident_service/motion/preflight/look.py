@@ -1,4 +1,4 @@
-"""What preflight sees of an arm that it does not touch: who answers, whether it rests, how regular and how quiet it is.
+"""Check an arm without torque: identities of the drives, rest, regular cycles, and noise of positions.
 
 Only `exchange(None)` is used; no drive is energised.
 """
@@ -20,7 +20,7 @@ from ident_service.motion.preflight.check import Check, Verdict, failed, joint_u
 DRIFT = 0.05  # of the velocity limit, as at the beginning of a run
 LATE = 0.25  # of a period: a later cycle counts as late (FIELDBUS.md 5.2, after OWD)
 LATE_SHARE = 0.05  # of the cycles may be late (FIELDBUS.md 5.2)
-LONGEST_GAP = 20.0  # periods through which nobody guards the arm (FIELDBUS.md 5.2: whole bus silent)
+LONGEST_GAP = 20.0  # periods in which the arm is not supervised (FIELDBUS.md 5.2: whole bus silent)
 PERIOD_ERROR = 0.02  # of a period: what the median may differ by
 STEPS_OF_NOISE = 3.0  # encoder steps: an axis at rest stays on one, or between two
 VELOCITY_NOISE = 0.1  # of the velocity limit, peak: the guard stops at 1.2
@@ -34,7 +34,7 @@ RATE_REMEDY = (
 
 @dataclass(frozen=True)
 class Looked:
-    """Cycles without torque.
+    """Hold cycles recorded without torque.
 
     Attributes:
         samples: in the order of cycles.
@@ -48,14 +48,14 @@ class Looked:
 
     @property
     def position(self) -> Vector:
-        """[rad or m], shape (cycles, joints)."""
+        """Return the positions [rad or m], shape (cycles, joints)."""
         return np.array([sample.position for sample in self.samples])
 
     @property
     def usable(self) -> bool:
-        """Whether every axis has answered with a number, first and last and all but as often as a bus may lose one.
+        """Return whether every axis has answered with finite positions, in the first, the last and almost all cycles.
 
-        What is missing in between is what it was before, which is right for an arm at rest.
+        Positions of lost answers repeat the last ones, which is right for an arm at rest.
         """
         valid = np.array([sample.valid for sample in self.samples])
         enough = bool((valid.mean(axis=0) >= 1.0 - LOST).all() and valid[0].all() and valid[-1].all())
@@ -63,7 +63,7 @@ class Looked:
 
 
 def look(arm: Arm, cycles: int, period: float, work: Callable[[Sample], None] = lambda sample: None) -> Looked:
-    """Look at an open arm for some cycles.
+    """Record cycles of an open arm without torque.
 
     Args:
         arm: open.
@@ -86,7 +86,7 @@ def look(arm: Arm, cycles: int, period: float, work: Callable[[Sample], None] = 
 def identities_check(
     described: ArmDescription, model: ArmModel, limits: MotionLimits, expected: Sequence[str] | None, looked: Looked
 ) -> Check:
-    """Whether every axis answers, and is the one that the description means.
+    """Check that every axis answers, and is the drive that the description means.
 
     Args:
         described: by the open arm.
@@ -157,7 +157,7 @@ def identities_check(
 
 
 def at_rest_check(looked: Looked, model: ArmModel, limits: MotionLimits) -> Check:
-    """Whether the arm stands still without torque, inside its position limits."""
+    """Check that the arm stands still without torque, inside its position limits."""
     code, names = "at_rest", model.chain.names
     if not looked.usable:
         return failed(code, "not every axis answers as it should", "Check bus and encoders of the axes named above.")
@@ -175,10 +175,10 @@ def at_rest_check(looked: Looked, model: ArmModel, limits: MotionLimits) -> Chec
 
 
 def rate_check(looked: Looked, lock_step: bool) -> Check:
-    """Whether this machine keeps the rate: median period, and how late cycles are.
+    """Check that this machine keeps the rate: median period, and lateness of cycles.
 
     Args:
-        looked: at the arm, with the work of a run in every cycle.
+        looked: cycles of the arm, with the work of a run in each.
         lock_step: whether time is virtual.
     """
     code = "rate"
@@ -202,13 +202,13 @@ def rate_check(looked: Looked, lock_step: bool) -> Check:
 
 
 def loop_rate_check(stamps_ns: Vector, period: float, lock_step: bool, before: Check) -> Check:
-    """Judge the rate of the whole loop, with the torque that holds the arm in every cycle, beside the look's.
+    """Check the rate of the whole loop under holding torque, in addition to the rate measured without torque.
 
     Args:
         stamps_ns: of the cycles [ns], shape (cycles,).
         period: [s].
         lock_step: whether time is virtual.
-        before: what the look said.
+        before: the check of the rate without torque.
     """
     if lock_step or before.verdict is not Verdict.PASSED:
         return before
@@ -227,7 +227,7 @@ def loop_rate_check(stamps_ns: Vector, period: float, lock_step: bool, before: C
 def noise_check(
     looked: Looked, described: ArmDescription, model: ArmModel, limits: MotionLimits, mass: Vector
 ) -> Check:
-    """What the positions of an arm at rest do, and what filter and gains would make of that.
+    """Check the position noise of an arm at rest, and what filter and gains make of it.
 
     Args:
         looked: at the arm, at rest.
@@ -252,7 +252,7 @@ def noise_check(
     speed = joint_units(model.chain.revolute, "rad/s", "m/s")
     force = joint_units(model.chain.revolute, "N m", "N")
     step = described.position_resolution
-    # Where the driver does not say how fine its encoder is, only what the loop makes of the noise can be judged.
+    # Where the driver does not state its encoder's resolution, only the effect of noise on the loop can be judged.
     steps = np.where(step > 0.0, STEPS_OF_NOISE * step, np.inf)
     found = [
         *measures("position noise, standard deviation", noise.std(axis=0), angle, names, most=steps),
@@ -276,7 +276,7 @@ def noise_check(
 
 
 def unreachable(error: ArmError) -> Check:
-    """The arm could not even be opened or looked at, and why."""
+    """Return the failed check of an arm that could not be opened or recorded, with the reason."""
     remedy = "Check power, cables and that no other program has the arm."
     if isinstance(error, PositionUnknown):
         remedy = "Do what this says; nobody else knows where the arm stands."

@@ -1,7 +1,4 @@
-"""What preflight can say before anything is opened: the description, the motion made for it, what is proven of it.
-
-Boundary: pure computation, no arm.
-"""
+"""Check what is known before an arm is opened: its description, the motion made for it, what is proven of that."""
 
 from __future__ import annotations
 
@@ -34,7 +31,7 @@ _POSTURES = 8  # of the motion, at which the coupled loop is judged
 
 
 def configuration_check(model: ArmModel) -> Check:
-    """Whether the description has all that moving needs: limits, gains, a prior of a real body, room on the bus."""
+    """Check that the description has all that motion needs: limits, gains, a prior of a real body, room on the bus."""
     code, remedy = "configuration", "Complete the arm's description; `ident config check` names every place."
     try:
         limits = motion_limits(model.config)
@@ -70,7 +67,7 @@ def configuration_check(model: ArmModel) -> Check:
 
 
 def motion_fits_check(model: ArmModel, excitation: Excitation) -> Check:
-    """Whether the motion was made for this description of the arm (`motion_sha256`)."""
+    """Check that the motion was made for this description of the arm (`motion_sha256`)."""
     code, remedy = "motion_fits", "Design the motion again for the description as it is now."
     if excitation.arm_sha256 != model.config.motion_sha256:
         return failed(code, f"the {excitation.name} motion was made for another description of the arm", remedy)
@@ -80,7 +77,7 @@ def motion_fits_check(model: ArmModel, excitation: Excitation) -> Check:
 
 
 def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excitation) -> Check:
-    """Whether the motion, the way to it from home, and every stop out of it are proven to keep all limits."""
+    """Check that the motion, the way to it from home, and every stop out of it are proven to keep all limits."""
     code, remedy = "motion_proven", "Design the motion again, with larger margins or a smaller share of the limits."
     try:
         proof = proof_of(excitation.path, model, limits, CollisionModel(model))
@@ -110,7 +107,7 @@ def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excit
 
 
 def stability_check(model: ArmModel, limits: MotionLimits, excitation: Excitation | None) -> Check:
-    """Whether the gains are stable at this rate and delay, at home, in the middle and along the motion."""
+    """Check that the gains are stable at this rate and delay, at home, in the middle and along the motion."""
     path = None if excitation is None or excitation.path.joints != model.chain.joints else excitation.path
     postures = np.vstack([limits.home, 0.5 * (limits.lower + limits.upper)])
     if path is not None:
@@ -137,7 +134,7 @@ def stability_check(model: ArmModel, limits: MotionLimits, excitation: Excitatio
 
 
 def away_from_home(model: ArmModel, limits: MotionLimits, position: Vector) -> str:
-    """Say how far an arm stands from where motions begin, in words; empty where that is near.
+    """Describe how far an arm stands from where motions begin, in words; empty where that is near.
 
     Args:
         model: of the arm.
@@ -154,7 +151,7 @@ def away_from_home(model: ArmModel, limits: MotionLimits, position: Vector) -> s
 
 
 def way_home_check(model: ArmModel, limits: MotionLimits, position: Vector) -> Check:
-    """Whether the straight way home is clear, from where the arm stands [rad or m], shape (joints,)."""
+    """Check that the straight way home is clear, from where the arm stands [rad or m], shape (joints,)."""
     code = "ways_clear"
     try:
         ((_, leg),) = GoTo(Destination.HOME).legs(model, position, limits)
@@ -164,7 +161,7 @@ def way_home_check(model: ArmModel, limits: MotionLimits, position: Vector) -> C
 
 
 def ways_check(model: ArmModel, limits: MotionLimits, excitation: Excitation, position: Vector) -> Check:
-    """Whether the ways from where the arm stands to the motion and back are within limits and clear.
+    """Check that the ways from where the arm stands to the motion and back are within limits and clear.
 
     Args:
         model: of the arm.

@@ -1,8 +1,8 @@
-"""Preflight: every check there is, in an order in which none endangers what a later one would have found.
+"""Run all preflight checks, in an order in which none endangers the arm for what a later check would have found.
 
-First what needs no arm, then what only looks, then what holds the arm, moves it a little, and at last lets the drives
-stop it. The first failed check that makes touching the arm unsafe ends it; the rest are skipped and say because of
-what. Whatever happens, the arm is without torque and closed afterwards.
+First the checks that need no arm, then those without torque, then those that hold the arm, move it a little, and at
+last let the drives stop it. The first failed check that makes touching the arm unsafe ends preflight; the rest are
+skipped and name that check. Whatever happens, the arm is without torque and closed afterwards.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ _LOOK_AGAIN = 20  # cycles
 Tell = Callable[[Check], None]
 
 
-@one_blas_thread()  # a second one would run beside whoever has the other core, and be waited for
+@one_blas_thread()  # a second one would compete for the other core, and be waited for
 def preflight(
     arm: Arm,
     model: ArmModel,
@@ -125,13 +125,13 @@ class _Gravity:
     friction: ExpectedFriction
 
     def carried_by(self, held: Vector) -> bool:
-        """Whether the torque that holds the arm is near enough to the model's; without words, between two cycles."""
+        """Return whether the torque that holds the arm is near enough to the model's; fast enough between cycles."""
         difference, most = weight.differences(held, self.torque, self.limits, self.friction)
         return bool((difference <= most).all())
 
 
 class _Ended(Exception):
-    """The arm has been let go, and why is among the checks."""
+    """Signal that the arm is without torque again, with the reason among the checks."""
 
 
 class _Preflight:
@@ -182,7 +182,7 @@ class _Preflight:
             self.arm.close()  # once more, for an arm that failed while it was opened
 
     def all_checks(self) -> list[Check]:
-        """Every check; those that were not made say because of which."""
+        """Return every check; those that were not made name the one that failed."""
         because = next((code for code, check in self.checks.items() if check.verdict is Verdict.FAILED), None)
         why = "nothing before it failed, but it was not reached" if because is None else f"because {because} failed"
         made = dict(self.checks)
@@ -215,11 +215,11 @@ class _Preflight:
         self._touched(session, planned, _Gravity(session.gravity, limits, friction), try_watchdog=agreed.given)
 
     def _bounds(self, limits: MotionLimits) -> MotionLimits:
-        """A motion begins inside the limits; a way home may begin as far outside as the arm may be led back from."""
+        """Return where the run may begin: inside the limits, or for a way home as far outside as `reachable` allows."""
         return limits if self.excitation is not None else reachable(limits)
 
     def _agreed(self, looked: Looked, limits: MotionLimits) -> Consent | None:
-        """Judge what was seen of the arm; whether its watchdog may be tried, None where the arm may not be touched."""
+        """Check the arm at rest; returns whether its watchdog may be tried, None where the arm may not be touched."""
         if self.described is None or not self._passed(
             identities_check(self.described, self.model, limits, self.identities, looked)
         ):
@@ -249,7 +249,7 @@ class _Preflight:
         return agreed
 
     def _planned(self, session: Session) -> list[Stroke]:
-        """A small motion of every joint; none, and a failed check, where one has no room."""
+        """Plan a small test motion of every joint; none, and a failed check, where a joint has no room."""
         try:
             # Of a joint that stands outside its limits none leads farther out.
             room = admitting(session.home, motion_limits(self.model.config), 0.0)
@@ -260,7 +260,7 @@ class _Preflight:
             return []
 
     def _touched(self, session: Session, planned: Sequence[Stroke], gravity: _Gravity, *, try_watchdog: bool) -> None:
-        """Hold the arm, move it a little, and fall silent; what came of it is judged when the arm has been let go."""
+        """Hold the arm, move it a little, and fall silent; judge the findings after torque is off."""
         held: Rows = ()
         moved: list[tuple[Rows, Rows]] = []
         silent: Check | None = None
@@ -289,7 +289,7 @@ class _Preflight:
             self._passed(silent)
 
     def _silent_in_motion(self, at_rest: Check) -> Check:
-        """Fall silent again, in the middle of a small motion of one joint; both checks in one."""
+        """Fall silent again, in the middle of a small motion of one joint; returns both watchdog checks in one."""
         try:
             self.arm.close()  # what the silence has left behind in drives ends with the session
             self.arm.open()
@@ -349,7 +349,7 @@ class _Preflight:
             self._passed(direction_check(answers, self.model, session, [one for one in delays if one]))
 
     def _load(self, first: Sample, limits: MotionLimits, period: float) -> Callable[[Sample], None]:
-        """The control law of a run, computed and thrown away."""
+        """Return a function that computes the control law of a run and discards the result, as load on the rate."""
         prior = np.zeros(self.model.layout.size) if self.model.prior is None else self.model.prior
         if first.position.shape != (self.model.chain.joints,) or not np.isfinite(first.position).all():
             return lambda sample: None
@@ -364,7 +364,7 @@ class _Preflight:
         return work
 
     def _faulted(self, session: Session, gravity: _Gravity, error: ArmFault) -> None:
-        """Find out what ended the loop: what the fault says failed, a joint that went the wrong way, or else."""
+        """Find out what ended the loop: what the fault names, a joint that went the wrong way, or another cause."""
         if "gravity" not in self.checks:
             self._passed(weight.not_held(session, self.model, gravity.limits, gravity.friction, error))
             return
@@ -381,7 +381,7 @@ class _Preflight:
             self._passed(failed("direction", f"{name} went astray: {error}", remedy))
 
     def _broken(self, error: ArmError) -> None:
-        """The arm could not be opened, looked at or energised, or fell silent."""
+        """Record a failed check for an arm that could not be opened, recorded or energised, or that fell silent."""
         if self.described is None or "identities" not in self.checks:
             self._passed(unreachable(error))
         else:

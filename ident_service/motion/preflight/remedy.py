@@ -1,6 +1,6 @@
-"""What to do about a fault that ended a preflight and that says by itself what failed.
+"""Provide remedies for faults that ended a preflight and that say by themselves what failed.
 
-Such a fault names its own joint. Of the others, an arm that does not go where it should, the trace must tell more:
+Such a fault names its own joint. For other faults (an arm that does not go where it should) the trace must tell more:
 `preflight.py` looks there for wrong signs.
 """
 
@@ -48,7 +48,7 @@ REMEDIES: dict[str, str] = {
 
 
 def remedy_of(fault: ArmFault) -> str | None:
-    """One sentence that says what to do.
+    """Return one sentence that says what to do about a fault.
 
     Args:
         fault: that ended the loop.

@@ -1,4 +1,4 @@
-"""The part of preflight with torque: a closed loop that may go next to nowhere.
+"""Run the part of preflight with torque: a control loop that may move the arm by next to nothing.
 
 The arm has just been seen at rest without torque, so it is supported where it stands. The loop is that of a run, but
 its guard stops it `FARTHEST` from where it should be, at a crawl, and its torque is kept to a band around the model's
@@ -7,7 +7,7 @@ where it can be let go. So every end here, good or bad, is torque off; a drive's
 sign that has not been proven yet.
 
 While the torque is on nothing is worked out between two cycles, for drives give up within a few cycles without torque
-frames: what was recorded is judged when the arm has been let go.
+frames: what was recorded is evaluated when torque is off again.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ FASTEST = 1.0  # rad/s or m/s: where the guard stops; motions here are slower by
 BAND = 0.25  # of the torque limit, beside the model's gravity torque and expected friction
 _CREEP = 0.02  # rad/s or m/s, below which friction is not compensated, so that nothing hunts at rest
 RELEASE = 0.5  # s over which torque is led to zero
-SUNK = 0.02  # rad or m: what sinks farther while torque fades has no support, and is let go at once
+SUNK = 0.02  # rad or m: what sinks farther while torque fades has no support, and torque is taken off at once
 
 Rows = Sequence[tuple[Sample, Setpoint]]
 
 
 @dataclass(frozen=True)
 class Trace:
-    """What happened, as arrays of one row per period from the first cycle's stamp on.
+    """Hold the cycles of a loop as arrays, one row per period from the first cycle's stamp on.
 
     In a period in which no cycle came, because the machine was late, positions and references are between those around
     it, and the torque before it acted on.
@@ -62,7 +62,7 @@ class Trace:
 
 
 def trace_of(rows: Rows, period: float) -> Trace:
-    """Cycles with their references, the earliest first, as a trace.
+    """Return cycles with their references, the earliest first, as a trace.
 
     Args:
         rows: at least one; stamps rise.
@@ -85,7 +85,7 @@ def trace_of(rows: Rows, period: float) -> Trace:
 
 
 class Session:
-    """A guarded loop on an open arm at rest.
+    """Run a guarded loop on an open arm at rest.
 
     Attributes:
         home: where the arm stood [rad or m], shape (joints,).
@@ -107,13 +107,13 @@ class Session:
         home: Vector,
         friction: ExpectedFriction,
     ) -> None:
-        """Prepare; nothing is sent.
+        """Prepare the loop; nothing is sent.
 
         Args:
             arm: open, at rest, not enabled.
             model: with a prior.
             limits: of the arm.
-            described: what the arm says of itself.
+            described: description of the open arm.
             home: where it stands [rad or m], shape (joints,).
             friction: widens the band of torques.
         """
@@ -152,7 +152,7 @@ class Session:
         self._most = (np.abs(to_drives) * self._band).max(axis=1)
 
     def energise(self) -> None:
-        """Enable; the first cycle of `follow` sends the torque that holds the arm.
+        """Enable the arm; the first cycle of `follow` sends the torque that holds it.
 
         Raises:
             DriverError: the drives refuse.
@@ -174,7 +174,7 @@ class Session:
             shaking: amplitude [N m or N], shape (joints,), and frequency [Hz] of a sinusoidal torque on top.
 
         Returns:
-            What happened, for `trace_of`.
+            The cycles with their references, for `trace_of`.
 
         Raises:
             ArmFault: the guard or a drive found something that is more than a warning; `trace` tells the story.
@@ -207,11 +207,11 @@ class Session:
 
     @property
     def torque(self) -> Vector:
-        """The torque that is sent next [N m or N], shape (joints,)."""
+        """Return the torque that is sent next [N m or N], shape (joints,)."""
         return self._torque
 
     def lead_in_silence(self, sample: Sample, setpoint: Setpoint, given_up: Flags, *, sends: bool) -> None:
-        """Judge a cycle in which drives miss something on purpose, and work out the torque that follows.
+        """Check a cycle in which a signal is withheld from drives on purpose, and compute the next torque.
 
         What drives say of themselves is what is being tried, and is not judged here; neither are joints whose drives
         have given up torque, but for their position limits. Every other joint is held and guarded as before.
@@ -235,7 +235,7 @@ class Session:
             self._torque = self._limited(wanted)
 
     def wait_in_silence(self) -> None:
-        """Go on with the torque that was sent last, through the guard, while drives tell no positions.
+        """Repeat the torque that was sent last, through the guard, while drives report no positions.
 
         Raises:
             ArmFault: the guard found something that is more than a warning.
@@ -243,7 +243,7 @@ class Session:
         self._torque = self._limited(self._torque)
 
     def trace(self) -> Trace:
-        """The cycles of the last `follow`, also of one that a fault ended."""
+        """Return the cycles of the last `follow` as a trace, also of one that a fault ended."""
         return trace_of(self._rows, self.period)
 
     def release(self) -> None:
@@ -258,7 +258,7 @@ class Session:
         self._arm.stop(StopKind.TORQUE_OFF)
 
     def _led(self, sample: Sample, setpoint: Setpoint, given_up: Flags) -> Vector:
-        """The control law's torque for a sample that the guard has judged [N m or N], shape (joints,)."""
+        """Check a sample by the guard and return the control law's torque for it [N m or N], shape (joints,)."""
         since, control = self._since(sample.stamp_ns, sample.stamp_doubt_ns), self._control
         velocity, correction = (np.where(given_up, 0.0, of) for of in (control.velocity, control.correction))
         known = self._since.known

@@ -1,4 +1,4 @@
-"""Whether the gains are stable at this rate and delay, when the true inertia is not the model's.
+"""Compute whether the gains are stable at this rate and delay, when the true inertia differs from the model's.
 
 Around a posture computed torque (eq. 76) leaves a double integrator, `ddq = R alpha` with `R = M_true^-1 M_model`. In
 discrete time, with period h, low-pass gain g and torque constant over a period,
@@ -15,8 +15,6 @@ beyond the prior, which is the least that is there, plus drive inertia that the 
 inertia for a joint (a CAD model of the links) lacks some, so that such a joint's link is taken to be no lighter than
 modelled. Friction and gravity's stiffness are left out: the first only damps, the second is small beside K_p, and
 friction that is fed forward depends on the reference alone. Margins are stated for the model's inertia.
-
-Boundary: pure computation.
 """
 
 from __future__ import annotations
@@ -44,7 +42,7 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Loop:
-    """What a linearised loop consists of.
+    """Hold the parameters of a linearised control loop.
 
     Attributes:
         kp: position gains [1/s^2], shape (joints,).
@@ -62,18 +60,18 @@ class Loop:
 
     @property
     def filter_gain(self) -> Vector:
-        """Gain of the low-pass, as `ComputedTorque` has it, shape (joints,)."""
+        """Return the gain of the low-pass, as `ComputedTorque` has it, shape (joints,)."""
         gain = 1.0 - np.exp(-2.0 * np.pi * np.asarray(self.cutoff) * self.period)
         return np.asarray(np.broadcast_to(gain, self.kp.shape))
 
 
 @dataclass(frozen=True)
 class JointStability:
-    """One joint's loop by itself.
+    """Represent the stability of one joint's loop by itself.
 
     Attributes:
         joint: its name.
-        lightest: the least true inertia looked at, as a share of the model's.
+        lightest: the least true inertia considered, as a share of the model's.
         radius: the largest spectral radius over the range of inertias.
         gain_margin: the loop gain may rise by this factor at the model's inertia before it oscillates; 1000 stands for
             more, and 1 for none.
@@ -89,7 +87,7 @@ class JointStability:
 
 @dataclass(frozen=True)
 class StabilityReport:
-    """All joints, by themselves and together.
+    """Represent the stability of all joints, by themselves and together.
 
     Attributes:
         period: of the loop [s].
@@ -106,11 +104,11 @@ class StabilityReport:
 
     @property
     def stable(self) -> bool:
-        """Whether there is nothing to object to."""
+        """Return whether `objections` finds nothing."""
         return not self.objections()
 
     def objections(self) -> list[str]:
-        """What is not as it must be, in words."""
+        """Describe in words which joints are unstable or have too small a gain margin."""
         found = [
             f"{one.joint}: unstable for some inertia from {one.lightest:g} times the model's up "
             f"(spectral radius {one.radius:.4f}, gain margin {one.gain_margin:.2f})"
@@ -128,7 +126,7 @@ class StabilityReport:
 
 
 def delay_of(config: ArmConfig) -> int:
-    """Cycles from a sample to the torque computed from it, where the driver knows of more than the contract's one."""
+    """Return the cycles from a sample to its torque, where the driver states more than the contract's one."""
     delay = getattr(config.driver, "delay_cycles", 1)
     return delay if isinstance(delay, int) and delay > 1 else 1
 
@@ -136,7 +134,7 @@ def delay_of(config: ArmConfig) -> int:
 def stability(
     model: ArmModel, limits: MotionLimits, delay_cycles: int = 1, postures: Vector | None = None
 ) -> StabilityReport:
-    """Judge the gains of an arm.
+    """Compute the stability of an arm's gains at some postures and over the range of inertias.
 
     Args:
         model: without a prior, only each joint by itself is judged.
@@ -176,7 +174,7 @@ def stability(
 
 
 def transition(loop: Loop, ratio: Vector) -> Vector:
-    """The matrix of the recursion.
+    """Return the matrix of the linear recursion.
 
     Args:
         loop: gains, rate and delay.
@@ -216,7 +214,7 @@ def transition(loop: Loop, ratio: Vector) -> Vector:
 
 
 def spectral_radius(loop: Loop, ratio: Vector) -> Vector:
-    """The spectral radius of the recursion, shape (...,), for ratios as `transition` takes them."""
+    """Return the spectral radius of the recursion, shape (...,), for ratios as `transition` takes them."""
     return np.asarray(np.abs(np.linalg.eigvals(transition(loop, ratio))).max(axis=-1))
 
 
@@ -242,7 +240,7 @@ def _delayed(loop: Loop, more: float) -> float:
 
 
 def _first(values: Vector, radii: Callable[[Vector], Vector]) -> float:
-    """The smallest value at which a radius reaches 1, refined; the first value where it does at once."""
+    """Return the smallest value at which a radius reaches 1, refined; the first value where it does at once."""
     low = float(values[0])
     for high in values.tolist():
         if not float(radii(np.array([high]))[0]) < 1.0:
@@ -257,7 +255,7 @@ def _first(values: Vector, radii: Callable[[Vector], Vector]) -> float:
 
 
 def _lightest_and_unknown(model: ArmModel) -> tuple[Vector, Vector]:
-    """Return the least share of the prior that is true, and the share of drive inertia that the model may lack.
+    """Return the least share of the prior that may be true, and the share of drive inertia that the model may lack.
 
     Each of shape (joints,).
     """
@@ -276,7 +274,7 @@ def drive_matrix(model: ArmModel, delta: Vector) -> Vector:
 
 
 def known_drives(model: ArmModel) -> Vector:
-    """Drive inertia that the description knows of beyond the prior's [kg m^2 or kg], shape (joints,)."""
+    """Return the drive inertia that the description states beyond the prior's [kg m^2 or kg], shape (joints,)."""
     joints = [model.config.joints.get(name) for name in model.chain.names]
     said = np.array([0.0 if joint is None else joint.drive_inertia or 0.0 for joint in joints])
     if model.prior is None:
@@ -290,7 +288,7 @@ def _postures(limits: MotionLimits) -> Vector:
 
 
 def _link_factors(lightest: Vector) -> Iterator[Vector]:
-    """All links as modelled, as light or heavy as can be, one of them alone, random ones; each shape (joints,)."""
+    """Yield factors of the links' inertias: as modelled, all extreme, one extreme, random; each shape (joints,)."""
     heaviest = np.full_like(lightest, INERTIA[1])
     rng = np.random.default_rng(_SEED)
     yield np.ones_like(lightest)
@@ -305,7 +303,7 @@ def _link_factors(lightest: Vector) -> Iterator[Vector]:
 def _ratios(
     model: ArmModel, prior: Vector, used: Vector, postures: Vector, lightest: Vector, unknown: Vector
 ) -> Iterator[Vector]:
-    """`M_true^-1 M_model` at all postures, case by case, each of shape (samples, joints, joints)."""
+    """Yield `M_true^-1 M_model` at all postures, case by case, each of shape (samples, joints, joints)."""
     nominal = _mass_matrices(model, used, postures)
     own = np.einsum("skk->sk", nominal)
     stated = drive_matrix(model, used) - drive_matrix(model, prior)

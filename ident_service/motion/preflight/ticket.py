@@ -1,6 +1,6 @@
-"""The ticket: what preflight found, for which arm, motion, model and software, and until when it counts.
+"""Represent preflight tickets: the findings, for which arm, motion, model and software, and until when they count.
 
-One JSON object of format `ident-ticket`. Whoever moves the arm asks it `valid_for` what it is about to do; any change
+One JSON object of format `ident-ticket`. The code that moves the arm asks it `valid_for` the motion; any change
 since asks for a new check. It is a record, not a signature: it protects against mistakes, not against people.
 """
 
@@ -35,7 +35,7 @@ _HASHES = {
 
 @dataclass(frozen=True)
 class Subject:
-    """What a ticket is about.
+    """Identify the arm, motion, model and software that a ticket is about.
 
     Attributes:
         arm: name.
@@ -62,10 +62,10 @@ class Subject:
 
 @dataclass(frozen=True)
 class Ticket:
-    """The result of a preflight.
+    """Represent the result of a preflight.
 
     Attributes:
-        subject: what was checked.
+        subject: arm, motion, model and software that were checked.
         checks: all of them, in the order of `CODES`.
         created: UTC, whole milliseconds.
         expires: UTC.
@@ -78,7 +78,7 @@ class Ticket:
 
     @property
     def verdict(self) -> Verdict:
-        """FAILED where one check failed, else NEEDS_PERSON where one does, else PASSED."""
+        """Return FAILED where one check failed, else NEEDS_PERSON where one does, else PASSED."""
         found = {check.verdict for check in self.checks}
         for worse in (Verdict.FAILED, Verdict.NEEDS_PERSON):
             if worse in found:
@@ -89,7 +89,7 @@ class Ticket:
         return {check.verdict for check in self.checks if check.code == code}
 
     def valid_for(self, subject: Subject, now: datetime) -> list[str]:
-        """Why this ticket does not allow a motion; empty when it does.
+        """Return why this ticket does not allow a motion; empty when it does.
 
         Args:
             subject: of what is about to be done, with the open arm's own description. One without a motion, for a way
@@ -132,17 +132,17 @@ class Ticket:
             )
 
     def with_arm(self, subject: Subject) -> Subject:
-        """The subject on the arm of this ticket: all that can be compared before the arm is open."""
+        """Return the subject on the arm of this ticket, to compare all that can be compared before the arm is open."""
         mine = self.subject
         return replace(subject, identities=mine.identities, bus_sha256=mine.bus_sha256, driver=mine.driver)
 
     def to_json(self) -> str:
-        """One JSON object, the inverse of `ticket_from_json`."""
+        """Return the ticket as one JSON object, the inverse of `ticket_from_json`."""
         return json.dumps(ticket_values(self), indent=1, allow_nan=False)
 
 
 def subject_of(model: ArmModel, excitation: Excitation | None, described: ArmDescription | None) -> Subject:
-    """What a ticket would have to be about to allow this motion on this arm.
+    """Return the subject that a ticket must have to allow this motion on this arm.
 
     Args:
         model: of the arm.
@@ -171,18 +171,18 @@ def subject_of(model: ArmModel, excitation: Excitation | None, described: ArmDes
 
 
 def new_ticket(subject: Subject, checks: Sequence[Check], now_ns: int, valid: timedelta = VALID) -> Ticket:
-    """A ticket made now (`now_ns` since 1970 in UTC [ns]) that counts for `valid`."""
+    """Create a ticket made now (`now_ns` since 1970 in UTC [ns]) that counts for `valid`."""
     created = utc(now_ns)
     return Ticket(subject, tuple(checks), created, created + valid)
 
 
 def utc(now_ns: int) -> datetime:
-    """A time [ns since 1970 in UTC] as a date, rounded down to milliseconds."""
+    """Convert a time [ns since 1970 in UTC] to a date, rounded down to milliseconds."""
     return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(milliseconds=now_ns // 1_000_000)
 
 
 def ticket_values(ticket: Ticket) -> dict[str, Any]:
-    """The ticket as JSON values."""
+    """Return the ticket as JSON values."""
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -222,7 +222,7 @@ def read_ticket(path: Path) -> Ticket:
 
 
 def ticket_from_json(text: str) -> Ticket:
-    """The inverse of `Ticket.to_json`.
+    """Parse a ticket from JSON, the inverse of `Ticket.to_json`.
 
     Raises:
         UsageError: not a ticket; the message says what is wrong with it.

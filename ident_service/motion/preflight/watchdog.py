@@ -1,4 +1,4 @@
-"""Prove that the drives stop by themselves when we fall silent: the one protection that works when the host dies.
+"""Prove that the drives stop by themselves when the host falls silent: the one protection that works when it dies.
 
 Done last, where the arm has just been held, and again in the middle of a small motion: what the drives' watchdogs watch
 is withheld, and looked at what the drives say of themselves. An arm without brakes then sinks onto its support, so a
@@ -32,7 +32,7 @@ _WORDS = {
     "sync_loss": "SYNC",
 }
 _ORDER = list(_WORDS)  # what leaves the most of the others alone comes first; without SYNC no position comes
-_LATER = 2.0  # times the configured time, some cycles, and what its report may wait, until a drive has said so
+_LATER = 2.0  # times the configured time, plus some cycles and the report's delay, until a drive must have reported
 _CYCLES = 10
 REMEDY = (
     "Set the drives' own watchdog (CANopen: 1400h:05, or another of drives.watchdog, and 6007h for its reaction), or "
@@ -44,11 +44,11 @@ Confirm = Callable[[str], str]
 
 @dataclass(frozen=True)
 class Consent:
-    """Whether the drives' watchdog may be tried.
+    """Represent whether the drives' watchdog may be tried.
 
     Attributes:
         given: it may.
-        check: what is said where it may not, else None.
+        check: the check to report where it may not, else None.
     """
 
     given: bool
@@ -56,11 +56,11 @@ class Consent:
 
 
 def consent(model: ArmModel, sample: Sample, confirm: Confirm) -> Consent:
-    """Ask, if there is anything to ask about, before anything is energised.
+    """Ask a person whether the drives' watchdog may be tried, before anything is energised.
 
     Args:
         model: of the arm; its name must be typed.
-        sample: of looking at the arm; without status words nobody can see what the drives do.
+        sample: of the arm without torque; without status words the drives' reaction cannot be seen.
         confirm: shows a question and returns what the person typed.
     """
     if not sample.status:
@@ -81,7 +81,7 @@ def consent(model: ArmModel, sample: Sample, confirm: Confirm) -> Consent:
 
 
 def watchdogs_of(arm: Arm, model: ArmModel) -> tuple[Watchdog, ...]:
-    """Return what each drive's watchdog watches; where the driver does not say, torque frames, by joint."""
+    """Return the signal that each drive's watchdog watches; where the driver does not say, torque frames, by joint."""
     seconds = getattr(model.config.driver, "watchdog", None)
     most = float(seconds) if isinstance(seconds, int | float) else None
     return arm.watchdogs() or tuple(Watchdog(name, "torque_frames", most) for name in model.chain.names)
@@ -90,7 +90,7 @@ def watchdogs_of(arm: Arm, model: ArmModel) -> tuple[Watchdog, ...]:
 def watchdog_check(
     arm: Arm, model: ArmModel, session: Session, setpoint_at: Callable[[float], Setpoint], moving: int | None = None
 ) -> Check:
-    """Fall silent on an arm that is held, and look at what its drives do; the arm is without torque afterwards.
+    """Fall silent while the arm is held, and check that its drives stop; the arm is without torque afterwards.
 
     What one kind of watchdog watches is withheld after the other, and everything else goes on: a drive that stops for
     another reason has not proven its watchdog. So do the closed loop and its guard, for the joints whose drives have
@@ -99,7 +99,7 @@ def watchdog_check(
     Args:
         arm: enabled, held by `session`.
         model: for names, and the watchdog's time in the driver's section where the driver does not tell it.
-        session: what holds it; without torque frames the last torque acts until a drive gives it up.
+        session: the loop that holds the arm; without torque frames the last torque acts until a drive ends it.
         setpoint_at: where the joints that are held should be, by the time since the silence began [s].
         moving: number of the joint that moves, whose travel is measured; None at standstill.
 
@@ -173,25 +173,25 @@ def watchdog_check(
 
 
 def _most(dog: Watchdog, period: float, told: float) -> float:
-    """How long a drive may take until it has said that it stopped [s]."""
+    """Return how long a drive may take until it has reported that it stopped [s]."""
     return LONGEST_SILENCE if dog.seconds is None else _LATER * dog.seconds + _CYCLES * period + told
 
 
 def _joints_of(drives: Collection[int], model: ArmModel) -> Flags:
-    """Tell which joints these drives, by number, have a part in, shape (joints,)."""
+    """Return which joints these drives, given by number, move, shape (joints,)."""
     coupling = model.chain.coupling
     return np.asarray((coupling[list(drives)] != 0.0).any(axis=0))
 
 
 def _reaction(word: AxisStatus) -> str:
-    """What a drive does by itself, in words."""
+    """Describe in words how a drive has reacted by itself."""
     if word & AxisStatus.FAULT:
         return "fault"
     return "quick stop" if word & AxisStatus.IDLE else "torque off"
 
 
 def _travel(arm: Arm, begin: Vector, joint: int) -> float:
-    """How far a joint goes from where its host fell silent until it rests, or for `_STOPS` [rad or m]."""
+    """Measure how far a joint moves from where its host fell silent until it rests, or for `_STOPS` [rad or m]."""
     now = begin
     last_ns: int | None = None
     while True:
