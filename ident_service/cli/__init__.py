@@ -1,7 +1,6 @@
-"""The command `ident`: parses words, calls the same functions as the Python API, prints, and picks an exit code.
+"""Run the command `ident`: parse its arguments, call the functions of the Python API, print, return an exit code.
 
-One file per group of verbs: `GROUPS` lists them, each registers its verbs with `add(verbs)` and answers them. Boundary:
-nothing is computed here, and large libraries load only when a verb needs them.
+One file per group of verbs: `GROUPS` lists them, each registers its verbs with `add(verbs)` and answers them.
 """
 
 from __future__ import annotations
@@ -114,7 +113,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _asked(verb: Callable[[argparse.Namespace], Answer], arguments: argparse.Namespace) -> Answer:
-    """What a verb answers; a name that no file can have is a wrong word, wherever it is noticed."""
+    """Return the answer of a verb; report a name that is too long for a file as a usage error."""
     try:
         return verb(arguments)
     except OSError as error:
@@ -124,7 +123,7 @@ def _asked(verb: Callable[[argparse.Namespace], Answer], arguments: argparse.Nam
 
 
 def parser() -> Parser:
-    """All verbs and their words."""
+    """Build the argument parser with all verbs and their arguments."""
     top = Parser(
         prog="ident",
         description="Commission a robot arm: excite it, record it, identify parameters a real body could have.",
@@ -137,7 +136,7 @@ def parser() -> Parser:
 
 
 def _own_packages_only() -> None:
-    """`drivers` and `sim_backend` are common words: refuse to run somebody else's from the working directory."""
+    """Refuse to run if `drivers` or `sim_backend`, common names, would come from the working directory."""
     home = Path(__file__).resolve().parents[2]
     for name in ("drivers", "sim_backend"):
         spec = importlib.util.find_spec(name)

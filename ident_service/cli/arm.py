@@ -1,6 +1,6 @@
-"""Verbs at an arm: `watch`, `check`, `rehearse`, `run`; from any terminal `stop`, `pause`, `resume`, `finish` and more.
+"""Register and run the verbs at an arm: `watch`, `check`, `rehearse`, `run`, `stop`, `pause`, `resume` and more.
 
-Boundary: words to requests, results to words; the work is `service/run.py`. `stop` asks for nothing, waits for nobody.
+`stop` asks for nothing, waits for nobody.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _HELP_ARM = "description file, or the name of a shipped one"
 
 
 def add(verbs: Verbs) -> None:
-    """Register the verbs."""
+    """Register `watch`, `check`, `run`, `rehearse`, `stop`, `pause`, `resume`, `finish`, `supported` and `ack`."""
     sub = verbs.add("watch", _watch, "look at the arm without a torque or a change of state")
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("--seconds", type=seconds, default=2.0)
@@ -163,14 +163,14 @@ def _check(arguments: argparse.Namespace) -> Answer:
         raise UsageError(f"--confirm {arguments.confirm}: the arm is {config.name}; nothing has moved")
     arm, model = make_arm(config), arm_model(config)
     lease, stopping = asked_lease(arguments, config), StopOnSignal()
-    # Whoever looks for the one who moves the arm finds this process, and its stop ends the preflight. A person's Ctrl-C
-    # or a polite kill ends it at once, a question too, with torque off; a program's signal waits for the next cycle.
+    # `ident stop` finds this process as the one that moves the arm, and ends the preflight. A person's Ctrl-C
+    # or SIGTERM ends it at once, a question too, with torque off; a program's signal waits for the next cycle.
     with (
         interrupting() if lease is None else stopping,
         ControlFile.take(control_path(state, config.name), None, asked_ns=arguments.asked_ns) as controls,
     ):
         stoppable = StoppableArm(arm, until(lambda: controls.stop or stopping.requested(), lease))
-        # The rate is measured with what a run gets of the kernel.
+        # The rate is measured with the real-time settings of a run.
         with nullcontext() if arm.clock.lock_step else asked():
             seconds = 0.0 if arguments.rate_seconds is None else arguments.rate_seconds
             ticket = preflight(stoppable, model, motion, confirm=confirm, rate_seconds=seconds)
@@ -193,7 +193,7 @@ def _scale(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
 
 
 def _run(arguments: argparse.Namespace, seconds: float | None = None) -> Answer:
-    """Run; `seconds` is how long the lease lasts that a program keeps, the ordinary time if None."""
+    """Run a motion; `seconds` is the duration of the lease [s] that a program renews, the default one if None."""
     from ident_service.config.load import load_arm
 
     config = load_arm(arguments.arm)
@@ -215,7 +215,7 @@ def _run(arguments: argparse.Namespace, seconds: float | None = None) -> Answer:
 
 
 def _target(arguments: argparse.Namespace) -> Target | None:
-    """What is to be known before the run may end early."""
+    """Return the parameter accuracy at which the run may end early; None if the verb asks for none."""
     if getattr(arguments, "until", None) is None:
         if getattr(arguments, "chosen", None):
             raise UsageError("--parameter is what --until SHARE is about; give both")
@@ -257,7 +257,7 @@ def _rehearse(arguments: argparse.Namespace) -> Answer:
 
 
 def _stop(arguments: argparse.Namespace) -> Answer:
-    """Stop an arm, or all; what is told and entered of it comes after."""
+    """Stop an arm, or all arms; print and note it in the audit trail only afterwards."""
     from ident_service.motion.control_file import ControlFile
     from ident_service.service.jobs.reach import stop_arms
 
@@ -315,7 +315,7 @@ def _require_typed(arguments: argparse.Namespace, name: str, follows: str) -> No
 
 
 def _let_go(arguments: argparse.Namespace) -> Answer:
-    """Take the power from drives that hold an arm which nobody moves any more."""
+    """Switch off the drives that still hold an arm after the motion process has ended."""
     from ident_service.config.load import load_arm
     from ident_service.service.recover import let_go
 
@@ -338,13 +338,13 @@ def _ack(arguments: argparse.Namespace) -> Answer:
 def _control(arguments: argparse.Namespace) -> tuple[str, Path]:
     from ident_service.service.arm_state import control_path
 
-    os.umask(0o077)  # and no more: a stop is not refused for a folder that others can enter
+    os.umask(0o077)  # only the umask is set: a stop must not be refused because others can enter the state folder
     name = _name(arguments)
     return name, control_path(state_folder(arguments), name)
 
 
 def _name(arguments: argparse.Namespace) -> str:
-    """Of an arm: the word itself where the state folder remembers such an arm, whose description may be a daemon's."""
+    """Return the arm's name: the word itself if the state folder has such an arm, else the name in its description."""
     from ident_service.config.load import load_arm
     from ident_service.service.arm_state import arm_folder
 

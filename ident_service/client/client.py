@@ -1,4 +1,4 @@
-"""Arms, jobs and motions of a daemon."""
+"""Talk to a daemon about its arms, jobs, runs and motions."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from ident_service.errors import ArmError, IdentError, MotionRefused, UsageError
 _API: Final = "/api/v1"
 _RENEWED: Final = 0.5  # s between renewals of a lease, which lasts four times as long
 _LOOK = 0.3  # s between looks at a job
-_AGAIN, _TRIES = 1.0, 30  # s between tries to take up a stream, and how many
+_AGAIN, _TRIES = 1.0, 30  # s between attempts to resume a stream, and how many attempts
 _LIVE: Final = ("queued", "running")
 
 
 @dataclass(frozen=True)
 class Job:
-    """A job as it stood when it was asked for.
+    """State of a job at the time of the request.
 
     Attributes:
         id: which names it.
@@ -56,7 +56,7 @@ class Job:
 
 @dataclass(frozen=True)
 class LiveSample:
-    """A moment of a run while it is recorded; the daemon sends one every 20 ms.
+    """One sample of a run while it is recorded; the daemon sends one every 20 ms.
 
     Attributes:
         time: since the first sample [s].
@@ -75,7 +75,7 @@ class LiveSample:
 
 @dataclass(frozen=True)
 class Event:
-    """Something that a daemon tells of its arms and jobs.
+    """One event of the daemon's stream about its arms and jobs.
 
     Attributes:
         kind: `happened` (a line of the audit trail), `job` or `arm` (how one stands), `samples` or `doubt` of a run.
@@ -89,14 +89,14 @@ class Event:
 
 
 class IdentClient(Connection):
-    """A daemon, asked over HTTP; used from any thread."""
+    """HTTP client of a daemon; may be used from any thread."""
 
     def arms(self) -> list[dict[str, Any]]:
         """List the arms (`ArmLine`)."""
         return list(self.pages(f"{_API}/arms"))
 
     def arm(self, name: str) -> RemoteArm:
-        """Name an arm; nothing is asked yet."""
+        """Return a handle on an arm; no request is sent yet."""
         return RemoteArm(self, name)
 
     def add_arm(self, description: str, files: Mapping[str, str] = NOTHING, *, replace: bool = False) -> RemoteArm:
@@ -115,7 +115,7 @@ class IdentClient(Connection):
         return self.arm(str(self.post(f"{_API}/arms", body)["name"]))
 
     def stop(self) -> dict[str, list[str]]:
-        """Bring all arms to a controlled stop; names of the arms and jobs that were reached."""
+        """Bring all arms to a controlled stop; return the names of the arms and jobs that were reached."""
         found: dict[str, list[str]] = self.post(f"{_API}/stop")
         return found
 
@@ -124,7 +124,7 @@ class IdentClient(Connection):
         return _job(self.get(f"{_API}/jobs/{_word(job)}"))
 
     def events(self, *, after: int | None = None, samples: bool = False) -> Iterator[Event]:
-        """Yield what happens to all arms and jobs, for as long as it is asked for.
+        """Yield the events of all arms and jobs until the caller stops iterating.
 
         A line that is cut is taken up again where it broke off, so nothing that happens is missed or told twice.
 
@@ -163,7 +163,7 @@ class IdentClient(Connection):
     def upload(
         self, arm: str, file: Path, *, columns: str = "", tell: Callable[[float], None] = lambda _: None
     ) -> dict[str, str]:
-        """Upload a recording of one's own in pieces; what is there already, of an earlier try, is not sent again.
+        """Upload a recording in pieces; pieces that arrived in an earlier attempt are not sent again.
 
         Args:
             arm: name of the arm that it is of.
@@ -213,13 +213,13 @@ class IdentClient(Connection):
         return seen
 
     def answer(self, job: str) -> dict[str, Any]:
-        """Read what the command of a job answered: its one JSON object."""
+        """Return the JSON object that the command of a job answered."""
         found: dict[str, Any] = self.get(f"{_API}/jobs/{_word(job)}/result")["answer"]
         return found
 
 
 class RemoteArm:
-    """An arm of a daemon."""
+    """Handle on one arm of a daemon."""
 
     def __init__(self, client: IdentClient, name: str) -> None:
         """Nothing is asked yet."""
@@ -227,12 +227,12 @@ class RemoteArm:
         self._path = f"{_API}/arms/{_word(name)}"
 
     def document(self) -> dict[str, Any]:
-        """Read its description, faults and accepted set (`ArmAnswer`)."""
+        """Return the arm's description, faults and accepted set (`ArmAnswer`)."""
         found: dict[str, Any] = self.client.get(self._path)
         return found
 
     def stop(self) -> dict[str, list[str]]:
-        """Bring it to a controlled stop."""
+        """Bring the arm to a controlled stop."""
         found: dict[str, list[str]] = self.client.post(f"{self._path}/stop")
         return found
 
@@ -246,13 +246,13 @@ class RemoteArm:
         self.client.post(f"{self._path}/faults/{_word(code)}/ack")
 
     def check(self, motion: str | None = None, *, confirm: str) -> RemoteMotion:
-        """Begin the preflight of a motion; as `run`."""
+        """Begin the preflight of a motion; arguments and errors as `run`."""
         return self._begin("check", confirm, motion=motion)
 
     def run(
         self, motion: str | None = None, *, confirm: str, speed: float | None = None, until: float | None = None
     ) -> RemoteMotion:
-        """Begin a run; it is to be used in a `with` block, which keeps its lease.
+        """Begin a run; use it in a `with` block, which renews its lease.
 
         Args:
             motion: id; the description's own if None.
@@ -267,15 +267,15 @@ class RemoteArm:
         return self._begin("run", confirm, motion=motion, speed=speed, until=share)
 
     def home(self, *, confirm: str) -> RemoteMotion:
-        """Begin the way home; as `run`."""
+        """Begin the motion to the home position; arguments and errors as `run`."""
         return self._begin("home", confirm)
 
     def finish(self) -> None:
-        """End a run early, in order."""
+        """End a run early by its regular end: the rest of the motion is left out."""
         self.client.post(f"{self._path}/finish")
 
     def accept(self, run: str, note: str) -> dict[str, Any]:
-        """Accept the parameters of a run, by a person's word (`AcceptanceAnswer`)."""
+        """Accept the parameters of a run on a person's decision (`AcceptanceAnswer`)."""
         found: dict[str, Any] = self.client.post(f"{self._path}/acceptances", {"run": run, "note": note})
         return found
 
@@ -287,7 +287,7 @@ class RemoteArm:
 
 
 class RemoteMotion:
-    """A motion that was asked for; a `with` block renews its lease, and waits for its end."""
+    """Handle on a requested motion; its `with` block renews the lease and waits for the end."""
 
     def __init__(self, client: IdentClient, begun: Job) -> None:
         """Take a job that the daemon has queued; its lease lasts two seconds from now."""
@@ -298,7 +298,7 @@ class RemoteMotion:
 
     @property
     def ended(self) -> Job:
-        """The job after its end.
+        """Return the job after its end.
 
         Raises:
             UsageError: the block has not been left.
@@ -308,7 +308,7 @@ class RemoteMotion:
         return self._ended
 
     def live(self) -> Iterator[LiveSample]:
-        """Yield samples while the run is recorded, until it ends; `uncertainty` has the deviations so far."""
+        """Yield samples while the run is recorded; `uncertainty` holds the latest parameter deviations."""
         for kind, _, value in self.client.stream(f"{_API}/jobs/{self.id}/live"):
             if kind == "doubt":
                 self.uncertainty = value
@@ -322,14 +322,14 @@ class RemoteMotion:
         self.client.post(f"{_API}/jobs/{self.id}/cancel")
 
     def __enter__(self) -> Self:
-        """Renew the lease from now on."""
+        """Begin to renew the lease."""
         self._thread.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Wait for the end, the lease renewed; after an exception the arm is stopped first."""
+        """Wait for the end of the job while the lease is renewed; after an exception stop the arm first."""
         try:
             if kind is not None:
                 with suppress(UsageError):  # it has ended by itself
@@ -344,7 +344,7 @@ class RemoteMotion:
             try:
                 self.client.post(f"{_API}/jobs/{self.id}/lease")
             except MotionRefused:
-                return  # nothing to renew any more: the job ends, or has
+                return  # the lease cannot be renewed any more: the job is ending or has ended
             except IdentError:
                 continue  # the next one may come through; if none does, the arm stops
 

@@ -1,4 +1,4 @@
-"""What the search for an excitation aims at, and what it keeps free of the arm's limits."""
+"""Describe the search for an excitation motion: its criterion, and the margins it keeps to the arm's limits."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Criterion = Literal["d_optimal", "condition_number", "a_optimal"]
 
 
 class Design(Section):
-    """How motions for an arm are designed; the command line may ask for something else.
+    """Settings for the design of motions for an arm; options of the command line override them.
 
     Attributes:
         criterion: `d_optimal` (log-determinant of the whitened information), `condition_number` (of the stacked
@@ -50,7 +50,7 @@ class Design(Section):
 
 
 def disagreements(design: Design, joints: Sequence[str]) -> Iterator[tuple[tuple[str, ...], str]]:
-    """What does not fit an arm of these joints: the place in the arm's file, and what is wrong.
+    """Yield what is inconsistent with an arm of these joints: the place in the file, and the mistake.
 
     Args:
         design: the section `design`.

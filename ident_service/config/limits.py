@@ -1,4 +1,4 @@
-"""What a motion needs to know of an arm, as arrays: limits, gains, home; refused where the description is silent."""
+"""Collect an arm's limits, gains and home position as arrays; refuse a description that lacks one."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ manifest.json            SHA-256 of each
 
 It is a tar file. Left out is what belongs to this machine and moment: locks, controls, the owner's token, preflight
 tickets, sessions of the page. The registry is copied first, so that what it names is in the file unless it was pruned
-meanwhile. Boundary: nothing here opens the registry of a running service other than to read it.
+meanwhile.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""The bus budget of an arm: worked out, as text for people and as JSON values; refused where it does not fit.
-
-Boundary: what frames cost is `drivers/canopen/budget.py`; here it is asked for and shown.
-"""
+"""The bus budget of an arm: worked out, as text for people and as JSON values; refused where it does not fit."""
 
 from __future__ import annotations
 

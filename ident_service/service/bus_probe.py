@@ -1,7 +1,7 @@
 """What the drives of an arm can, held against what the driver needs; as text for people and as JSON values.
 
 Drives are asked by SDO uploads alone; of one that does not answer, and of files without a drive, the data sheet
-foretells. Boundary: what is asked and how it is judged is `drivers/canopen/capabilities.py`.
+foretells.
 """
 
 from __future__ import annotations

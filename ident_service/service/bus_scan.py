@@ -1,7 +1,4 @@
-"""Who is on the buses of an arm, held against its configuration; as text for people and as JSON values.
-
-Boundary: what nodes say is `drivers/canopen/scan.py`; here it is judged and shown.
-"""
+"""Who is on the buses of an arm, held against its configuration; as text for people and as JSON values."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""A description as it is judged before anybody uses it: its mistakes, its bus budget, its gains; as text and as values.
-
-Boundary: the work is `config/load.py`, `service/bus.py` and `motion/preflight/stability.py`; here it is put together.
-"""
+"""A description as it is judged before anybody uses it: its mistakes, its bus budget, its gains; as text and as values."""
 
 from __future__ import annotations
 

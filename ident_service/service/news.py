@@ -5,7 +5,7 @@ misses nothing, after a restart of the service, too. How an arm or a job stands 
 whoever comes, and whenever it changes.
 
 Whoever looks first looks for all: fifty viewers cost the registry what one does, and none costs nothing. Nothing that
-acts (a stop, a lease, a job) knows of viewers or waits for them. Boundary: values; the stream is `api/events.py`.
+acts (a stop, a lease, a job) knows of viewers or waits for them.
 """
 
 from __future__ import annotations

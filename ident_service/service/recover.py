@@ -1,7 +1,7 @@
 """What stands between an arm and its next motion after a fault, a stop or a loss of power, and what a person does next.
 
 Looking sends no torque and changes no state. When every latched fault has been acknowledged by name, drives that have
-latched something are reset (`Arm.reset`), which energises nothing. Boundary: nothing here moves an arm.
+latched something are reset (`Arm.reset`), which energises nothing.
 """
 
 from __future__ import annotations

@@ -7,8 +7,7 @@ STATE/runs/RUN/                  a whole one: NAME, upload.json, arm.json, colum
 ```
 
 The id is a hash of what was announced: whoever announces the same again goes on, after a restart, too. A whole one is a
-run of the kind `recording`, so whatever takes a recording of a run takes it. Boundary: nothing here looks into a
-recording; that is done by the process of a job.
+run of the kind `recording`, so whatever takes a recording of a run takes it.
 """
 
 from __future__ import annotations

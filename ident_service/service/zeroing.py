@@ -2,7 +2,6 @@
 
 What a person must do is lead the arm there and compare it with the posture that is told; nobody else can. Everything
 that a program can tell stands against it first: whoever moves the arm, another host, powered drives, an arm that moves.
-Boundary: nothing here moves or energises an arm; what drives keep is the driver's (`Arm.zero`).
 """
 
 from __future__ import annotations

@@ -7,7 +7,6 @@ address and of all, because the doors refuse more (`busy`), a stop and a lease e
 let go, too.
 
 uvicorn's own `limit_concurrency` counts idle lines and would refuse the stop, and it has no deadline for a request.
-Boundary: sockets of the event loop's thread; requests and answers are `doors.py`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""The OpenAPI description as people read it: a summary, an example of each request, and one of each failure.
-
-Boundary: words about routes; their shapes are those of the models.
-"""
+"""The OpenAPI description as people read it: a summary, an example of each request, and one of each failure."""
 
 from __future__ import annotations
 

@@ -2,7 +2,6 @@
 
 Tokens and sessions are in the registry, where each request but two looks them up. A stop and the renewal of a lease ask
 a copy in memory, and so wait for nobody (`known`).
-Boundary: no HTTP here; `asking.py` takes tokens out of requests.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""A job while it runs, as server-sent events: its state and log, and what a run that is recorded shows.
-
-Boundary: what is shown of a run is `service/live.py`.
-"""
+"""A job while it runs, as server-sent events: its state and log, and what a run that is recorded shows."""
 
 from __future__ import annotations
 

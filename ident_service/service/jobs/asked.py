@@ -1,7 +1,4 @@
-"""What may be asked of the service as a job: ids and plain values, never a path.
-
-Boundary: shapes and bounds; what becomes of them is `commands.py`.
-"""
+"""What may be asked of the service as a job: ids and plain values, never a path."""
 
 from __future__ import annotations
 

@@ -2,7 +2,6 @@
 
 The lock guards memory, and lines into pipes that never wait. So a stop or a renewal waits neither for the registry, nor
 for a disk, nor for the queue.
-Boundary: no file and no registry here; processes are started, and their ends entered, by `engine.py`.
 """
 
 from __future__ import annotations

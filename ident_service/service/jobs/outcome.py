@@ -1,7 +1,4 @@
-"""What became of a job, told from the files that its process left; after a crash of the service, too.
-
-Boundary: files in, a state and words out.
-"""
+"""What became of a job, told from the files that its process left; after a crash of the service, too."""
 
 from __future__ import annotations
 

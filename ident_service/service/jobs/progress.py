@@ -1,7 +1,4 @@
-"""How far a job is, from what it said so far and how long such jobs took before.
-
-Boundary: text and numbers in, an estimate out.
-"""
+"""How far a job is, from what it said so far and how long such jobs took before."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Whoever moves an arm of a state folder, reached over its control file: a job of ours, a terminal, anybody.
-
-Boundary: control files; who asked, and what becomes of jobs, is `engine.py`.
-"""
+"""Whoever moves an arm of a state folder, reached over its control file: a job of ours, a terminal, anybody."""
 
 from __future__ import annotations
 

@@ -6,7 +6,6 @@ asks for a stop: after a restart only what computes goes on.
 
 The identification uses the description that the acceptance kept, so that both sets have the same parameters and the
 same shape of friction.
-Boundary: rows and jobs; what is due, and when, is `schedules.py` and `keeper.py`.
 """
 
 from __future__ import annotations

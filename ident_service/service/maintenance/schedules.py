@@ -3,7 +3,6 @@
 A time that was missed, because nothing ran or the clock was wrong, is due once. What is due stays so until a
 re-identification of the arm came to a verdict, or a person says that it is not to be done; meanwhile its schedule adds
 nothing. Operating hours are those that runs of this registry drove the arm; what drives it otherwise is not seen here.
-Boundary: rows and an injected time; nothing is begun here.
 """
 
 from __future__ import annotations

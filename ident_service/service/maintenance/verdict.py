@@ -1,7 +1,4 @@
-"""What a comparison with the accepted set says, in one line, for the registry, the alarm and whoever is told.
-
-Boundary: the document of `results/comparison` in, words out.
-"""
+"""What a comparison with the accepted set says, in one line, for the registry, the alarm and whoever is told."""
 
 from __future__ import annotations
 
