@@ -48,7 +48,7 @@ def add(verbs: Verbs) -> None:
     sub.add_argument("--seed", type=seed, default=0, help="of the random starts")
     searched = "time for the search, not the motion's length (default: 60, or none with --starts)"
     sub.add_argument("--search-time", type=seconds, metavar="SECONDS", help=searched)
-    sub.add_argument("--seconds", dest="search_time", type=seconds, help=argparse.SUPPRESS)  # former name of --search-time
+    sub.add_argument("--seconds", dest="search_time", type=seconds, help=argparse.SUPPRESS)  # former name
     sub.add_argument("--starts", type=count, metavar="N", help="random starts; the result is then the same every time")
     sub.add_argument("--workers", type=workers, default=2, metavar="N", help="processes")
     sub.add_argument("--resume", type=Path, metavar="FILE", help="search.json of an earlier design, to go on from")

@@ -105,7 +105,7 @@ def _listed(section: Mapping[str, str], sub: int) -> Iterator[tuple[int, Listed]
     """Yield the entries of one section: one, or all elements of a compact array."""
     text = section.get("defaultvalue") or None
     own = section.get("parametervalue") or None
-    if own is not None and not (text is not None and _NODE.search(text)):  # a value with $NODEID is that of another node
+    if own is not None and not (text is not None and _NODE.search(text)):  # that is another node's
         text = own
     low, high = (_number(section.get(key, ""), 0) for key in ("lowlimit", "highlimit"))
     kind = _number(section.get("datatype", ""), 0) or 0

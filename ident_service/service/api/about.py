@@ -1,4 +1,4 @@
-"""Routes about the service itself: its health, its figures, who asks, sessions of the page, the audit trail."""
+"""Serve the routes about the service itself: health, metrics, identity, sessions of the page, audit trail."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from ident_service.service.maintenance.schedules import dues
 from ident_service.service.registry.audit import trail
 
 router = APIRouter(tags=["service"], responses=failures())
-AUDIT_SECONDS = 1.0  # that a reader of the trail waits for lines that are to be entered
+AUDIT_SECONDS = 1.0  # s that a reader of the trail waits for queued lines
 
 
 class Login(BaseModel):
-    """A token, to be exchanged for a session of the page."""
+    """Token to be exchanged for a session of the page."""
 
     model_config = ConfigDict(extra="forbid")
     token: Annotated[str, Field(min_length=1, max_length=200)]
@@ -51,7 +51,7 @@ def metrics(service: Serving, _: Viewer) -> PlainTextResponse:
         try:
             faults[folder.name] = len(fault_file(service.state, folder.name).latched())
         except IdentError:
-            faults[folder.name] = 1  # a file that somebody damaged stands in the way like one
+            faults[folder.name] = 1  # a damaged file prevents motion like a fault
     jobs = {(row["kind"], row["state"]): row["number"] for row in rows}
     due = Counter[str](row["arm"] for row in dues(service.db))
     drifted = Counter[str](row["arm"] for row in alarms(service.db, most=10_000))

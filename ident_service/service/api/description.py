@@ -1,4 +1,4 @@
-"""The OpenAPI description as people read it: a summary, an example of each request, and one of each failure."""
+"""Complete the OpenAPI description: summaries, an example of each request and of each failure."""
 
 from __future__ import annotations
 
@@ -75,13 +75,13 @@ FAILURES: Final[dict[int, tuple[str, str]]] = {
 
 
 def describe(app: FastAPI) -> None:
-    """Have an application describe itself with all of this."""
+    """Add summaries and examples to an application's OpenAPI description."""
     plain = app.openapi
 
     def described() -> dict[str, Any]:
         if app.openapi_schema is None:
             _complete(plain())
-        return plain()  # which is kept from the first time
+        return plain()  # FastAPI keeps it from the first time
 
     app.openapi = described  # type: ignore[method-assign]
 

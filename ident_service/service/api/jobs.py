@@ -1,4 +1,4 @@
-"""Routes about jobs: asked for, watched, cancelled, their lease renewed; and stop, which asks for nothing."""
+"""Serve the routes about jobs (create, watch, cancel, renew the lease) and the stop, which needs no role."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from ident_service.service.registry.tokens import Access
 
 router = APIRouter(prefix="/api/v1", tags=["jobs"], responses=failures(404, 409))
 MOST_LOG: Final = 2**20
-_EVENTS = 0.2  # s between looks at a job that is watched
-_BREATH = 10.0  # s without news, after which a comment shows that the line is up
-# Its own threads: whatever else is busy, a stop is not.
+_EVENTS = 0.2  # s between reads of a job that is watched
+_BREATH = 10.0  # s without news, after which a comment shows that the connection is up
+# Threads of its own, so that a stop never waits for other requests.
 _STOPS = ThreadPoolExecutor(4, thread_name_prefix="stop")
 _STREAM: dict[int | str, dict[str, Any]] = {
     200: {"content": {"text/event-stream": {}}, "description": "Events."},
@@ -58,7 +58,7 @@ State = Literal["queued", "running", "done", "refused", "failed", "faulted", "ca
 
 
 class Confirmation(BaseModel):
-    """A person's word for one motion: the arm's name, typed, and the challenge that was given for it."""
+    """Confirmation of one motion by a person: the arm's name, typed, and the challenge that was given for it."""
 
     model_config = ConfigDict(extra="forbid")
     name: Annotated[str, Field(max_length=64)]
@@ -66,7 +66,7 @@ class Confirmation(BaseModel):
 
 
 class JobRequest(BaseModel):
-    """A job; one that may move an arm needs the confirmation, and its lease renewed from now on."""
+    """Job to be done; one that may move an arm needs the confirmation, and its lease renewed from now on."""
 
     model_config = ConfigDict(extra="forbid")
     job: Asked
@@ -105,7 +105,7 @@ def create_job(
 
         try:
             return answer_of(service, service.engine.create(body.job, who.name, entering=enter))
-        except sqlite3.IntegrityError:  # the same request came twice at a time, and the other one was the first
+        except sqlite3.IntegrityError:  # the same request came twice at once, and the other one was entered first
             row = rows.job_of_key(service.db, who.name, idempotency_key, asked)
             if row is None:
                 raise
@@ -206,7 +206,7 @@ async def _stop(service: Service, arm: str | None, who: str) -> StopAnswer:
 
 
 def answer_of(service: Service, row: Row) -> JobAnswer:
-    """A job as it is answered: without the words of its command, which name places of this machine."""
+    """Return a job as the API answers it, without its command's own text, which names paths of this machine."""
     found = service.engine.progress(row)
     shown = {key: value for key, value in row.items() if key in JobAnswer.model_fields}
     shown["detail"] = without_paths(row["detail"], str(service.state))
@@ -215,7 +215,7 @@ def answer_of(service: Service, row: Row) -> JobAnswer:
 
 
 def without_paths(value: Any, state: str) -> Any:
-    """Values in which places below the state folder are told relative to it."""
+    """Return values with the paths below the state folder made relative to it."""
     if isinstance(value, str):
         return value.replace(f"{state}/", "")
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""Routes about what is checked again: schedules, maintenance, what is due, re-identifications, drift alarms."""
+"""Serve the routes about schedules, maintenance, due re-identifications, re-identifications and drift alarms."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class _Body(BaseModel):
 
 
 class NewSchedule(_Body):
-    """When an arm is to be re-identified: exactly one of cron (UTC), operating hours, maintenance."""
+    """Schedule of an arm's re-identification: exactly one of cron (UTC), operating hours, maintenance."""
 
     arm: ArmName
     cron: Annotated[str, Field(max_length=200)] | None = None
@@ -51,7 +51,7 @@ class NewSchedule(_Body):
 
 
 class Enabled(_Body):
-    """Whether a schedule counts."""
+    """State of a schedule: enabled or disabled."""
 
     enabled: bool
 
@@ -64,13 +64,13 @@ class Event(_Body):
 
 
 class Remark(_Body):
-    """A person's word, with a reason."""
+    """Decision of a person, with a reason."""
 
     note: Words
 
 
 class NewReidentification(_Body):
-    """A person's word that an arm is re-identified now; it moves twice, for the preflight and for the run."""
+    """Request to re-identify an arm now; it moves twice, for the preflight and for the run."""
 
     arm: ArmName
     motion: Id | None = None

@@ -1,4 +1,4 @@
-"""Lists in pages, the newest first: `before` names the last line of one page, `Link` the page after it (RFC 8288)."""
+"""Serve lists in pages, the newest first: `before` names the last line of one page, `Link` the next page (RFC 8288)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PAGES: Final[dict[int | str, dict[str, Any]]] = {
 
 
 class Pager:
-    """Reads one page of a list for a request."""
+    """Reader of one page of a list for a request."""
 
     def __init__(self, request: Request, response: Response) -> None:
         """Take the request, which names the page, and the answer, which gets the header."""

@@ -1,4 +1,4 @@
-"""Routes about runs: what was recorded and identified, and the files of their manifests."""
+"""Serve the routes about runs: their records, recordings, parameters, files and reports."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _BINARY: dict[int | str, dict[str, Any]] = {
     200: {"content": {"application/octet-stream": {}}, "description": "The file."},
     **failures_of_files(404),
 }
-# Of a page without network, whose own style and script stand in it; it can reach nothing of ours.
+# Content security policy of the report: its inline style and script run in a sandbox and can reach nothing.
 _POLICY = (
     "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:; frame-ancestors 'self'; "
     "sandbox allow-scripts allow-downloads"

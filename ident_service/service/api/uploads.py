@@ -1,4 +1,4 @@
-"""Routes about uploads: a recording of one's own arrives in pieces, and becomes a run that jobs take it from."""
+"""Serve the routes about uploads: a recording arrives in pieces, and becomes a run that jobs can use."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Offset = Annotated[int, Header(ge=0, lt=2**62, description="of the piece's first
 
 
 class NewUpload(BaseModel):
-    """A recording that is to be uploaded.
+    """Recording that is to be uploaded.
 
     `columns` is YAML that says how a CSV is laid out (`docs/recordings.md`), where the arm's description does not.
     """
@@ -39,7 +39,7 @@ class NewUpload(BaseModel):
 
 
 class UploadAnswer(BaseModel):
-    """An upload: `received` is where the next piece begins, `run` the id of the run that it has become."""
+    """Upload: `received` is the offset of the next piece, `run` the id of the run that it has become."""
 
     id: str
     arm: str
