@@ -1,4 +1,4 @@
-"""What became of a job, told from the files that its process left; after a crash of the service, too."""
+"""Determine the outcome of a job from the files that its process left, also after a crash of the service."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ STOPPED: Final = "stopped"
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a job.
+    """Outcome of a job.
 
     Attributes:
         state: one of those in `registry/jobs.py`.
@@ -34,7 +34,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Said:
-    """The files of a job's process.
+    """Output of a job's process, from its files.
 
     Attributes:
         answer: its one JSON object; empty where it had none.
@@ -46,14 +46,14 @@ class Said:
 
 
 def said(folder: Path, most: int = _LAST) -> Said:
-    """Read them; `most` bytes of the log."""
+    """Read the answer and the last `most` bytes of the log of a job's process."""
     answer: dict[str, Any] = {}
     try:
         with (folder / ANSWER).open("rb") as stream:
             content = json.loads(stream.read(_MOST))
         answer = content if isinstance(content, dict) else {}
     except (OSError, ValueError, RecursionError):
-        pass  # none yet, or torn with its process
+        pass  # there is none yet, or it was cut off when its process was killed
     try:
         with (folder / LOG).open("rb") as stream:
             end = stream.seek(0, 2)
@@ -65,7 +65,7 @@ def said(folder: Path, most: int = _LAST) -> Said:
 
 
 def outcome(heard: Said, exit_code: int | None, asked_to_end: str) -> Outcome:
-    """Judge a process that has ended.
+    """Return the outcome of a process that has ended.
 
     Args:
         heard: what it said.
@@ -88,7 +88,7 @@ def outcome(heard: Said, exit_code: int | None, asked_to_end: str) -> Outcome:
 
 
 def interrupted(heard: Said, folder: Path | None, *, moves: bool) -> str:
-    """What can be told of a job that was running when the service died.
+    """Describe a job that was running when the service died, from its output and its folder.
 
     Args:
         heard: what its process said, until now.
@@ -118,7 +118,7 @@ def interrupted(heard: Said, folder: Path | None, *, moves: bool) -> str:
 
 
 def lateness_of(folder: Path) -> Any:
-    """Read how late the cycles of a run were, as `motion/histogram.py` writes it; None where it is not known."""
+    """Return the lateness histogram of a run's cycles (`motion/histogram.py`); None where it is not known."""
     try:
         return json.loads((folder / ENDED).read_text(encoding="utf-8"))["lateness"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):

@@ -1,4 +1,4 @@
-"""How far a job is, from what it said so far and how long such jobs took before."""
+"""Estimate the progress of a job from its output and the duration of earlier jobs of its kind."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _SURE = 0.99  # a job that still runs is never told to be done
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a job is.
+    """Progress of a job.
 
     Attributes:
         phase: its last words.
@@ -26,7 +26,7 @@ class Progress:
 
 
 def progress(log: str, elapsed: float, typical: float | None) -> Progress:
-    """Judge a job that runs.
+    """Estimate the progress of a running job.
 
     Args:
         log: what it said, its last lines at least.
@@ -41,7 +41,7 @@ def progress(log: str, elapsed: float, typical: float | None) -> Progress:
     motion = _MOTION.search(log)
     if typical is None and motion is None:
         return Progress(phase, None, None)
-    # A first run knows how long its motion is, and not its ways there and back.
+    # For a first run only the duration of its motion is known, not that of its approach and return.
     return _of(phase, elapsed, typical if typical is not None else float(motion["seconds"]) if motion else 0.0)
 
 
