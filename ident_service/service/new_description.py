@@ -1,4 +1,4 @@
-"""A first description of an arm from its URDF: everything that a simulated run needs, guessed where nothing is known.
+"""Draft an arm's description from its URDF, with all that a simulated run needs, guessed where unknown.
 
 What the URDF says is taken over; what it lacks is guessed as a careful person would, and said to be a guess in a
 comment. The simulated arm is another one than the prior: its links, drives and friction are drawn about it, so that
@@ -38,10 +38,10 @@ from ident_service.service.commission import require_clear_from_home
 from ident_service.service.draft import CLEARANCE, LARGEST_USE, RATE, Draft, in_yaml, short
 from ident_service.service.urdf_says import Said, arm_part, said_of
 
-_MOST_TURNS = 8.0 * np.pi  # rad, from which a range is degrees
+_MOST_TURNS = 8.0 * np.pi  # rad; a larger range is taken for degrees
 _TURN, _SLIDE = 3.14, 0.5  # rad and m either way, of joints without limits
 _VELOCITY = {True: 2.0, False: 0.3}  # rad/s, m/s
-_SECONDS = 0.25  # in which a joint reaches its velocity, at most acceleration
+_SECONDS = 0.25  # s in which a joint reaches its velocity limit at its acceleration limit
 _FOLLOWS = {True: 0.2, False: 0.05}  # rad, m
 _GAINS = ((400.0, 40.0), (225.0, 30.0), (100.0, 20.0), (49.0, 14.0))  # all of damping 1
 _LIGHT = 0.3  # of the torque limits, that holding home should take at most
@@ -52,7 +52,7 @@ _RATE_SHARE = 0.15  # of the torque rate that the guard lets through, that a mot
 _POSTURES, _SEED = 300, 20140101
 _USES = (LARGEST_USE, 0.4, 0.25, 0.15, 0.08)  # shares of the limits that motions are tried with
 _SEEDS = range(1, 9)
-_GLANCES, _GLANCE = 200, 1.3  # postures of a motion that are looked at first, and clearances they must have
+_GLANCES, _GLANCE = 200, 1.3  # postures of a motion that are checked first, and how many clearances they must keep
 # Share of postures from which links that touch are no collision, by the joints between them: capsules of links around a
 # shoulder or a wrist reach into each other.
 _TOUCHES, _ALWAYS = {2: 0.3, 3: 0.6}, 0.95
@@ -66,7 +66,7 @@ def new_description(
     tip: str | None = None,
     tell: Callable[[str], None] = lambda _: None,
 ) -> tuple[Path, tuple[str, ...]]:
-    """Write the description of an arm, and its URDF beside it where that is elsewhere.
+    """Write the description of an arm, and a copy of its URDF beside it.
 
     Args:
         urdf: the file.
@@ -132,7 +132,7 @@ def _plain(name: str) -> str:
 
 
 def _which(model: ArmModel, draft: Draft) -> list[str]:
-    """What the arm is, where the file holds more."""
+    """Return a remark on which part of the URDF is the arm, where the file holds more."""
     file = model.config.kinematics.urdf
     if file is None or "tip" not in draft.part:
         return []
@@ -143,7 +143,7 @@ def _which(model: ArmModel, draft: Draft) -> list[str]:
 
 
 def _joints(draft: Draft, model: ArmModel, said: Mapping[str, Said]) -> None:
-    """Limits of every joint: the URDF's, else guesses; torque limits that can hold the arm."""
+    """Set the limits of every joint: the URDF's, else guesses; torque limits that can hold the arm."""
     chain = model.chain
     likely = likely_bodies(with_urdf_bodies(model))
     if likely.guessed:
@@ -189,7 +189,7 @@ def _joints(draft: Draft, model: ArmModel, said: Mapping[str, Said]) -> None:
         if missing:
             draft.remarks.append(f"{name}: {', '.join(missing)} limit guessed; the URDF has none that could be meant")
         draft.joints[name] = {
-            # What the URDF says to the digit: a limit that is rounded may be wider than the arm's.
+            # The URDF's exact values: a rounded limit may be wider than the arm's.
             "position": list(ranges[k]),
             "velocity": velocity,
             "acceleration": short(acceleration),
@@ -210,7 +210,7 @@ def _prior(model: ArmModel) -> Array:
 
 
 def _worst(model: ArmModel, ranges: list[tuple[float, float]]) -> tuple[Array, Array]:
-    """Largest torque of gravity, and largest inertia of each joint, over random postures."""
+    """Return the largest gravity torque and the largest inertia of each joint over random postures."""
     low, high = np.array(ranges).T
     dynamics = InverseDynamics(model.chain, model.layout, _prior(model))
     still, gravity, inertia = np.zeros(model.chain.joints), np.zeros(model.chain.joints), np.zeros(model.chain.joints)
@@ -221,7 +221,7 @@ def _worst(model: ArmModel, ranges: list[tuple[float, float]]) -> tuple[Array, A
 
 
 def _bodies(draft: Draft, loaded: Callable[[], ArmModel], folder: Path) -> None:
-    """Capsules in place of meshes, and pairs that touch whatever the arm does."""
+    """Set capsules in place of meshes, and list the pairs of links that touch in most postures."""
     model = loaded()
     chain = model.chain
     capsules, unread = mesh_capsules(model.config.kinematics, chain, folder)
@@ -248,7 +248,7 @@ def _bodies(draft: Draft, loaded: Callable[[], ArmModel], folder: Path) -> None:
 
 
 def _home(draft: Draft, loaded: Callable[[], ArmModel]) -> ArmModel:
-    """Choose where motions begin: zero, the middle, or what is most free of random postures; and keep it."""
+    """Choose the home posture (zero, middle, or a random one with clearance and low torque), and store it."""
     model = loaded()
     limits = motion_limits(model.config)
     low, high = limits.lower, limits.upper
@@ -264,7 +264,7 @@ def _home(draft: Draft, loaded: Callable[[], ArmModel]) -> ArmModel:
     good = (free >= 3.0 * CLEARANCE) & (held <= _LIGHT)
     if good.any():
         place = int(np.argmax(good))
-    else:  # the lightest of those that have room, or what has most
+    else:  # the least torque among postures with clearance, or the one with most clearance
         roomy = free >= min(3.0 * CLEARANCE, float(free.max()))
         place = int(np.argmin(np.where(roomy, held, np.inf)))
     if not (free[place] > CLEARANCE and held[place] <= 1.0 / _HEAVY):
@@ -280,7 +280,7 @@ def _home(draft: Draft, loaded: Callable[[], ArmModel]) -> ArmModel:
 
 
 def _drives(draft: Draft, model: ArmModel) -> None:
-    """Draw the simulated arm: links about the prior's, drives and friction of their own."""
+    """Draw the true parameters of the simulated arm at random: links about the prior's, drives and friction."""
     rng = np.random.default_rng(_SEED)
     chain, layout, prior = model.chain, model.layout, _prior(model)
     limits = motion_limits(model.config)
@@ -317,7 +317,7 @@ def _motions(draft: Draft, loaded: Callable[[], ArmModel]) -> None:
             draft.seeds = (seed, seed)
             model = loaded()
             try:
-                # A glance, before all of the way is proven.
+                # A quick check of a few postures, before the whole path is verified.
                 path = excitation(model, "identification", checked=False).path
                 seen = collision.distances(path.at(np.linspace(0.0, path.duration, _GLANCES))[0])
                 if seen.min(initial=np.inf) < _GLANCE * CLEARANCE:

@@ -1,4 +1,4 @@
-"""What may be let go when the disk fills: recordings of runs that nobody accepted, the oldest first; nothing else ever.
+"""Delete recordings of runs that nobody accepted, the oldest first, to make room on the disk; nothing else.
 
 Parameters, reports, tickets and manifests stay, and so does the row of a recording that was let go, with its hash.
 """
@@ -18,7 +18,7 @@ from ident_service.service.registry.runs import run_folder
 
 @dataclass(frozen=True)
 class Expendable:
-    """A recording that the policy lets go.
+    """Recording that the retention policy allows to delete.
 
     Attributes:
         run: id.
@@ -32,7 +32,7 @@ class Expendable:
 
 
 def expendable(db: Database, state: Path, newest: int) -> list[Expendable]:
-    """Recordings that the policy lets go: not accepted, not of an arm's `newest` runs, not of a job that lives.
+    """Return the recordings that may be deleted: not accepted, not of an arm's `newest` runs, not of a live job.
 
     Raises:
         UsageError: a number below 0.
@@ -57,7 +57,7 @@ def expendable(db: Database, state: Path, newest: int) -> list[Expendable]:
 
 
 def let_go(db: Database, state: Path, newest: int, who: str) -> list[Expendable]:
-    """Delete what `expendable` names; each row is marked first, so that a kill in between is no damage."""
+    """Delete the recordings that `expendable` returns; each row is marked first, so that a kill does no damage."""
     gone = expendable(db, state, newest)
     for one in gone:
         with db.transaction():

@@ -1,4 +1,4 @@
-"""A run on an arm: recorder and motion each in a process of their own, watched from here, everything kept in a folder.
+"""Run a motion on an arm: recorder and motion in processes of their own, supervised, all kept in a folder.
 
 The folder is there from the beginning and keeps what was recorded, whether the run ended well or not; only a run that
 was refused before anything moved leaves none. How it ended is written by the motion process, and from here where that
@@ -40,7 +40,7 @@ from ident_service.service.watching import watched
 
 @dataclass(frozen=True)
 class Ran:
-    """How a run ended.
+    """Result of a run.
 
     Attributes:
         folder: with everything that was kept.
@@ -171,8 +171,8 @@ def run_motion(
 
 
 def _missed(folder: Path, until: Target, period: float, tell: Callable[[str], None]) -> list[dict[str, Any]] | None:
-    """Say what a run that went on to its end has not taught; None where its recording cannot be judged."""
-    # Loads the estimator, which nobody waits for while the arm moves.
+    """Return which parameters a completed run did not determine well enough; None if its recording cannot be judged."""
+    # Loads the estimator only now, after the motion.
     from ident_service.service.target_process import missed
 
     try:
@@ -183,10 +183,10 @@ def _missed(folder: Path, until: Target, period: float, tell: Callable[[str], No
 
 
 def _keep(folder: Path, error: BaseException) -> None:
-    """Write down how a run ended, unless the motion process has, and what is in its folder."""
+    """Write how a run ended, unless the motion process has, and the manifest of its folder."""
 
     def ending() -> None:
-        # One that the motion process called good, but whose recording could not be finished, was not.
+        # A run whose recording could not be finished has failed, even if the motion process ended well.
         if isinstance(error, RecordingError) or not (folder / ENDED).exists():
             cause = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or type(error).__name__
             write_ending(folder, {"error": cause})

@@ -1,4 +1,4 @@
-"""Take recordings in pieces: resumed where they broke off, and kept only when their hash is right.
+"""Receive recordings in pieces: resumed where they broke off, and kept only if their hash is right.
 
 ```
 STATE/.uploads/ID/upload.json    what was announced
@@ -37,19 +37,19 @@ from ident_service.service.registry.database import Database
 from ident_service.service.registry.motions import new_id
 from ident_service.service.registry.runs import COLUMNS, RUNS, UPLOAD, index_run
 
-UPLOADS: Final = ".uploads"  # hidden: backups leave out what is half there
+UPLOADS: Final = ".uploads"  # hidden, so that backups leave out incomplete uploads
 MOST_BYTES: Final = 4 * 2**30  # of a recording
 MOST_OPEN: Final = 16
 MOST_COLUMNS: Final = 2**16
 KEPT_FREE: Final = 2**30  # bytes of the disk that a motion's own recording may need meanwhile
-HALF_SECONDS: Final = 24 * 3600.0  # after its last piece
+HALF_SECONDS: Final = 24 * 3600.0  # s after its last piece, when an incomplete upload is deleted
 _DATA, _ARM = "data", "arm.json"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,119}")
-_DOCUMENTS = (".json", ".yaml", ".partial")  # endings of what else may stand in the folder of a run
+_DOCUMENTS = (".json", ".yaml", ".partial")  # endings of other files in the folder of a run
 
 
 class NoRoom(OSError):
-    """The disk has no room for a recording that was announced."""
+    """Error for an announced recording that the disk has no room for."""
 
     def __init__(self, words: str) -> None:
         super().__init__(errno.ENOSPC, words)
@@ -57,7 +57,7 @@ class NoRoom(OSError):
 
 @dataclass(frozen=True)
 class Announced:
-    """A recording that is to come.
+    """Recording that is to be uploaded, as announced.
 
     Attributes:
         arm: whose it is.
@@ -77,13 +77,13 @@ class Announced:
 
     @property
     def id(self) -> str:
-        """Return what names this upload."""
+        """Return the id of this upload."""
         return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:32]
 
 
 @dataclass(frozen=True)
 class Upload:
-    """A recording that arrives, or has.
+    """State of an upload.
 
     Attributes:
         id: which names it.
@@ -99,7 +99,7 @@ class Upload:
 
 
 def begin_upload(db: Database, state: Path, announced: Announced) -> Upload:
-    """Make place for a recording; of one that was announced before, tell how much is there.
+    """Begin or resume an upload; return how much of the recording has arrived.
 
     Args:
         db: the registry.
@@ -118,7 +118,7 @@ def begin_upload(db: Database, state: Path, announced: Announced) -> Upload:
     if (run := _same(db, state, announced)) is not None:
         return Upload(announced.id, announced, announced.bytes, run)
     folder = state / UPLOADS / announced.id
-    # Without data, a disk was full when it was completed.
+    # The data is missing if the disk was full when the upload was completed.
     if not all((folder / name).is_file() for name in (UPLOAD, _DATA)):
         others = uploads(state)
         if len(others) >= MOST_OPEN:
@@ -134,7 +134,7 @@ def begin_upload(db: Database, state: Path, announced: Announced) -> Upload:
 
 
 def known_upload(state: Path, upload: str) -> Upload:
-    """Return the upload of this id, as far as it is there.
+    """Return the upload of this id, with the bytes received so far.
 
     Raises:
         UnknownId: there is none; it was completed, deleted, or left alone for a day.
@@ -148,7 +148,7 @@ def known_upload(state: Path, upload: str) -> Upload:
 
 
 def uploads(state: Path) -> list[Upload]:
-    """List the uploads that are under way."""
+    """Return the uploads that are under way."""
     found, place = [], state / UPLOADS
     for folder in sorted(place.iterdir()) if place.is_dir() else ():
         with suppress(UnknownId):
@@ -157,10 +157,10 @@ def uploads(state: Path) -> list[Upload]:
 
 
 class Piece:
-    """Write one piece of an upload; what has arrived of a piece that is torn stays."""
+    """Writer of one piece of an upload; the bytes of an interrupted piece that arrived are kept."""
 
     def __init__(self, state: Path, upload: str, offset: int) -> None:
-        """Take the upload for this piece alone.
+        """Lock the upload for this piece.
 
         Args:
             state: the state folder.
@@ -204,18 +204,18 @@ class Piece:
             view, self._size = view[written:], self._size + written
 
     def __enter__(self) -> Self:
-        """Nothing more to do."""
+        """Return the writer itself."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Let the upload go."""
+        """Unlock the upload."""
         os.close(self._fd)
 
 
 def complete_upload(db: Database, state: Path, upload: str, who: str) -> Upload:
-    """Make a run of a recording that has arrived.
+    """Check the hash of a recording that has arrived, and make a run of it.
 
     Args:
         db: the registry.
@@ -231,7 +231,7 @@ def complete_upload(db: Database, state: Path, upload: str, who: str) -> Upload:
     seen = known_upload(state, upload)
     announced, folder = seen.announced, state / UPLOADS / upload
     arm = known_arm(db, state, announced.arm)
-    with Piece(state, upload, seen.received):  # nobody else writes it
+    with Piece(state, upload, seen.received):  # locked, so that nobody else writes it
         if seen.received != announced.bytes:
             raise AlreadyThere(f"{upload}: has {seen.received} of {announced.bytes} bytes; send the rest first")
         run = new_id(arm.name)
@@ -264,7 +264,7 @@ def _unknown(upload: str) -> UnknownId:
 
 @contextmanager
 def _known(upload: str) -> Iterator[None]:
-    """Know an upload no more that is deleted in this moment."""
+    """Raise UnknownId in the block for an upload that is deleted meanwhile."""
     try:
         yield
     except FileNotFoundError:
@@ -282,7 +282,7 @@ def _deleted_if_wrong(folder: Path) -> Iterator[None]:
 
 
 def delete_upload(state: Path, upload: str) -> None:
-    """Forget an upload and what has arrived of it.
+    """Delete an upload and what has arrived of it.
 
     Raises:
         UnknownId: no such upload.
@@ -308,7 +308,7 @@ def delete_half_uploads(state: Path, now: float | None = None) -> list[str]:
 
 
 def _same(db: Database, state: Path, announced: Announced) -> str | None:
-    """Find a run that the same recording has become."""
+    """Return the run that the same recording has become, if any."""
     rows = db.rows(
         "SELECT run FROM recordings JOIN runs ON runs.id = run WHERE sha256 = ? AND name = ? AND arm = ? "
         "AND kind = 'recording' AND deleted IS NULL ORDER BY created DESC",
