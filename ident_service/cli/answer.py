@@ -27,7 +27,7 @@ Answer = tuple[int, str, dict[str, Any]]
 
 
 def print_answer(arguments: argparse.Namespace, code: int, text: str, document: dict[str, Any]) -> None:
-    """Print a verb's answer as it was asked for: words, or one JSON object."""
+    """Print a verb's answer as text, or with `--json` as one JSON object."""
     if arguments.json:
         _print_json({**document, "exit_code": code})
     else:
@@ -40,7 +40,7 @@ def print_error(kind: str, message: str, code: int, more: Mapping[str, object] |
 
 
 def print_to_person(text: str) -> None:
-    """Print on stderr, as far as anybody reads it."""
+    """Print on stderr; a closed stderr is ignored."""
     write(sys.stderr, text)
 
 
@@ -96,7 +96,7 @@ def state_folder(arguments: argparse.Namespace) -> Path:
 
 
 def own_state_folder(arguments: argparse.Namespace) -> Path:
-    """Return the state folder for a verb that writes there, with access for its owner only.
+    """Return the state folder for a verb that writes there, after checking that only its owner can enter it.
 
     Raises:
         UsageError: as `state_folder`; or others can enter it.

@@ -1,6 +1,7 @@
 """Register and run the verbs at an arm: `watch`, `check`, `rehearse`, `run`, `stop`, `pause`, `resume` and more.
 
-`stop` asks for nothing, waits for nobody.
+`stop` needs no lease, no ticket and no confirmation, and waits for no other process. Running motions is
+`service/run.py`.
 """
 
 from __future__ import annotations
@@ -180,7 +181,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
 
 
 def _scale(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
-    """Have a person turn each joint by hand; nothing is energised."""
+    """Check the position scale of each joint that a person turns by hand; nothing is energised."""
     from ident_service.service.scale import FILE, check_scale
 
     if arguments.json or not sys.stdin.isatty():
@@ -300,7 +301,7 @@ def _ask(arguments: argparse.Namespace) -> Answer:
 
 
 def _require_typed(arguments: argparse.Namespace, name: str, follows: str) -> None:
-    """Take a person's word that an arm is supported: its name, typed now or as `--confirm`.
+    """Require a person's confirmation that an arm is supported: its name, typed now or as `--confirm`.
 
     Raises:
         UsageError: another word, or nobody to ask.

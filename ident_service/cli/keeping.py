@@ -49,7 +49,7 @@ def note_act(arguments: argparse.Namespace, what: str, about: str, **detail: Any
 
     Args:
         arguments: of the verb.
-        what: one word or two, as in the daemon's own lines.
+        what: one word or two that name the act, as in the daemon's own lines.
         about: name of the arm.
         detail: JSON values.
     """

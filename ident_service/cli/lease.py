@@ -28,11 +28,12 @@ _MOST = 4096  # bytes that are kept of a line; a longer one never counts as `sto
 class StdinLease:
     """Lease of a motion that the requesting program renews with lines on standard input.
 
-    What waited while nobody looked counts as fresh: this program was busy then, and not the other one silent.
+    Lines that queued up while this program did not read count as fresh: the program was busy then, and the other side
+    not silent.
     """
 
     def __init__(self, seconds: float, fd: int, now: Callable[[], float] = time.monotonic) -> None:
-        """Begin with the first look.
+        """Create the lease; its time begins with the first call of `over`.
 
         Args:
             seconds: how long it lasts after a line [s].

@@ -44,7 +44,7 @@ class HeldKey:
     """
 
     def __init__(self, fd: int, now: Callable[[], float] = time.monotonic) -> None:
-        """`fd` is a terminal's; `now` [s] is only for differences."""
+        """Take the file descriptor of a terminal, and a clock [s] that is used for differences only."""
         self._fd, self._now = fd, now
         self._last = self._looked = -1.0  # times of the last key and of the last look
         self._row = 0
@@ -124,11 +124,11 @@ def moved(
         arguments: with `out`, `state` and `can_log`.
         config: of the arm.
         motion: or destination.
-        sentence: what is about to happen, told with the folder.
+        sentence: description of the motion, printed with the folder before it begins.
         speed: share of the motion's own.
         lease: how long the arm moves on when this process is gone [s]; None for the ordinary one.
         stop_requested: asked several times per lease.
-        until: what is to be known, whereupon the run is finished early.
+        until: accuracy target at which the run is finished early.
 
     Raises:
         As `service.run.run_motion`; MotionRefused without a ticket.

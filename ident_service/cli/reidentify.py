@@ -1,6 +1,6 @@
 """Register and run `reidentify`: preflight, run, identification, comparison with the accepted set.
 
-Each step is the verb that the daemon has a job do, in this process; `service/maintenance` keeps what came of it.
+Each step runs in this process the verb that the daemon runs as a job; `service/maintenance` stores the result.
 """
 
 from __future__ import annotations

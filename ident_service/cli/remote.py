@@ -1,6 +1,6 @@
 """Run verbs on a daemon (`ident VERB ... --server URL`), and `jobs`, which lists, shows and cancels its jobs.
 
-Files that are named here are read here and uploaded.
+Local files that the arguments name are read here and uploaded.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def asked(make: Callable[[IdentClient, argparse.Namespace], dict[str, Any]], end
 
     Args:
         make: the job of the words; its kind is the verb if it does not say another.
-        ended: what becomes of the answer.
+        ended: turns the job's answer into the verb's.
     """
 
     def verb(client: IdentClient, arguments: argparse.Namespace) -> Answer:

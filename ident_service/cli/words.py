@@ -50,7 +50,7 @@ class Verbs:
 
     Attributes:
         commands: argparse's list of verbs.
-        common: what every verb understands.
+        common: parser of the options that every verb has.
         prefix: the words before the verb, with a space behind them.
     """
 

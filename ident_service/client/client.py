@@ -50,7 +50,7 @@ class Job:
 
     @property
     def live(self) -> bool:
-        """Tell if the job has not ended."""
+        """Return whether the job has not ended."""
         return self.state in _LIVE
 
 
@@ -78,8 +78,8 @@ class Event:
     """One event of the daemon's stream about its arms and jobs.
 
     Attributes:
-        kind: `happened` (a line of the audit trail), `job` or `arm` (how one stands), `samples` or `doubt` of a run.
-        number: of what has happened, to go on after it; None for all else.
+        kind: `happened` (a line of the audit trail), `job` or `arm` (its state), `samples` or `doubt` (uncertainty).
+        number: of a line of the audit trail, to resume after it; None for other kinds.
         value: `AuditLine`, `JobAnswer`, or as the OpenAPI description says of the stream.
     """
 
@@ -120,13 +120,13 @@ class IdentClient(Connection):
         return found
 
     def job(self, job: str) -> Job:
-        """Look at a job."""
+        """Return the present state of a job."""
         return _job(self.get(f"{_API}/jobs/{_word(job)}"))
 
     def events(self, *, after: int | None = None, samples: bool = False) -> Iterator[Event]:
         """Yield the events of all arms and jobs until the caller stops iterating.
 
-        A line that is cut is taken up again where it broke off, so nothing that happens is missed or told twice.
+        After a broken connection the stream is resumed where it broke off, so that no event is missed or repeated.
 
         Args:
             after: number of the last event that was seen, by this program or an earlier one; from now on if None.
@@ -222,7 +222,7 @@ class RemoteArm:
     """Handle on one arm of a daemon."""
 
     def __init__(self, client: IdentClient, name: str) -> None:
-        """Nothing is asked yet."""
+        """Create the handle; no request is sent yet."""
         self.client, self.name = client, name
         self._path = f"{_API}/arms/{_word(name)}"
 

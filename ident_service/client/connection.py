@@ -41,11 +41,11 @@ class Connection:
     """HTTP connection to a daemon for JSON requests; may be used from any thread."""
 
     def __init__(self, url: str, token: str | None = None, *, patience: float = _PATIENCE) -> None:
-        """Nothing is asked yet.
+        """Create the connection; no request is sent yet.
 
         Args:
             url: of the daemon: scheme, host and port.
-            token: to say who asks; None for a stop on the daemon's own machine.
+            token: that authenticates the caller; None for a stop on the daemon's own machine.
             patience: how long to wait for an answer [s].
 
         Raises:

@@ -89,7 +89,7 @@ class CanopenDrive(GrownSection):
     where the drive does not let it be set; a torque is sent in thousandths of it. `torque_scale` is how much torque
     the motor really gives for one that was asked for. `max_torque` [N m] and `max_speed` [turns per minute] of the
     motor are set as 6072h and 6080h. `notices` are the emergency codes by which this drive, as its manual says, only
-    informs: they are told and recorded, and stop nothing.
+    informs: they are reported and recorded, and stop nothing.
 
     `watchdog` says what makes this drive stop by itself when the host is gone: torque frames that stay away
     (`rpdo_timer`, 1400h:05), the host's heartbeat (1016h), SYNC, node guarding (100Ch, 100Dh), or something of its

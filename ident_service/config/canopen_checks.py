@@ -10,7 +10,7 @@ from ident_service.config.recording import Transmission
 from ident_service.config.watchdogs import ABORTING
 from ident_service.errors import DriverError
 
-_ASKED = 0.7  # of the guard time that is available to ask all guarded drives
+_ASKED = 0.7  # of the guard time, after which a drive is asked again; all must be asked within it
 _WHOLE_TURNS = 0.999  # 6080h holds whole turns per minute
 _LEAST_DEADLINE = 2.0  # cycles: one frame may be late
 

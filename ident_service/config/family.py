@@ -51,7 +51,7 @@ class TorquePath(Section):
 
 
 class TorqueUnit(Section):
-    """Size of a count of the target torque: a thousandth of `rated`, or `count`; `mA` needs a torque constant."""
+    """Size of a count of the target: a thousandth of `rated`, or `count`, in `unit`; `mA` needs a torque constant."""
 
     rated: EntryText | None = None
     count: Positive | None = None

@@ -33,7 +33,7 @@ class LocatedStr(str):
     folder: Path
 
     def __new__(cls, value: str, folder: Path) -> LocatedStr:
-        """Make the string with its folder."""
+        """Create the string with the folder of its file."""
         located = super().__new__(cls, value)
         located.folder = folder
         return located

@@ -231,8 +231,8 @@ class Identification(GrownSection):
 
     `method` is the estimator, by default the one of `wls` and `huber` that predicts held-out parts of the recordings
     better; `edge` [s] is left out at both ends of every recording, two periods of the cut-off by default; `block` [s]
-    is what doubt is computed from; `delay` [s] is how much later the torque's stamps are than the position's, by
-    default none, or one of a few samples where that predicts held-out parts clearly better; `period` [s] averages a
+    is the block length of the uncertainty estimate; `delay` [s] is the delay of torque stamps against position stamps,
+    by default none, or one of a few samples where that predicts held-out parts clearly better; `period` [s] averages a
     periodic motion over its periods, without the filters of the torque. `torque` is what drives measured or what they
     were told; left out, what they measured where a recording has it in every sample.
     """

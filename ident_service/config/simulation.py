@@ -1,6 +1,6 @@
 """Describe the simulated arm, and the faults to inject: kind, joint, time, duration, size.
 
-What each kind does to readings and to the plant is `sim_backend`.
+`sim_backend` implements the effect of each kind on readings and plant.
 """
 
 from __future__ import annotations

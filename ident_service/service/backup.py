@@ -314,8 +314,9 @@ def _standing(state: Path) -> list[str]:
 def _exchange(state: Path, staging: Path) -> str | None:
     """Replace the state folder's content with a folder's; return the folder that holds the old content, or None.
 
-    The folder itself stays: its parent may be somebody else's. Between the first move and the last, `.restoring` is
-    there, and everybody refuses the state folder; whoever restores again begins anew, and what stood is kept.
+    The folder itself stays, because its parent may belong to somebody else. Between the first move and the last,
+    `.restoring` exists, and every process refuses the state folder; a restore that is run again begins anew, and the
+    old content is kept.
     """
     standing = [name for name in _standing(state) if name != RESTORING]
     marker, folder = state / RESTORING, None

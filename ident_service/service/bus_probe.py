@@ -1,7 +1,7 @@
 """Compare the capabilities of an arm's drives with what the driver needs; format them as text and as JSON values.
 
-Drives are asked by SDO uploads alone; of one that does not answer, and of files without a drive, the data sheet
-foretells.
+Drives are read by SDO uploads alone; for a drive that does not answer, and for files without a drive, the capabilities
+are derived from the data sheet.
 """
 
 from __future__ import annotations

@@ -122,7 +122,7 @@ def simulate(
     tell: Tell = lambda _: None,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> Commissioning:
-    """Commission the simulated arm of a configuration and score the result against its truth.
+    """Commission the simulated arm of a configuration, and score the result against its true parameters.
 
     Args:
         config: with a simulated driver.

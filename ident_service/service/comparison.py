@@ -46,7 +46,7 @@ def compare_files(paths: Sequence[Path], out: Path | None = None) -> tuple[Compa
 def compare_into(reference: Path, folder: Path) -> Comparison:
     """Compare a folder of results with a reference, and store the comparison in it, named by its manifest.
 
-    A kill in between leaves files that the manifest does not name, which nobody believes.
+    A kill in between leaves files that the manifest does not name, and which are therefore ignored.
 
     Args:
         reference: folder of results or parameter file.

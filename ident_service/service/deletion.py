@@ -1,7 +1,7 @@
 """Delete runs, motions and arms; entries that refer to one are listed first, and nothing in use is deleted.
 
-A folder is renamed to a hidden name before the registry forgets it: a kill in between leaves a row without a folder,
-and whoever deletes again completes it. What was renamed is removed at the next start, too. The audit trail stays.
+A folder is renamed to a hidden name before its row is deleted: a kill in between leaves a row without a folder, and
+deleting again completes it. Renamed folders are also removed at the next start. The audit trail stays.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Judge an uploaded description as a separate program; `judge_apart` runs it within limits.
 
-A description within the limits of size has been read in the daemon by then; here stands what computes with it.
+The daemon has loaded the description by then, within the limits of size; this process does the computations on its
+model.
 """
 
 from __future__ import annotations

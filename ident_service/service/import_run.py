@@ -23,7 +23,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,119}")
 
 
 def import_run(db: Database, state: Path, folder: Path, who: str) -> Row:
-    """Import a run folder.
+    """Import a run folder into the state folder and the registry.
 
     Args:
         db: the registry.

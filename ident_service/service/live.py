@@ -1,9 +1,9 @@
 """Show a run while it moves: samples thinned for display, and parameter deviations so far.
 
-All is read from what the recorder has flushed into the run's file: the motion process, its ring and its recorder are
-never asked for anything. Ten viewers cost what one does: whoever looks first reads on for all. Doubt is worked out by a
-thread, one bounded step every second and a half, and only while somebody watches. The thread keeps the service's own
-priority: with a lower one it could be kept waiting while it holds the interpreter, and a stop with it.
+All is read from what the recorder has flushed into the run's file: the motion process, its ring buffer and its recorder
+are never asked for anything. Ten viewers cost as much as one: the first to ask reads on for all. The parameter
+deviations are computed by a thread, one bounded step every 1.5 s, and only while somebody watches. The thread keeps the
+service's own priority: with a lower one it could be kept waiting while it holds the interpreter, and a stop with it.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Draft an arm's description from its URDF, with all that a simulated run needs, guessed where unknown.
 
-What the URDF says is taken over; what it lacks is guessed as a careful person would, and said to be a guess in a
-comment. The simulated arm is another one than the prior: its links, drives and friction are drawn about it, so that
-identifying it shows what identification does. Before anything is written, the description is loaded, home and both
-motions are found clear; gains that are not stable are said to be.
+Values of the URDF are taken over; missing ones are guessed cautiously, and marked as guesses in a comment. The
+simulated arm differs from the prior: its links, drives and friction are drawn at random about it, so that identifying
+it shows what identification does. Before anything is written, the description is loaded, and home and both motions are
+checked to be clear; gains that are not stable are reported.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Report to viewers what happens to arms and jobs, and their present state, from one poll for all viewers.
 
-What has happened is a line of the audit trail. It has that line's number, so whoever comes again names the last one and
-misses nothing, after a restart of the service, too. How an arm or a job stands has no number: it is told anew to
-whoever comes, and whenever it changes.
+An event is a line of the audit trail and has that line's number, so a viewer who reconnects names the last one and
+misses nothing, also after a restart of the service. The state of an arm or a job has no number: it is sent to each new
+viewer, and whenever it changes.
 
-Whoever looks first looks for all: fifty viewers cost the registry what one does, and none costs nothing. Nothing that
+One poll serves all viewers: fifty cost the registry as much as one, and none costs nothing. Nothing that
 acts (a stop, a lease, a job) knows of viewers or waits for them.
 """
 

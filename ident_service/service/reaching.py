@@ -57,7 +57,7 @@ class Reaching:
             folder: of the run.
             target: to be reached.
             least: seconds of the motion, before which nothing counts: its period, zero where it has none.
-            tell: is told once when it is reached, or when nobody looks any more.
+            tell: called once, when the target is reached or when the process has failed.
         """
         self._request = {"folder": str(folder), "share": target.share, "parameters": target.parameters, "least": least}
         self.period = least

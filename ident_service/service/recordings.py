@@ -33,7 +33,7 @@ _OF_ALL = ("trim", "gap", "stamps", "rate")
 
 
 def file_and_range(path: Path) -> tuple[Path, tuple[float, float] | None]:
-    """Split `FILE@START:END`, seconds of the recording either of which may be left out, where no such file exists.
+    """Split `FILE@START:END` into file and seconds, either of which may be left out, unless such a file exists.
 
     Raises:
         UsageError: the range ends before it begins.
@@ -148,7 +148,7 @@ def open_for(
 
 
 def _ended(whole: McapRecording | MeasuredRecording, recording: Recording) -> float | None:
-    """Return when a stop or a fault ended the motion in our own recording [s after its first sample]; None if neither.
+    """Return when a stop or a fault ended the motion in a recording by ident [s after its first sample]; None if none.
 
     From then on brakes or the drives themselves hold the arm, and the recorded torque is not what acts on it.
     """
@@ -203,7 +203,7 @@ def standstill_left_out(recording: Recording) -> tuple[float, float]:
 
 
 def require_no_fault(path: Path, recording: Recording) -> None:
-    """Refuse a recording of our own in which a fault stopped the arm, unless its range ends before.
+    """Refuse a recording made by ident in which a fault stopped the arm, unless its range ends before.
 
     Args:
         path: as it was named.

@@ -44,10 +44,10 @@ class Recovery:
         unreachable: why not, or empty.
         zero_lost: why the arm does not know where it stands, or empty; nothing else is then seen of it.
         reset: axes whose drives were reset just now.
-        tripped: what drives still say, by axis.
+        tripped: what drives still have latched, by axis.
         outside: joints outside their position limits, in words.
         steps: what to do next, one sentence each, in order; the last one is what a usable arm needs as well.
-        usable: whether nothing stands in the way of `ident check`.
+        usable: whether `ident check` can be run.
     """
 
     arm: str

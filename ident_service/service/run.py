@@ -1,7 +1,7 @@
 """Run a motion on an arm: recorder and motion in processes of their own, supervised, all kept in a folder.
 
-The folder is there from the beginning and keeps what was recorded, whether the run ended well or not; only a run that
-was refused before anything moved leaves none. How it ended is written by the motion process, and from here where that
+The folder exists from the beginning and keeps what was recorded, whether the run ended well or not; only a run that was
+refused before anything moved leaves none. The motion process writes how the run ended, or this process if that one
 could not. A file that cannot be written never hides why a run ended: it becomes a note of that error.
 """
 
@@ -74,16 +74,16 @@ def run_motion(
         motion: made for it; or where one slow way is to lead, home for example.
         folder: the run folder; it must not exist.
         state: the state folder, where the arm's controls and faults are.
-        ticket: of the preflight; the motion process holds it against the open arm.
-        speed: share of the motion's own speed; ways to a destination have theirs.
+        ticket: of the preflight; the motion process compares it with the open arm.
+        speed: share of the motion's own speed; motions to a destination have a fixed speed.
         lease: how long the arm moves on when this process is gone [s].
         log_frames: whether every frame of the fieldbus is kept in `can.log`, too, in candump's format.
-        begin: called when nothing that is known without the arm stands against the run, and its folder exists.
+        begin: called when all checks that do not need the arm have passed, and the folder exists.
         tell: called with each state that is entered.
         stop_requested: asked several times a second.
         asked_ns: when a person asked for the motion, on the machine's monotonic clock [ns]; now when None. A stop that
             was asked for since then keeps it from beginning.
-        until: what is to be known, whereupon the run is finished early; None for one that goes on to its end.
+        until: accuracy target at which the run is finished early; None for one that goes on to its end.
 
     Raises:
         UsageError: the run folder exists or cannot be made, the state folder cannot be written, or the target is none;

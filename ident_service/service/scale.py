@@ -1,7 +1,7 @@
 """Check position scales: compare drives' positions with angles by which a person has turned each joint by hand.
 
-A loop closes over a wrong gear ratio or encoder scale as if nothing were wrong, and how a joint answers torque tells it
-only where its inertia is known. A hand and a protractor know it.
+A control loop works with a wrong gear ratio or encoder scale as if nothing were wrong, and the response of a joint to
+torque reveals it only where its inertia is known. A turn by hand, measured with a protractor, reveals it directly.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Follow a run's recording in a process of its own, at the lowest priority, until its accuracy target is reached.
 
-It gets one JSON object on its standard input and says one line of JSON, once. It reads what the recorder has flushed
-and touches nothing else: whoever started it keeps the lease and asks for the finish. It ends with its standard input.
+It reads one JSON object from standard input and prints one line of JSON, once. It reads what the recorder has flushed
+and touches nothing else: its parent keeps the lease and asks for the finish. It ends when its standard input ends.
 """
 
 from __future__ import annotations

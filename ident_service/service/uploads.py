@@ -87,7 +87,7 @@ class Upload:
 
     Attributes:
         id: which names it.
-        announced: what it is to be.
+        announced: the recording as announced.
         received: bytes that are there; the next piece begins at this offset.
         run: id of the run that it became; None before it is whole.
     """
@@ -190,7 +190,7 @@ class Piece:
             raise
 
     def write(self, data: bytes) -> None:
-        """Append bytes.
+        """Append bytes to the upload.
 
         Raises:
             UsageError: they are more than were announced; nothing of `data` is kept.

@@ -1,9 +1,8 @@
 """Supervise the motion process from its parent: start it, keep its lease, read its output until it ends.
 
-What ends this process closes the pipe, and what makes it hang lets the lease lapse; either stops the arm. An interrupt
-while somebody has the arm ends nothing at once: it asks for a controlled stop, and the end of that is waited for. An
-arm without brakes may then be held until a person confirms that it is supported; whoever holds it is waited for, and
-never killed.
+If this process dies, the pipe closes; if it hangs, the lease lapses; either stops the arm. An interrupt while a process
+has the arm ends nothing at once: it asks for a controlled stop and waits for its end. An arm without brakes may then be
+held until a person confirms that it is supported; the process that holds it is waited for, and never killed.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Zero an arm with incremental encoders: a person confirms that the arm stands at its home posture.
 
-What a person must do is lead the arm there and compare it with the posture that is told; nobody else can. Everything
-that a program can tell stands against it first: whoever moves the arm, another host, powered drives, an arm that moves.
+A person must move the arm to its home and compare it with the displayed posture. Everything that a program can check is
+checked first: another process that moves the arm, another host, powered drives, an arm that moves.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ class Zeroed:
     Attributes:
         arm: name.
         posture: that the arm stands in, of all joints.
-        drives: what each says of itself.
-        faults: that nobody has acknowledged; zeroing neither needs that nor changes it.
+        drives: message of each drive about its zero.
+        faults: that nobody has acknowledged; zeroing is possible with them and leaves them as they are.
         ticket_removed: whether there was a preflight ticket, which was about another zero.
     """
 

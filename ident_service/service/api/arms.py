@@ -111,7 +111,7 @@ def get_arm(service: Serving, _: Viewer, arm: ArmName) -> ArmAnswer:
 
 @router.post("/arms/{arm}/challenge", status_code=201)
 def challenge(service: Serving, who: Operator, arm: ArmName) -> ChallengeAnswer:
-    """Make a challenge, which with the typed name confirms one motion; a request that comes twice moves it once."""
+    """Make a challenge, which with the typed name confirms one motion; a repeated request moves the arm once."""
     name = known.known_arm(service.db, service.state, arm).name
     return ChallengeAnswer(arm=name, challenge=service.gate.challenge(name, who.name), seconds=CHALLENGE_SECONDS)
 

@@ -1,7 +1,8 @@
 """Authenticate requests and provide the routes' dependencies: the service, and the caller's name and role.
 
-A token comes as `Authorization: Bearer`, or a session of the page as a cookie. A cookie comes by itself, so what
-changes anything with one must say which page it came from, too (`doors.py` has seen that it is ours).
+A token comes as `Authorization: Bearer`, or a session of the page as a cookie. Browsers send cookies by themselves, so
+a request with a cookie that changes anything must also have an Origin header (`doors.py` has checked that it is this
+service's).
 """
 
 from __future__ import annotations
@@ -78,8 +79,8 @@ async def access_of(request: Request, bearer: Bearer = None, cookie: Cookie = No
     """Return name and role of the caller by token or session; None without a valid session and without a token.
 
     Raises:
-        HTTPException: 401 for a token that is nobody's, 429 after too many of them, 403 for a session that is used from
-            nowhere.
+        HTTPException: 401 for an unknown token, 429 after too many failed attempts, 403 for a changing request with a
+            session and without an Origin header.
     """
     service, found = service_of(request), None
     if bearer is not None:

@@ -1,12 +1,12 @@
 """Count the connections of the service's listener, and close those that wait too long without a request.
 
-A newcomer is always let in. Where there are too many, of one address or of all, the connection goes that has waited
-longest without a whole request: half a request, a TLS handshake that does not go on, an idle line. So a stop finds a
-place, whoever keeps lines open. What is being answered stays; there is less of it than there are places, of one
-address and of all, because the doors refuse more (`busy`), a stop and a lease excepted. Who does not read its answer is
-let go, too.
+A new connection is always admitted. Where there are too many, of one address or of all, the connection is closed that
+has waited longest without a complete request: half a request, a TLS handshake that does not go on, an idle connection.
+So a stop always finds a place, whoever keeps connections open. Requests that are being answered keep theirs; they are
+fewer than the places, of one address and of all, because the middleware refuses more (`busy`), a stop and a lease
+excepted. A client that does not read its answer is closed, too.
 
-uvicorn's own `limit_concurrency` counts idle lines and would refuse the stop, and it has no deadline for a request.
+uvicorn's own `limit_concurrency` counts idle connections and would refuse the stop; it has no deadline for a request.
 """
 
 from __future__ import annotations

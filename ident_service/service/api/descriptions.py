@@ -1,6 +1,6 @@
 """Serve the routes that check a description without storing it, and show an arm's home posture.
 
-What computes with mechanisms is loaded when it is asked for: the service starts without.
+Modules that compute with mechanisms are imported only in the request, so that the service starts without them.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ class Throttled(Exception):
 class Throttle:
     """Counter of failed attempts, per address and per token.
 
-    Nothing is counted of all together: nobody guesses 256 bits, and whoever fails elsewhere must lock out no one here.
+    There is no total over all callers: nobody guesses 256 bits, and failures elsewhere must lock out nobody here.
     """
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
@@ -123,7 +123,7 @@ class Gate:
         return found
 
     def log_in(self, secret: str, address: str) -> tuple[str, Access] | None:
-        """Exchange a token for a session; None if it is nobody's. Raises as `by_token`."""
+        """Exchange a token for a session; return None for an unknown token. Raises as `by_token`."""
         found = self.by_token(secret, address)
         if found is None:
             return None

@@ -92,7 +92,7 @@ def require_confirmed(service: Service, arm: str, confirm: Confirmation | None, 
 def create_job(
     service: Serving, who: Operator, body: JobRequest, response: Response, idempotency_key: Key = None
 ) -> JobAnswer:
-    """Begin or queue a job; a computation that is asked for again with the same `Idempotency-Key` is the same job."""
+    """Begin or queue a job; a computation repeated with the same `Idempotency-Key` is the same job."""
     if idempotency_key is None:
         return begin_job(service, who, body)
     if body.job.kind in MOVES:
@@ -114,7 +114,7 @@ def create_job(
 
 
 def begin_job(service: Service, who: Access, body: JobRequest) -> JobAnswer:
-    """Queue what is asked for, in a request to the API or on a page.
+    """Queue the job of a request to the API or of a page.
 
     Raises:
         MotionRefused: a motion that no person has confirmed.
@@ -149,14 +149,14 @@ def get_job(service: Serving, _: Viewer, job: Id) -> JobAnswer:
 
 @router.get("/jobs/{job}/log", response_class=PlainTextResponse, responses=failures_of_files(404, 409))
 def get_log(service: Serving, _: Viewer, job: Id) -> PlainTextResponse:
-    """Read the end of the log of a job."""
+    """Return the end of the log of a job."""
     row = rows.known_job(service.db, job)
     return PlainTextResponse(said(service.state / JOBS / row["id"], MOST_LOG).log)
 
 
 @router.get("/jobs/{job}/result")
 def get_result(service: Serving, _: Viewer, job: Id) -> JobResult:
-    """Read what the command of a job answered."""
+    """Return what the command of a job answered."""
     row = rows.known_job(service.db, job)
     answer = said(service.state / JOBS / row["id"]).answer
     return JobResult(job=row["id"], answer=without_paths(answer, str(service.state)))
@@ -178,7 +178,7 @@ def cancel_job(service: Serving, who: Operator, job: Id) -> JobAnswer:
 
 @router.post("/jobs/{job}/lease")
 async def renew_lease(service: Serving, who: LeaseKeeper, job: Id) -> LeaseAnswer:
-    """Renew the lease of a motion; only whoever asked for it can."""
+    """Renew the lease of a motion; only the caller who asked for the motion can."""
     holder = service.engine.live.lease_holder(job)
     if holder is not None and holder != who.name:
         raise HTTPException(403, "the lease of a motion is renewed by whoever asked for it")
@@ -196,7 +196,7 @@ async def stop_all(service: Serving, who: Near) -> StopAnswer:
 
 @router.post("/arms/{arm}/stop")
 async def stop_arm(service: Serving, who: Near, arm: ArmName) -> StopAnswer:
-    """Stop an arm, under control; as for all arms; one that nobody moves is no mistake."""
+    """Stop an arm, under control; as for all arms; it is no error if no process moves it."""
     return await _stop(service, arm, who)
 
 

@@ -1,7 +1,7 @@
 """Write logs as lines of JSON on standard error: time, level, logger, message, and named facts.
 
-A thread of its own writes them: a reader of standard error that stands still keeps nobody else, a stop least of all.
-Lines that nobody takes are left out, and so are those that say the same thing again and again.
+A thread of its own writes them, so that a reader of standard error that does not read delays no request, least of all a
+stop. Lines that do not fit the queue are dropped, and so are lines that are repeated too often.
 """
 
 from __future__ import annotations

@@ -132,7 +132,7 @@ def list_due(service: Serving, _: Viewer, arm: ArmName | None = None) -> list[Du
 
 @router.post("/due/{number}/dismiss", status_code=204)
 def dismiss_due(service: Serving, who: Operator, number: Number, body: Remark) -> None:
-    """Dismiss what is due, by a person's word."""
+    """Dismiss a due re-identification, on a person's decision."""
     planned.dismiss(service.db, number, body.note, who.name, time.time())
 
 
@@ -193,7 +193,7 @@ def list_alarms(
 
 @router.post("/alarms/{number}/ack")
 def acknowledge_alarm(service: Serving, who: Operator, number: Number, body: Remark) -> AlarmAnswer:
-    """Acknowledge a drift alarm, by a person's word; the accepted set stays as it is."""
+    """Acknowledge a drift alarm, on a person's decision; the accepted set stays as it is."""
     return AlarmAnswer(**raised.acknowledge_alarm(service.db, number, body.note, who.name, time.time()))
 
 

@@ -33,11 +33,11 @@ class Pager:
     """Reader of one page of a list for a request."""
 
     def __init__(self, request: Request, response: Response) -> None:
-        """Take the request, which names the page, and the answer, which gets the header."""
+        """Take the request, which names the page, and the response, which gets the `Link` header."""
         self._request, self._response = request, response
 
     def __call__(self, most: int, read: Callable[[int], Sequence[Row]], key: str = "id") -> list[Row]:
-        """Read one page and name the next.
+        """Return the lines of one page, and name the next page in the header.
 
         Args:
             most: lines of a page.

@@ -62,7 +62,7 @@ def get_file(service: Serving, _: Viewer, run: Id, name: FileName) -> FileRespon
 
 @router.get("/runs/{run}/report.html", response_class=FileResponse, responses=_PAGE)
 def get_report(service: Serving, _: Viewer, run: Id) -> FileResponse:
-    """Show the report of a run; the one that a job of the kind `report` has made since, or its own."""
+    """Show the report of a run: the newest that a job of the kind `report` has made, else the run's own."""
     path = service.state / REPORTS / f"{runs.known_run(service.db, run)['id']}.html"
     if not path.is_file() and _REPORT in runs.run_files(service.db, service.state, run):
         path = runs.run_file(service.db, service.state, run, _REPORT)

@@ -52,7 +52,7 @@ class UploadAnswer(BaseModel):
 
 @router.post("/uploads", status_code=201)
 def begin_upload(service: Serving, who: Operator, body: NewUpload) -> UploadAnswer:
-    """Announce a recording; one that was announced before goes on where it broke off, a whole one is not sent again."""
+    """Announce a recording; an interrupted upload is resumed, a complete one is not sent again."""
     announced = uploads.Announced(**body.model_dump(), by=who.name)
     try:
         return _answer(uploads.begin_upload(service.db, service.state, announced))
@@ -74,7 +74,7 @@ def get_upload(service: Serving, _: Viewer, upload: Id) -> UploadAnswer:
 
 @router.patch("/uploads/{upload}", responses=failures(404, 409), openapi_extra=_PIECE)
 async def add_piece(request: Request, service: Serving, _: Operator, upload: Id, upload_offset: Offset) -> UploadAnswer:
-    """Send the next piece of a recording, 8 MiB at most; what has arrived of a torn piece stays."""
+    """Send the next piece of a recording, 8 MiB at most; bytes of an interrupted piece that arrived are kept."""
     with await run_in_threadpool(uploads.Piece, service.state, upload, upload_offset) as piece:
         try:
             async for data in request.stream():

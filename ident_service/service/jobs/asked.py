@@ -117,7 +117,7 @@ class Recover(Ask):
 
 
 class Watch(Ask):
-    """Read the arm's state without a torque or a change of state."""
+    """Read the arm's positions and drive status without torque and without changing its state."""
 
     kind: Literal["watch"]
     arm: ArmName

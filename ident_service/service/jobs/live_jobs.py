@@ -204,7 +204,7 @@ class LiveJobs:
         return [live.job for live in found]
 
     def stops(self, arm: str | None) -> int:
-        """Return the number of stops of this arm, or of all arms, requested so far."""
+        """Return the number of stops asked for so far that concern an arm: those of all arms plus its own."""
         return self._stops[None] + (self._stops[arm] if arm is not None else 0)
 
     def end(self, job: str, why: str) -> bool:

@@ -1,6 +1,6 @@
 """Mark jobs as interrupted after the service died, with what their files show.
 
-A motion is not begun by a restart: a person asked for it at another moment. What waits to compute goes on waiting.
+A restart begins no motion: a person asked for it at another moment. Queued computations stay queued.
 """
 
 from __future__ import annotations

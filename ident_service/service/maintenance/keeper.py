@@ -1,8 +1,9 @@
 """Find due re-identifications, begin those that may begin unattended, advance their steps, send notices.
 
-An arm begins by itself only where its description says `unattended_motion: allowed`, and then only at the time: what is
-late, what was due before this process began, and an arm that has a latched fault, is moved or is waited for, all ask
-for a person. That is decided once, so that neither an acknowledged fault nor a new description sets an arm in motion.
+A re-identification begins unattended only where the description says `unattended_motion: allowed`, and then only on
+time. One that is late, or was due before this process began, and one of an arm that has a latched fault, is moved or is
+waited for, needs a person. That is decided once, so that neither an acknowledged fault nor a new description sets an
+arm in motion later.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """Re-identify an arm in four jobs: preflight, run, identification, comparison with the accepted set.
 
-Its row in the registry says which step it is at; the job of that step says how far. Whatever ends a step badly ends it.
-A person's word, or that of the schedule, is good for both motions, and for no longer than this process lives and nobody
-asks for a stop: after a restart only what computes goes on.
+Its row in the registry names the present step and that step's job. A step that ends badly ends the re-identification.
+The confirmation by a person, or the schedule, covers both motions, but only while this process lives and nobody asks
+for a stop: after a restart only computations go on.
 
 The identification uses the description that the acceptance kept, so that both sets have the same parameters and the
-same shape of friction.
+same friction model.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Keep the schedules of an arm (cron, operating hours, maintenance) and what is due by them.
 
-A time that was missed, because nothing ran or the clock was wrong, is due once. What is due stays so until a
-re-identification of the arm came to a verdict, or a person says that it is not to be done; meanwhile its schedule adds
-nothing. Operating hours are those that runs of this registry drove the arm; what drives it otherwise is not seen here.
+A time that was missed, because nothing ran or the clock was wrong, is due once. It stays due until a re-identification
+of the arm came to a verdict, or a person dismisses it; meanwhile its schedule adds nothing. Operating hours count only
+the time in which runs of this registry drove the arm.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Send notices of due re-identifications and drift alarms to a webhook, by the convention of standardwebhooks.com.
 
-Each notice is a row of the registry before anybody is told that it was sent. It is tried again, later and later, for
-three days, also after a restart; then it is given up with a line in the audit trail. A failure harms nothing: a thread
-of its own sends. Only https, or http to this machine; redirections are not followed.
+Each notice is a row of the registry before it counts as sent. Failed attempts are repeated at growing intervals for
+three days, also after a restart; then the notice is given up with a line in the audit trail. A thread of its own sends,
+so that a failure delays nothing else. Only https, or http to this machine; redirections are not followed.
 
 The receiver verifies `webhook-signature` with a library of the convention and the shared secret, refuses old
 timestamps, and tells repetitions by `webhook-id`, which is the same for all attempts.

@@ -1,7 +1,7 @@
 """Collect what pages show of a re-identification: its steps with their jobs, and the findings of its comparison.
 
-The registry's words are what was concluded. The comparison in the run's folder says the same with more structure; it
-is shown only where the manifest names it as it is, and where it is that very one and not a later one.
+The registry's text is the verdict that was concluded. The comparison in the run's folder has the same content in more
+detail; it is shown only if the manifest names it with its hash, and if it leads to that same text.
 """
 
 from __future__ import annotations
@@ -136,7 +136,8 @@ def _told(folder: Path, pair: dict[str, Any]) -> Compared:
 def _jobs(db: Database, row: Row) -> dict[str, str]:
     """Return the job id of each step that has a job, by the step's key.
 
-    What a job makes names it. A check makes nothing: it is the one that was asked for when this was begun.
+    A step's job is found by the run that it made. A check makes none: it is the one whose creation time is nearest to
+    the beginning of the re-identification.
     """
     found = {
         key: job["id"]

@@ -1,7 +1,7 @@
 """Serve the pages of re-identifications: confirmation by a person, progress, and findings.
 
-A person's word is the arm's name, typed, as for any motion; a note may say why, and stands in the audit trail. The page
-that then opens keeps the lease of both motions.
+A person confirms by typing the arm's name, as for any motion; a note may say why, and is entered in the audit trail.
+The page that then opens renews the lease of both motions.
 """
 
 from __future__ import annotations

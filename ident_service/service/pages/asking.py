@@ -1,7 +1,7 @@
 """Parse the forms of page routes, and render their failures as pages.
 
-A form comes from a page of ours or not at all: its Origin must be there and ours (`api/doors.py`), besides the cookie
-that other sites do not send.
+A form must come from a page of this service: besides the cookie, which other sites do not send, its Origin header must
+be present and this service's (`api/doors.py`).
 """
 
 from __future__ import annotations

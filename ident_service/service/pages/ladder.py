@@ -1,8 +1,8 @@
 """Determine the commissioning steps of an arm: what is done of each, and which comes next.
 
-Told from the registry and the arm's folder each time it is asked, so that it is true after any restart. Steps count
-from the last description on: another description begins the ladder anew. What a re-identification did belongs to its
-own step alone. That step comes next whenever something is due or a drift alarm stands, and can be done.
+Read from the registry and the arm's folder at each request, so that it is right after any restart. Steps count from the
+last description on: a new description begins them anew. Jobs of a re-identification count for its own step alone. That
+step comes next whenever something is due or a drift alarm stands, and it can be done.
 """
 
 from __future__ import annotations

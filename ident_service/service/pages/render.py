@@ -1,7 +1,7 @@
 """Render pages from templates: every value is escaped, no script or style stands inline.
 
-A page's own policy allows scripts, styles and connections of this service only. Its referrer policy tells our own
-origin, because a browser that is to say nothing sends `Origin: null` with a form, which the doors refuse.
+The content security policy of a page allows scripts, styles and connections of this service only. Its referrer policy
+is `same-origin`, because with `no-referrer` a browser sends `Origin: null` with a form, which the middleware refuses.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def page(name: str, who: Access | None, status: int = 200, **values: Any) -> HTM
 
     Args:
         name: of the template, without its ending.
-        who: looks at it; None for nobody that we know.
+        who: the caller; None for one that is not logged in.
         status: of the answer.
         values: of the template; every one that it names must be there.
     """
@@ -87,7 +87,7 @@ def static() -> dict[str, bytes]:
 
 @lru_cache(maxsize=1)
 def mark() -> str:
-    """Return the part of the static files' addresses that changes with their content, so that browsers may cache."""
+    """Return the part of the static files' addresses that changes with their content, so that browsers cache them."""
     return hashlib.sha256(b"".join(static().values())).hexdigest()[:12]
 
 

@@ -58,7 +58,7 @@ def resources(config: ArmConfig) -> tuple[str, ...]:
 
 
 def know_shipped(db: Database) -> None:
-    """Enter the shipped arms; an uploaded one of the same name stays.
+    """Enter the shipped arms in the registry; an uploaded one of the same name stays.
 
     Their descriptions are read when they are asked for: reading all of them takes longer than a start may.
     """
