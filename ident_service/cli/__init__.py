@@ -91,7 +91,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         verb: Callable[[argparse.Namespace], Answer] = arguments.verb if arguments.server is None else remote.remotely
         code, text, document = _asked(verb, arguments)
     except KeyboardInterrupt:
-        # Asked twice, or by somebody who does not want to wait for what could be saved.
+        # A second Ctrl-C: the person does not want to wait for what could be saved.
         print_to_person("ident: interrupted\n")
         if arguments.json:
             print_error("Interrupted", "interrupted", FAILED)

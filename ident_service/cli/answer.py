@@ -23,7 +23,7 @@ from ident_service.errors import UsageError
 DONE, FAILED, USAGE, VERDICT_NO, FAULTED, PERSON_NEEDED = 0, 1, 2, 3, 4, 5
 
 Answer = tuple[int, str, dict[str, Any]]
-"""Exit code; what a person reads, with its last line break; what a program reads."""
+"""Exit code; text for a person, with its last line break; JSON values for a program."""
 
 
 def print_answer(arguments: argparse.Namespace, code: int, text: str, document: dict[str, Any]) -> None:

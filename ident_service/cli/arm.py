@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from ident_service.excitation.excitation import Excitation
 
 _REHEARSAL = 0.2
-_PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")  # a name that stays below its folder
+_PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")  # a name that cannot lead out of its folder
 _HELP_ARM = "description file, or the name of a shipped one"
 
 

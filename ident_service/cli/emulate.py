@@ -75,7 +75,7 @@ def _emulate(arguments: argparse.Namespace) -> Answer:
 
 def _lines() -> Callable[[], str | None]:
     """Return a function that takes the next line of standard input, None while there is none or after its end."""
-    # No thread waits for them: one that reads standard input cannot be ended.
+    # Polled, not read by a thread: a thread that blocks on standard input cannot be ended.
     rest, ended = b"", sys.stdin is None or sys.stdin.closed
 
     def take() -> str | None:

@@ -102,7 +102,7 @@ def _step(arguments: argparse.Namespace, *words: str) -> Answer:
     try:
         answer: Answer = parsed.verb(parsed)
     except MotionRefused as error:
-        # Not the verdict that the arm has changed, which is told by the same exit code elsewhere.
+        # Distinguished from the verdict that the arm has changed, whose exit code a refused motion has otherwise.
         refused = PersonNeeded(str(error))
         refused.facts = error.facts
         raise refused from None

@@ -214,7 +214,7 @@ def _known(client: IdentClient, arm: str) -> bool:
 
 def _ask(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     answer = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/{arguments.word}")
-    if not answer["reached"]:  # the exit code is that of the same words at the machine itself
+    if not answer["reached"]:  # the same exit code as for this verb on the daemon's machine
         raise UsageError(f"{arguments.arm}: nobody moves an arm of this name there")
     return DONE, f"{arguments.arm}: {arguments.word} asked\n", answer
 

@@ -130,4 +130,4 @@ CARRIED: dict[str, frozenset[str]] = {
     **dict.fromkeys(("due dismiss", "alarm ack"), _NUMBER | {"note"}),
     "reidentify": frozenset({"arm", "motion", "confirm"}),
 }
-"""What of each verb a daemon is told; who asks is the token's name, and not `--by`."""
+"""Arguments that are sent to a daemon, by verb; the audit trail has the token's name there, and not `--by`."""

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ident_service.client import IdentClient
 
 _API = "/api/v1"
-_PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,119}")  # a name that stays in the folder it is written into
+_PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,119}")  # a name that cannot lead out of the folder it is written into
 
 
 def _run(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -174,4 +174,4 @@ CARRIED: dict[str, frozenset[str]] = {
     "token list": frozenset(),
     "token revoke": frozenset({"name"}),
 }
-"""What of each verb a daemon is told; who asks is the token's name, and not `--by`."""
+"""Arguments that are sent to a daemon, by verb; the audit trail has the token's name there, and not `--by`."""

@@ -152,4 +152,4 @@ CARRIED: dict[str, frozenset[str]] = {
     "config check": frozenset({"file"}),
     "rehearse": frozenset({"arm", "motion", "confirm", "speed", "no_key"}),
 }
-"""What of each verb a daemon is told."""
+"""Arguments that are sent to a daemon, by verb."""

@@ -21,7 +21,7 @@ from ident_service.config.source import KeyPath, Tree, first_problems, read_tree
 from ident_service.errors import ConfigError, Problem, UsageError
 
 _MOST_JSON = 4 * 2**20  # bytes: a text, a URDF and an EDS at their limits
-_MOST_VALUES = 10_000  # each may be a mistake, which takes a kilobyte
+_MOST_VALUES = 10_000  # each may cause an error message of about a kilobyte
 _Described = TypeVar("_Described", bound=Section)
 _PER_JOINT = ("encoder_resolution", "torque_resolution", "torque_noise")
 

@@ -27,7 +27,7 @@ from ident_service.config.quantities import Angle, NonNegative, Number, Positive
 # Beyond it, rounding would lose half of the digits between motor and joint.
 _WORST_CONDITION = 1e8
 _NUMBERED = re.compile(r"(q|dq|tau)(\d+)")
-_SAME = 0.01  # a factor this near to a unit's own conversion is that conversion a second time
+_SAME = 0.01  # a factor this near to a unit's own conversion is taken for a repetition of it
 
 _QUANTITIES = {"t": "time", "q": "position", "dq": "velocity", "tau": "torque"}
 _SI = {"time": "s", "position": "rad or m", "velocity": "rad/s or m/s", "torque": "N m or N"}

@@ -111,7 +111,7 @@ def rollback(db: Database, state: Path, arm: str, note: str, who: str, to: int |
 
     Raises:
         UsageError: no note, no name, or there is no such set.
-        ParameterError: the set is not what was accepted.
+        ParameterError: the set's files were changed after the acceptance.
     """
     note, who = _noted(note), _named(who)
     with _acting(state, arm):
@@ -143,7 +143,7 @@ def acceptances(state: Path, arm: str) -> list[Acceptance]:
     """Return all acceptances of an arm, the earliest first.
 
     Raises:
-        ParameterError: a file of them was damaged by somebody.
+        ParameterError: a file of them is damaged.
     """
     place, acts = arm_folder(state, arm) / ACCEPTED, list[Acceptance]()
     while (folder := place / f"{len(acts) + 1:04d}").is_dir():
@@ -159,7 +159,7 @@ def accepted_set(state: Path, arm: str, number: int | None = None) -> tuple[Acce
 
     Raises:
         UsageError: nothing was accepted, or nothing of this number.
-        ParameterError: it is not what was accepted.
+        ParameterError: its files were changed after the acceptance.
     """
     acts = acceptances(state, arm)
     if not acts:

@@ -321,7 +321,7 @@ def _exchange(state: Path, staging: Path) -> str | None:
     standing = [name for name in _standing(state) if name != RESTORING]
     marker, folder = state / RESTORING, None
     os.sync()  # what was unpacked, before anything moves
-    for left in marker.iterdir() if marker.exists() else ():  # by a restore that broke off
+    for left in marker.iterdir() if marker.exists() else ():  # left by a restore that was interrupted
         shutil.rmtree(left) if left.is_dir() else left.unlink()
     staging.rename(marker)
     if standing:

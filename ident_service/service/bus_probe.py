@@ -30,10 +30,10 @@ class Probed:
     """Capabilities of one drive, or of one data sheet.
 
     Attributes:
-        title: what it is called.
+        title: `drive N`, or the name of the file.
         node: number of the drive, as the description has it.
         silent: why it was not asked, or did not answer; empty for one that did.
-        can: what it can; None where neither it nor a file tells.
+        can: its capabilities; None where neither the drive nor a file tells them.
     """
 
     title: str

@@ -37,9 +37,9 @@ class Line:
         bus: number of its bus, from 0.
         node: its number.
         drive: number of the configured drive, from 1; None for a node that is none.
-        match: how it goes with the configuration.
+        match: result of the comparison with the configuration.
         why: what is different, in words; empty where nothing is.
-        found: what it says; None where it is missing.
+        found: its identity, state and errors; None where it is missing.
     """
 
     bus: int

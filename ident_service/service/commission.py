@@ -137,7 +137,7 @@ def simulate(
 
     Raises:
         UsageError: the folder exists, or the arm is not simulated.
-        ArmError: somebody asked for a stop.
+        ArmError: a stop was requested.
         IdentError: anything the steps raise; no folder is left behind.
     """
     if folder.exists():

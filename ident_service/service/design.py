@@ -92,7 +92,7 @@ def design_files(
         cancelled: True ends the search with what it has.
 
     Raises:
-        UsageError, ConfigError: the request or the description cannot be meant.
+        UsageError, ConfigError: the request or the description is not valid.
         MotionRefused: limits that contradict each other, home in collision, no posture that keeps them.
         RecordingError, ParameterError: a file of the knowledge cannot be used.
     """
@@ -140,7 +140,7 @@ def preview_files(arm: str, motion: Path | None, knowledge: Knowledge, folder: P
         folder: where the text and the drawings go; others in it stay.
 
     Raises:
-        UsageError, ConfigError: a file that does not exist or cannot be meant.
+        UsageError, ConfigError: a file that does not exist or is not valid.
         MotionRefused: the motion was made for another arm.
     """
     model = known_model(arm, knowledge)

@@ -112,7 +112,7 @@ def identify_files(request: Request, folder: Path, tell: Callable[[str], None] =
         tell: called with a line at each step that takes longer.
 
     Raises:
-        UsageError, ConfigError: the request or the arm's description cannot be meant, or the folder holds anything
+        UsageError, ConfigError: the request or the arm's description is not valid, or the folder holds anything
             else.
         RecordingError: a recording cannot be used.
         SolverError: a solver stopped without an optimum.

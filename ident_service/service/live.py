@@ -26,7 +26,7 @@ from ident_service.errors import IdentError, RecordingError
 from ident_service.record.recording import Block
 from ident_service.record.tail import RecordingTail, Samples
 
-if TYPE_CHECKING:  # estimation is loaded by the thread that needs it: the service starts without
+if TYPE_CHECKING:  # the thread that needs estimation imports it, so that the service starts without
     from ident_service.estimation.growing import Doubt, GrowingInformation
 
 ARM, RECORDING = "arm.json", "run.mcap"

@@ -7,7 +7,7 @@
 | `ident_cycle_lateness_seconds` | how late cycles of runs woke, from what each run wrote down |
 | `ident_job_seconds`, `ident_job_wait_seconds` | how long jobs took, and waited |
 
-Counts are since the service was started. What the registry knows is read when somebody asks.
+Counts are since the service was started. Gauges are read from the registry at each request.
 """
 
 from __future__ import annotations

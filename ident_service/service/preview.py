@@ -36,8 +36,8 @@ from ident_service.motion.surroundings import Nearest, stop_clearance
 from ident_service.motion.way import calm_way
 from ident_service.results.parameter_file import read_parameters
 
-_LOOKED_AT = 2000  # samples of every part of a motion that the following error is forecast at
-_USED = 0.25  # of the torque limits, by an arm of which nothing is known
+_LOOKED_AT = 2000  # samples of each part of a motion for the forecast of the following error
+_USED = 0.25  # share of the torque limits used by an arm without a prior
 KINDS = ("velocity", "acceleration", "jerk", "torque")
 
 
@@ -49,7 +49,7 @@ class Preview:
         model: of the arm.
         excitation: the motion.
         limits: of the arm.
-        proof: what it asks, at every instant.
+        proof: verified bounds of its demands at every instant.
         objections: every limit that is not kept, in words; empty for a motion that may run.
         stops: lowest and highest positions that a stop from anywhere on the motion reaches, each of shape (joints,).
         stop_clearance: the smallest distance on stops out of the motion.

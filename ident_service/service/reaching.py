@@ -46,7 +46,7 @@ class Reaching:
     """Monitor of a run's accuracy target.
 
     Attributes:
-        said: what the process said then, `seconds` of the motion and the largest `share`; None before.
+        said: result once the target is reached, `seconds` of the motion and the largest `share`; None before.
         period: of the motion [s], zero where it has none.
     """
 

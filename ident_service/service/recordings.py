@@ -69,7 +69,7 @@ def open_together(
 ) -> Opened:
     """Open recordings for one estimate, with the same kind of torque in all that ident recorded.
 
-    Torques that drives measured and ones that they were only told differ by what current loops leave, and each has its
+    Torques that drives measured and commanded ones differ by the error of the current loops, and each has its
     own delay. So measured ones are used where all recordings have them, and commanded ones otherwise.
 
     Args:

@@ -73,7 +73,7 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str 
         called: the arm as commands are to name it, its file for example; its name when None.
 
     Raises:
-        UsageError: the file of faults was damaged by somebody.
+        UsageError: the file of faults is damaged.
         MotionRefused: the description has no position limits.
         DriverError: nothing is installed that can reach such an arm.
     """

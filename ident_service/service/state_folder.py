@@ -17,7 +17,7 @@ from ident_service.errors import UsageError
 LOCK: Final = "serve.lock"
 URL_FILE: Final = "serve.url"
 RESTORING: Final = ".restoring"
-"""A folder that is there while a restored state takes the place of another one."""
+"""Name of a folder that exists while a restore replaces the state."""
 _OTHERS_ENTER = 0o011
 
 

@@ -116,7 +116,7 @@ def _opened(folder: Path) -> RecordingTail | None:
 
 
 def _left_alone() -> bool:
-    """Wait a little; return whether standard input has ended, so that nobody waits for the answer."""
+    """Wait a little; return whether standard input has ended, or has data, so that nobody waits for the answer."""
     return bool(select.select([sys.stdin.fileno()], [], [], _LOOK)[0])
 
 

@@ -41,7 +41,7 @@ UPLOADS: Final = ".uploads"  # hidden, so that backups leave out incomplete uplo
 MOST_BYTES: Final = 4 * 2**30  # of a recording
 MOST_OPEN: Final = 16
 MOST_COLUMNS: Final = 2**16
-KEPT_FREE: Final = 2**30  # bytes of the disk that a motion's own recording may need meanwhile
+KEPT_FREE: Final = 2**30  # bytes left free on the disk for the recording of a motion
 HALF_SECONDS: Final = 24 * 3600.0  # s after its last piece, when an incomplete upload is deleted
 _DATA, _ARM = "data", "arm.json"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,119}")
@@ -109,7 +109,7 @@ def begin_upload(db: Database, state: Path, announced: Announced) -> Upload:
     Raises:
         UnknownId: no such arm.
         UsageError: a name that no recording can have, or too many uploads are under way.
-        NoRoom: the disk has no room for it.
+        NoRoom: the disk has too little space for it.
     """
     name = announced.name
     if not _NAME.fullmatch(name) or name.endswith(_DOCUMENTS):

@@ -145,7 +145,7 @@ def watched(
                 if not watch.hear_the_end():
                     raise
         except BaseException:
-            process.stdin.close()  # nobody asks for this motion any more
+            process.stdin.close()  # ends the motion process's input: the motion has no owner any more
             watch.ask_stop()
             while process.poll() is None and not watch.hear(time.monotonic() + _LAST_WORDS):
                 if not watch.holding:
@@ -205,7 +205,7 @@ class _Watch:
     def hear_the_end(self) -> bool:
         """After an interrupt, wait up to a bound for the end of the stop; return whether a result was reported."""
         if self._controls is None:
-            return False  # nobody has the arm yet
+            return False  # the motion process has not taken the arm yet
         with _deaf():
             self.ask_stop()
             self._tell(f"interrupted: the arm is being stopped under control; waiting {_LAST_WORDS:g} s at most")

@@ -71,7 +71,7 @@ class AcceptanceAnswer(BaseModel):
 class ArmAnswer(ArmLine):
     """Arm with its state.
 
-    `moved_by` is the process that moves it, `resources` what a motion of it has for itself, `simulated` whether it can
+    `moved_by` is the process that moves it, `resources` what a motion of it reserves, `simulated` whether it can
     be commissioned by `simulate`, `unattended_motion` whether what is due may begin by itself.
     """
 

@@ -68,7 +68,7 @@ ROUTERS = (
     ),
     *(exports.router, uploads.router, events.router, deletion.router, maintenance.router, *PAGES),
 )
-"""In this order."""
+"""Routers of the application, in the order in which they are included."""
 
 
 def create_app(settings: Settings, connections: Connections | None = None) -> FastAPI:

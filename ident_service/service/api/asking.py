@@ -191,4 +191,4 @@ LeaseKeeper = Annotated[Access, Depends(lease_keeper)]
 Viewer = Annotated[Access, Depends(viewer)]
 Told = Annotated[WhileKnown, Depends(while_known)]
 Operator = Annotated[Access, Depends(operator)]
-"""What routes ask for."""
+"""Dependencies that routes declare."""

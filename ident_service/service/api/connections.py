@@ -21,7 +21,7 @@ from typing import Any, Final, Self
 
 HEADER_SECONDS: Final = 10.0  # for a handshake and the headers of a request
 BODY_SECONDS: Final = 60.0  # for 16 MiB over 2.2 Mbit/s
-ANSWER_SECONDS: Final = 60.0  # for the next piece of an answer that the other end does not read
+ANSWER_SECONDS: Final = 60.0  # s for a client to read the next piece of an answer
 _MOST, _FEWEST = 512, 16
 _DESCRIPTORS = 4096  # descriptors that are asked for, if the hard limit of the process allows it
 _RESERVE = 256  # descriptors for files, pipes of jobs, and connections that are being closed
@@ -144,7 +144,7 @@ class Connections:
         connection = self._forget(peer)
         connection.leaving = True
         self._leaving += 1
-        # The event loop reads the end of it, during a TLS handshake too, and closes it.
+        # The event loop then reads the end of the stream, during a TLS handshake too, and closes the socket.
         with suppress(OSError):
             connection.shutdown(socket.SHUT_RDWR)
 

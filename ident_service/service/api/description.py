@@ -56,7 +56,7 @@ EXAMPLES: Final[dict[str, dict[str, Any]]] = {
     "Support": {"By a person who sees it": {"confirm": "wam7_sim"}},
     "Rollback": {"The set before": {"note": "the new one oscillates"}, "The second": {"note": "the best", "to": 2}},
 }
-"""By the name of a request's model: title and value of its examples."""
+"""Examples (title and value) by the name of a request's model."""
 
 FAILURES: Final[dict[int, tuple[str, str]]] = {
     400: ("UsageError", "a description comes with 16 files at most"),
@@ -71,7 +71,7 @@ FAILURES: Final[dict[int, tuple[str, str]]] = {
     503: ("RegistryBusy", "another process keeps the registry; ask again"),
     507: ("DiskFull", "the disk of the state folder is full; make room, then ask again"),
 }
-"""By status: kind and message of one failure that has it."""
+"""Example of a failure (kind and message) by HTTP status."""
 
 
 def describe(app: FastAPI) -> None:

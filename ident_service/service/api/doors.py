@@ -156,7 +156,7 @@ class Doors:
                     raise _TooLarge(most)
                 if not whole and not message.get("more_body", False):
                     whole = True
-                    # While the body came, others may have taken the places of those that are answered.
+                    # While the body arrived, other requests may have used up the places.
                     if not urgent and self._connections.busy(peer):
                         raise _Busy
                     self._connections.request_came(peer)

@@ -89,7 +89,7 @@ class AsideHandler(logging.Handler):
 
     def _work(self) -> None:
         while (line := self._lines.get()) is not None:
-            with suppress(OSError, ValueError):  # nobody is left to tell
+            with suppress(OSError, ValueError):  # standard error is gone, so that nothing can be reported
                 self._stream.write(line + "\n")
                 if self._lines.empty():
                     self._stream.flush()

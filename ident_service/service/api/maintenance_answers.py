@@ -29,7 +29,7 @@ class ScheduleAnswer(BaseModel):
 class DeliveryAnswer(BaseModel):
     """Notice to the webhook.
 
-    `next` is when it is tried; without it and without `delivered` it was given up. `why` says what the last try met.
+    `next` is when it is tried; without it and without `delivered` it was given up. `why` is the last error.
     """
 
     number: int

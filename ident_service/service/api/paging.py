@@ -26,7 +26,7 @@ PAGES: Final[dict[int | str, dict[str, Any]]] = {
         }
     }
 }
-"""For `responses` of a route."""
+"""Description of the `Link` header, for `responses` of a route."""
 
 
 class Pager:

@@ -179,7 +179,7 @@ class Identify(Ask):
     feasible_set: FeasibleSet | None = None
     prior: Literal["none", "euclidean", "entropic"] | None = None
     as_accepted: Annotated[int, Field(ge=1, lt=10_000)] | None = None
-    """By the description that this acceptance keeps, which the comparison with its set needs; not by today's."""
+    """Number of an acceptance whose stored description is used instead of today's, for comparison with its set."""
 
 
 class Simulate(Ask):
@@ -297,7 +297,7 @@ Asked = Annotated[
     | Judge,
     Field(discriminator="kind"),
 ]
-"""Any of them; `kind` says which."""
+"""Any request for a job; `kind` tells which."""
 
 MOVES = frozenset({"check", "rehearse", "run", "home", "leave_limit", "zero"})
-"""Kinds that may give an arm a torque, or decide where it believes to stand: they need a lease, and a person's word."""
+"""Kinds of jobs that may command torque or set the encoders' zero: they need a lease and a person's confirmation."""

@@ -218,7 +218,7 @@ def _about_a_run(
         formats = asked.format if isinstance(asked, Figures) else ",".join(asked.formats)
         words = [asked.kind, str(folder), "--format", formats, "--out", str(place / str(made))]
     if made is not None or isinstance(asked, Report):
-        # The one command that writes a file, not a folder; `keep` takes away what stays empty.
+        # `correct` writes a file, not a folder, so the folder is made here; `keep` removes it if it stays empty.
         (place / str(made) if isinstance(asked, Correct) else place).mkdir(parents=True, exist_ok=True)
     return Command((*words, *_always(state)), arm, False, made or asked.run, (), LEASE_SECONDS)
 

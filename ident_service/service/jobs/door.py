@@ -23,7 +23,7 @@ _OPTIONS_OF_LOOKS = ("--json", "--state", "--seconds=")
 def main() -> int:
     """Become the requested command; return only if nothing, or nothing allowed here, was requested."""
     line = bytearray()
-    # Byte by byte: what comes after the line is the command's.
+    # Byte by byte: the input after the line belongs to the command.
     while not line.endswith(b"\n") and len(line) < _MOST:
         if not (part := os.read(0, 1)):
             return 1

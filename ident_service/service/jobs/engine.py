@@ -40,7 +40,7 @@ from ident_service.service.registry.motions import new_id
 from ident_service.service.registry.runs import RUNS
 
 _POLITE = 15.0  # s for a computation that was asked to end
-_AGAIN = 1.0  # s between tries to enter what the registry has no room for
+_AGAIN = 1.0  # s between attempts to write to a registry that is full or locked
 LOG = logging.getLogger("ident.jobs")
 
 
@@ -311,7 +311,7 @@ class Engine:
                 LOG.error("the end of a job cannot be entered yet: %s", error, extra={"job": live.job})
                 self._unwritten.add(live.job)
                 if self._closing.wait(_AGAIN):
-                    return  # the next start finds out what became of it
+                    return  # the next start determines the job's outcome
             else:
                 self._unwritten.discard(live.job)
                 return

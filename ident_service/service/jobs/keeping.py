@@ -39,7 +39,7 @@ def keep(db: Database, state: Path, row: Row, by: str) -> None:
     elif row["kind"] == "design" and (state / MOTIONS / made / MOTION_FILE).is_file():
         index_motion(db, state, made, row["arm"], by)
     elif row["kind"] == "correct":
-        with suppress(OSError):  # there is a file in it, or it is gone
+        with suppress(OSError):  # not empty, or removed already
             (state / EXPORTS / made).rmdir()
 
 

@@ -25,7 +25,7 @@ class LiveJob:
 
     Attributes:
         job: its id.
-        order: what its process is to do.
+        order: the command of its process.
         by: who asked for it.
         own_lease: whether a motion's lease is the service's own.
         renewed: when that was renewed last [s].
@@ -34,7 +34,7 @@ class LiveJob:
         child: its process, once it runs.
         asked_to_end: why it is to end; empty while it is not.
         since: when that was asked [s].
-        told: whether a computation was asked politely.
+        told: whether a computation was sent SIGTERM.
         killed: whether it was ended by force.
         concluding: whether its end is being entered.
     """
@@ -94,7 +94,7 @@ class LiveJobs:
 
         Args:
             live: the job.
-            stops: what `stops` answered when that was begun of which it is a later step.
+            stops: result of `stops` at the beginning of the sequence of which this job is a step; None for a single job.
 
         Raises:
             MotionRefused: nothing is begun any more; somebody has asked for a stop meanwhile; or it may not wait, and

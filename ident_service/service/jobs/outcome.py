@@ -38,7 +38,7 @@ class Said:
 
     Attributes:
         answer: its one JSON object; empty where it had none.
-        log: the end of what it said.
+        log: the end of its output.
     """
 
     answer: dict[str, Any] = field(default_factory=dict)
@@ -68,7 +68,7 @@ def outcome(heard: Said, exit_code: int | None, asked_to_end: str) -> Outcome:
     """Return the outcome of a process that has ended.
 
     Args:
-        heard: what it said.
+        heard: its output.
         exit_code: as its parent saw it, None where it had another one.
         asked_to_end: why it was asked to, empty if it was not.
     """
@@ -91,7 +91,7 @@ def interrupted(heard: Said, folder: Path | None, *, moves: bool) -> str:
     """Describe a job that was running when the service died, from its output and its folder.
 
     Args:
-        heard: what its process said, until now.
+        heard: output of its process so far.
         folder: that it made, if any.
         moves: whether it is about a motion.
     """

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 _MOTION = re.compile(r"motion of (?P<seconds>[0-9.e+-]+) s")
 _SEARCH = re.compile(r"about (?P<seconds>[0-9]+) s left")
-_SURE = 0.99  # a job that still runs is never told to be done
+_SURE = 0.99  # a job that still runs is never shown as completed
 
 
 @dataclass(frozen=True)
@@ -16,8 +16,8 @@ class Progress:
 
     Attributes:
         phase: its last words.
-        fraction: from 0 to 1; None where nobody can know.
-        remaining: seconds, None where nobody can know.
+        fraction: from 0 to 1; None where it cannot be known.
+        remaining: time to the end [s]; None where it cannot be known.
     """
 
     phase: str
@@ -29,7 +29,7 @@ def progress(log: str, elapsed: float, typical: float | None) -> Progress:
     """Estimate the progress of a running job.
 
     Args:
-        log: what it said, its last lines at least.
+        log: output of the job, its last lines at least.
         elapsed: since it began [s].
         typical: what such jobs took [s]; None before there was one.
     """

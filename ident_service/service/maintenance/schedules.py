@@ -55,7 +55,7 @@ def add_schedule(db: Database, arm: str, when: When, by: str, now: float, motion
         motion: id; the description's own if None.
 
     Raises:
-        UsageError: not exactly one time or trigger, one that cannot be meant, too many, or a motion for another arm.
+        UsageError: not exactly one time or trigger, an invalid one, too many schedules, or a motion for another arm.
     """
     if sum((when.cron is not None, when.hours is not None, when.maintenance)) != 1:
         raise UsageError("give one of: cron, operating hours, maintenance")

@@ -39,7 +39,7 @@ class Step:
     Attributes:
         key: one of `TITLES`.
         title: for people.
-        words: what it does.
+        words: description of the step.
         state: `ended` where the whole ended badly.
         job: id of its job; None where it has none yet, or was done at a terminal.
     """

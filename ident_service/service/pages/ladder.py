@@ -54,8 +54,8 @@ class Step:
         title: for people.
         state: `next` for exactly one step, unless a job of a step is under way, which then is `busy`; `skipped` for a
             rehearsal that a run went without.
-        words: what is done of it.
-        link: page of what does it now.
+        words: result so far, in words.
+        link: page of the job that is doing it now.
     """
 
     key: str

@@ -65,7 +65,7 @@ class Database:
             self._migrate(migrations)
             self._checkpointed()
             self._reader.execute("PRAGMA query_only = ON")
-            for ending in ("", "-wal", "-shm"):  # of folders that older software made
+            for ending in ("", "-wal", "-shm"):  # older software made these files with other modes
                 with suppress(FileNotFoundError):
                     self._path.with_name(self._path.name + ending).chmod(0o600)
         except sqlite3.Error as error:

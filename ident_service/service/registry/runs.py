@@ -17,9 +17,9 @@ from ident_service.service.registry.database import Database, Row
 
 RUNS, REPORTS, EXPORTS = "runs", "reports", "exports"
 TAKEN_AWAY: Final = frozenset({"export", "figures", "payload", "correct"})
-"""Kinds of jobs whose files are made for somebody to fetch: a folder of its own below `EXPORTS`."""
+"""Kinds of jobs that make files for download, in a folder of their own below `EXPORTS`."""
 UPLOAD, COLUMNS = "upload.json", "columns.yaml"
-"""Files of a run that is an uploaded recording: what was announced, and how its columns are laid out."""
+"""Files of a run that is an uploaded recording: its announcement, and the layout of its columns."""
 KILLED: Final = "killed"
 _ARM, _PARAMETERS, _SCORE = "arm.json", "parameters.json", "score.json"
 _MOST_BYTES = 64 * 2**20

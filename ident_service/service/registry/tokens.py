@@ -90,7 +90,7 @@ def begin_session(db: Database, session: str, secret: str, until: float, most: i
 
     Args:
         db: the registry.
-        session: its word, of which the digest is kept.
+        session: random word of the session's cookie, of which only the digest is stored.
         secret: the token that it was exchanged for; it ends with that, too.
         until: when it ends [s since 1970 in UTC].
         most: how many there may be.
