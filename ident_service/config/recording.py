@@ -246,7 +246,7 @@ def _joints(columns: Mapping[str, Column]) -> int:
 def units_of_other_joints(form: RecordingFormat, joints: Sequence[str], revolute: Sequence[bool]) -> Iterator[str]:
     """Yield columns with a unit of a prismatic joint where the arm's joint is revolute, or vice versa.
 
-    What was measured at a motor turns whatever the joint does, and is not looked at.
+    Quantities measured at a motor are rotary whatever the joint is, and are not checked.
 
     Args:
         form: the section `recording`.

@@ -91,7 +91,7 @@ Geometry = dict[str, Annotated[tuple[Capsule, ...], Field(min_length=1)]]
 class Supply(Section):
     """Power supply of the drives.
 
-    Drive k draws `torque velocity + loss torque^2`, never less than nothing: what a braking drive feeds back is not
+    Drive k draws `max(0, torque velocity + loss torque^2)` [W]: power that a braking drive feeds back is not
     counted on.
 
     Attributes:

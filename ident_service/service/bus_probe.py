@@ -88,7 +88,7 @@ def bus_probe(
 
     Raises:
         UsageError: the arm's driver has no bus.
-        DriverError: a bus that is in use, by another host too, or that cannot be had or is lost.
+        DriverError: a bus is in use, by another host too, cannot be opened, or is lost.
     """
     driver = config.driver
     if not isinstance(driver, CanopenDriver):

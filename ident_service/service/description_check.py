@@ -30,7 +30,7 @@ class CheckedDescription:
         budget: of its buses; None for an arm without CANopen drives.
         gains: how stable they are; None for an arm that can be identified but not moved.
         after_stop: what follows a stop, or why nothing may move; None likewise.
-        warnings: what is allowed and probably not meant, in words.
+        warnings: what is allowed but probably a mistake, in words.
     """
 
     model: ArmModel
@@ -53,8 +53,8 @@ def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescri
         upload: whether somebody has sent it (`load_arm`).
 
     Raises:
-        ConfigError: every mistake in it, each with line and column; a mechanism that cannot be computed with, and a bus
-            budget that does not fit, are one.
+        ConfigError: every mistake in it, each with line and column; also for an invalid mechanism, and for a bus
+            budget that does not fit.
     """
     config = load_arm(arm, upload=upload)
     try:

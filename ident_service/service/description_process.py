@@ -26,7 +26,7 @@ def judge_apart(path: Path) -> dict[str, Any]:
 
     Raises:
         ConfigError: its mistakes.
-        ModelError: whatever else stands against it, or it takes too long or breaks what computes with it.
+        ModelError: any other error of it, or judging it takes too long or crashes.
     """
     try:
         answer = ask_process("ident_service.service.description_process", path, _DEADLINE)

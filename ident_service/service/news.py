@@ -39,7 +39,7 @@ class News:
     Attributes:
         kind: `happened`, `arm` or `job`.
         data: JSON.
-        number: of what has happened; None for how something stands.
+        number: of a `happened` event; None for a state.
     """
 
     kind: str
@@ -96,7 +96,7 @@ class Watch:
         """Return the position of a new viewer.
 
         Args:
-            after: number of the last line that was seen; what has happened from now on is told if None.
+            after: number of the last line that was seen; only events from now on are reported if None.
         """
         last = last_line(self._db)
         # A number beyond the last line comes from another state folder, or from before a restore.

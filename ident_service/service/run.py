@@ -43,8 +43,8 @@ class Ran:
     """Result of a run.
 
     Attributes:
-        folder: with everything that was kept.
-        report: what the motion process said: state, cycles, peaks, timing.
+        folder: of the run, with recording, report and manifest.
+        report: of the motion process: state, cycles, peaks, timing.
     """
 
     folder: Path

@@ -43,7 +43,7 @@ def require_whole(state: Path) -> None:
     """Refuse a state folder in which a restore was interrupted.
 
     Raises:
-        UsageError: it did.
+        UsageError: a restore was interrupted.
     """
     if (state / RESTORING).exists():
         raise UsageError(f"{state}: a restore broke off here; run `ident restore` again, it loses nothing")

@@ -94,7 +94,7 @@ class LiveJobs:
 
         Args:
             live: the job.
-            stops: result of `stops` at the beginning of the sequence of which this job is a step; None for a single job.
+            stops: result of `stops` when the sequence began of which this job is a step; None for a single job.
 
         Raises:
             MotionRefused: nothing is begun any more; somebody has asked for a stop meanwhile; or it may not wait, and

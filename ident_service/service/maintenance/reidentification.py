@@ -47,7 +47,7 @@ def require_comparable(state: Path, config: ArmConfig, number: int | None = None
 
     Raises:
         UsageError: nothing was accepted; or the mechanism in the description is another one since.
-        ParameterError: what was accepted was changed on the disk.
+        ParameterError: the accepted set was changed on the disk.
     """
     act, folder = accepted_set(state, config.name, number)
     before = arm_from_json(folder / ARM)
@@ -171,7 +171,7 @@ class Reidentifications:
         """Begin a re-identification by queuing its first step.
 
         Args:
-            wanted: what.
+            wanted: the request.
             by: the name of a token, or `service`; it keeps the lease of the motions, unless unattended.
 
         Raises:

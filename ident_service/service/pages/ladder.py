@@ -92,7 +92,7 @@ def ladder(db: Database, state: Path, config: ArmConfig) -> Ladder:
     """Return the commissioning steps of an arm with their states.
 
     Raises:
-        ParameterError: what was accepted cannot be read.
+        ParameterError: the accepted set cannot be read.
     """
     arm = config.name
     row = db.row("SELECT added FROM arms WHERE name = ?", arm)

@@ -115,7 +115,7 @@ def enter_key(db: Database, who: str, key: str, request: str, job: str) -> None:
         db: the registry.
         who: name of the token.
         key: of the request; each token has its own.
-        request: SHA-256 of what was asked.
+        request: SHA-256 of the request's content.
         job: id.
 
     Raises:
