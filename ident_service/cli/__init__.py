@@ -1,7 +1,6 @@
-"""The command `ident`: parses words, calls the same functions as the Python API, prints, and picks an exit code.
+"""Run the command `ident`: parse its arguments, call the functions of the Python API, print, return an exit code.
 
-One file per group of verbs: `GROUPS` lists them, each registers its verbs with `add(verbs)` and answers them. Boundary:
-nothing is computed here, and large libraries load only when a verb needs them.
+One file per group of verbs: `GROUPS` lists them, each registers its verbs with `add(verbs)` and answers them.
 """
 
 from __future__ import annotations
@@ -102,7 +101,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         verb: Callable[[argparse.Namespace], Answer] = arguments.verb if arguments.server is None else remote.remotely
         code, text, document = _asked(verb, arguments)
     except KeyboardInterrupt:
-        # Asked twice, or by somebody who does not want to wait for what could be saved.
+        # A second Ctrl-C: the person does not want to wait for what could be saved.
         print_to_person("ident: interrupted\n")
         if arguments.json:
             print_error("Interrupted", "interrupted", FAILED)
@@ -181,7 +180,7 @@ def _refused(arguments: argparse.Namespace, error: OSError) -> IdentError | None
 
 
 def parser() -> Parser:
-    """All verbs and their words."""
+    """Build the argument parser with all verbs and their arguments."""
     top = Parser(
         prog="ident",
         description="Commission a robot arm: excite it, record it, identify parameters a real body could have.",
@@ -194,7 +193,7 @@ def parser() -> Parser:
 
 
 def _own_packages_only() -> None:
-    """`drivers` and `sim_backend` are common words: refuse to run somebody else's from the working directory."""
+    """Refuse to run if `drivers` or `sim_backend`, common names, would come from the working directory."""
     home = Path(__file__).resolve().parents[2]
     for name in ("drivers", "sim_backend"):
         spec = importlib.util.find_spec(name)

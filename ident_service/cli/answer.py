@@ -1,8 +1,7 @@
-"""What a verb answers, where it may write, and how it is interrupted; shared by all groups of verbs.
+"""Print the answers of verbs, find the state folder, and handle interrupts, for all groups of verbs.
 
-Exit codes: 0 done and good; 1 failed; 2 usage or configuration; 3 done, but the verdict is no; 4 stopped by a fault;
-5 nothing was judged, because a person is needed first.
-Boundary: nothing here knows a single verb.
+Exit codes: 0 done and good; 1 failed; 2 usage or configuration; 3 done, but the verdict is no; 4 stopped by a fault; 5
+nothing was judged, because a person is needed first.
 """
 
 from __future__ import annotations
@@ -24,11 +23,11 @@ from ident_service.errors import UsageError
 DONE, FAILED, USAGE, VERDICT_NO, FAULTED, PERSON_NEEDED = 0, 1, 2, 3, 4, 5
 
 Answer = tuple[int, str, dict[str, Any]]
-"""Exit code; what a person reads, with its last line break; what a program reads."""
+"""Exit code; text for a person, with its last line break; JSON values for a program."""
 
 
 def print_answer(arguments: argparse.Namespace, code: int, text: str, document: dict[str, Any]) -> None:
-    """Print a verb's answer as it was asked for: words, or one JSON object."""
+    """Print a verb's answer as text, or with `--json` as one JSON object."""
     if arguments.json:
         _print_json({**document, "exit_code": code})
     else:
@@ -41,7 +40,7 @@ def print_error(kind: str, message: str, code: int, more: Mapping[str, object] |
 
 
 def print_to_person(text: str) -> None:
-    """Print on stderr, as far as anybody reads it."""
+    """Print on stderr; a closed stderr is ignored."""
     write(sys.stderr, text)
 
 
@@ -50,14 +49,14 @@ def _print_json(document: dict[str, Any]) -> None:
 
 
 def tell(arguments: argparse.Namespace, line: str) -> None:
-    """Say what is going on while a verb works; words that cannot be said end nothing, least of all a motion."""
+    """Print a progress line while a verb works; a line that cannot be written ends nothing, least of all a motion."""
     # With --json, stdout belongs to the one object.
     with suppress(OSError):
         write(sys.stderr if arguments.json else sys.stdout, line + "\n")
 
 
 def write(stream: TextIO | None, text: str) -> None:
-    """Write and flush; a reader that has gone, or a terminal, changes neither what is done nor the exit code.
+    """Write and flush text; a reader that has gone, or a closed terminal, changes neither the work nor the exit code.
 
     Raises:
         OSError: anything else that keeps text from its place, a full disk for example.
@@ -74,14 +73,14 @@ def write(stream: TextIO | None, text: str) -> None:
 
 
 def discard(stream: TextIO) -> None:
-    """Lead a stream nowhere: what its buffer holds would fail again when the interpreter ends, with exit code 120."""
+    """Redirect a stream to the null device, so that its unwritten buffer cannot fail at exit with exit code 120."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, stream.fileno())
     os.close(nowhere)
 
 
 def state_folder(arguments: argparse.Namespace) -> Path:
-    """Where results go that were given no folder: `--state`, `$IDENT_STATE`, or the user's XDG state folder.
+    """Return the state folder, where results go by default: `--state`, `$IDENT_STATE`, or the user's XDG folder.
 
     Raises:
         UsageError: `--state` without a name.
@@ -97,7 +96,7 @@ def state_folder(arguments: argparse.Namespace) -> Path:
 
 
 def own_state_folder(arguments: argparse.Namespace) -> Path:
-    """The same for a verb that writes there: what it writes is its owner's alone.
+    """Return the state folder for a verb that writes there, after checking that only its owner can enter it.
 
     Raises:
         UsageError: as `state_folder`; or others can enter it.
@@ -110,7 +109,7 @@ def own_state_folder(arguments: argparse.Namespace) -> Path:
 
 
 def hear_interrupts() -> None:
-    """Hear Ctrl-C although the shell that started this process told it not to.
+    """Make Ctrl-C interrupt this process although the shell that started it had SIGINT ignored.
 
     A shell without job control, that of a script for example, starts `command &` with SIGINT ignored (POSIX.1-2017,
     Shell Command Language, 2.11), and what is started inherits it. Where hangups are ignored too, `nohup` was asked for
@@ -125,7 +124,7 @@ def hear_interrupts() -> None:
 
 @contextmanager
 def interrupting() -> Iterator[None]:
-    """A polite kill, or a terminal that closes, is an interrupt like Ctrl-C: who has an arm lets go of it first."""
+    """Raise KeyboardInterrupt on SIGTERM and SIGHUP too, so that whoever drives an arm releases it first."""
     numbers = [signal.SIGINT, signal.SIGTERM]
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
         numbers.append(signal.SIGHUP)
@@ -138,7 +137,7 @@ def interrupting() -> Iterator[None]:
 
 
 class StopOnSignal:
-    """Ctrl-C, a polite kill or a terminal that closes asks for a controlled stop.
+    """Request a controlled stop on Ctrl-C, SIGTERM or a terminal that closes (SIGHUP).
 
     A second Ctrl-C interrupts and a second kill does what it did before. A second hangup does nothing: shells send it
     besides the kernel. Where hangups are ignored (`nohup`), they stay so; Ctrl-C is heard everywhere.
@@ -148,7 +147,7 @@ class StopOnSignal:
         self._asked = False
 
     def requested(self) -> bool:
-        """Has a stop been asked for?"""
+        """Return whether a stop has been requested."""
         return self._asked
 
     def __enter__(self) -> None:

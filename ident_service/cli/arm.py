@@ -1,6 +1,7 @@
-"""Verbs at an arm: `watch`, `check`, `rehearse`, `run`; from any terminal `stop`, `pause`, `resume`, `finish` and more.
+"""Register and run the verbs at an arm: `watch`, `check`, `rehearse`, `run`, `stop`, `pause`, `resume` and more.
 
-Boundary: words to requests, results to words; the work is `service/run.py`. `stop` asks for nothing, waits for nobody.
+`stop` needs no lease, no ticket and no confirmation, and waits for no other process. Running motions is
+`service/run.py`.
 """
 
 from __future__ import annotations
@@ -36,12 +37,12 @@ if TYPE_CHECKING:
     from ident_service.excitation.excitation import Excitation
 
 _REHEARSAL = 0.2
-_PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")  # a name that stays below its folder
+_PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")  # a name that cannot lead out of its folder
 _HELP_ARM = "description file, or the name of a shipped one"
 
 
 def add(verbs: Verbs) -> None:
-    """Register the verbs."""
+    """Register `watch`, `check`, `run`, `rehearse`, `stop`, `pause`, `resume`, `finish`, `supported` and `ack`."""
     sub = verbs.add("watch", _watch, "look at the arm without a torque or a change of state")
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("--seconds", type=seconds, default=2.0)
@@ -163,14 +164,14 @@ def _check(arguments: argparse.Namespace) -> Answer:
         raise UsageError(f"--confirm {arguments.confirm}: the arm is {config.name}; nothing has moved")
     arm, model = make_arm(config), arm_model(config)
     lease, stopping = asked_lease(arguments, config), StopOnSignal()
-    # Whoever looks for the one who moves the arm finds this process, and its stop ends the preflight. A person's Ctrl-C
-    # or a polite kill ends it at once, a question too, with torque off; a program's signal waits for the next cycle.
+    # `ident stop` finds this process as the one that moves the arm, and ends the preflight. A person's Ctrl-C
+    # or SIGTERM ends it at once, a question too, with torque off; a program's signal waits for the next cycle.
     with (
         interrupting() if lease is None else stopping,
         ControlFile.take(control_path(state, config.name), None, asked_ns=arguments.asked_ns) as controls,
     ):
         stoppable = StoppableArm(arm, until(lambda: controls.stop or stopping.requested(), lease))
-        # The rate is measured with what a run gets of the kernel.
+        # The rate is measured with the real-time settings of a run.
         with nullcontext() if arm.clock.lock_step else asked():
             seconds = 0.0 if arguments.rate_seconds is None else arguments.rate_seconds
             ticket = preflight(stoppable, model, motion, confirm=confirm, rate_seconds=seconds)
@@ -180,7 +181,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
 
 
 def _scale(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
-    """Have a person turn each joint by hand; nothing is energised."""
+    """Check the position scale of each joint that a person turns by hand; nothing is energised."""
     from ident_service.service.scale import FILE, check_scale
 
     if arguments.json or not sys.stdin.isatty():
@@ -193,7 +194,7 @@ def _scale(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
 
 
 def _run(arguments: argparse.Namespace, seconds: float | None = None) -> Answer:
-    """Run; `seconds` is how long the lease lasts that a program keeps, the ordinary time if None."""
+    """Run a motion; `seconds` is the duration of the lease [s] that a program renews, the default one if None."""
     from ident_service.config.load import load_arm
 
     config = load_arm(arguments.arm)
@@ -215,7 +216,7 @@ def _run(arguments: argparse.Namespace, seconds: float | None = None) -> Answer:
 
 
 def _target(arguments: argparse.Namespace) -> Target | None:
-    """What is to be known before the run may end early."""
+    """Return the parameter accuracy at which the run may end early; None if the verb asks for none."""
     if getattr(arguments, "until", None) is None:
         if getattr(arguments, "chosen", None):
             raise UsageError("--parameter is what --until SHARE is about; give both")
@@ -318,7 +319,7 @@ def _ask(arguments: argparse.Namespace) -> Answer:
 
 
 def _require_typed(arguments: argparse.Namespace, name: str, follows: str) -> None:
-    """Take a person's word that an arm is supported: its name, typed now or as `--confirm`.
+    """Require a person's confirmation that an arm is supported: its name, typed now or as `--confirm`.
 
     Raises:
         UsageError: another word, or nobody to ask.
@@ -333,7 +334,7 @@ def _require_typed(arguments: argparse.Namespace, name: str, follows: str) -> No
 
 
 def _let_go(arguments: argparse.Namespace) -> Answer:
-    """Take the power from drives that hold an arm which nobody moves any more."""
+    """Switch off the drives that still hold an arm after the motion process has ended."""
     from ident_service.config.load import load_arm
     from ident_service.service.recover import let_go
 

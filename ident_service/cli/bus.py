@@ -1,8 +1,4 @@
-"""Verbs about fieldbuses: `bus load`, `bus scan`, `bus probe`.
-
-Boundary: words to requests, results to words; the work is `service/bus.py`, `service/bus_scan.py` and
-`service/bus_probe.py`.
-"""
+"""Register and run the verbs about fieldbuses: `bus load`, `bus scan`, `bus probe`."""
 
 from __future__ import annotations
 
@@ -15,7 +11,7 @@ _HELP_ARM = "description file, or the name of a shipped one"
 
 
 def add(verbs: Verbs) -> None:
-    """Register the verbs."""
+    """Register `bus load`, `bus scan` and `bus probe`."""
     bus = verbs.group("bus", "the fieldbus of an arm")
     load = bus.add("load", _load, "what every frame costs, and whether all of them fit (exit code 3: they do not)")
     load.add_argument("arm", metavar="ARM", help=_HELP_ARM)

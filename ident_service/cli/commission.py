@@ -1,7 +1,4 @@
-"""Verbs that make parameters: `simulate` the whole job, `identify` recordings.
-
-Boundary: words to requests, results to words; the work is `service/commission.py` and `service/identification.py`.
-"""
+"""Register and run the verbs that estimate parameters: `simulate` the whole job, `identify` recordings."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Verbs that hold results against each other, or against a recording: `compare`, `payload`.
-
-Boundary: words to calls, results to words; the work is `service/comparison.py` and `service/payload.py`.
-"""
+"""Register and run `compare` (results with results) and `payload` (results with recordings under load)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Verbs about arm descriptions: `new`, `config check`.
-
-Boundary: words to calls, results to words; the work is `service/new_description.py` and `description_check.py`.
-"""
+"""Register and run the verbs about arm descriptions: `new`, `config check`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Verbs about the daemon: `serve`, and `token` for who may talk to it.
-
-Boundary: words to calls, results to words; the work is `service/api` and `service/registry/tokens.py`.
-"""
+"""Register and run the verbs about the daemon: `serve`, and `token` for its access tokens."""
 
 from __future__ import annotations
 
@@ -19,7 +16,7 @@ _PORT = 8470
 
 
 def add(verbs: Verbs) -> None:
-    """Register the verbs."""
+    """Register `serve`, `token add`, `token list` and `token revoke`."""
     sub = verbs.add("serve", _serve, "the daemon: API, jobs and registry of the state folder")
     sub.add_argument("--host", default="127.0.0.1", help="address to listen on; any but a loopback one needs TLS")
     sub.add_argument("--port", type=_port, default=_PORT, help=f"default {_PORT}; 0 for any that is free")
@@ -89,7 +86,7 @@ def _list(arguments: argparse.Namespace) -> Answer:
 
 
 def token_line(row: Mapping[str, Any]) -> str:
-    """A token in the list."""
+    """Format one access token as a line of the list."""
     since = datetime.fromtimestamp(row["created"], UTC).strftime("%Y-%m-%d")
     return f"{row['name']:<24} {row['role']:<9} since {since}{', revoked' if row['revoked'] else ''}\n"
 

@@ -1,7 +1,4 @@
-"""The verb `emulate`: an arm's drives, emulated on its bus.
-
-Boundary: words to calls, results to words; the drives are `sim_backend/pucks`.
-"""
+"""Register and run the verb `emulate`: emulate an arm's drives on its bus."""
 
 from __future__ import annotations
 
@@ -77,8 +74,8 @@ def _emulate(arguments: argparse.Namespace) -> Answer:
 
 
 def _lines() -> Callable[[], str | None]:
-    """Lines of standard input, None while there is none; the end of it ends nothing."""
-    # No thread waits for them: one that reads standard input cannot be ended.
+    """Return a function that takes the next line of standard input, None while there is none or after its end."""
+    # Polled, not read by a thread: a thread that blocks on standard input cannot be ended.
     rest, ended = b"", sys.stdin is None or sys.stdin.closed
 
     def take() -> str | None:

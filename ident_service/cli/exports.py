@@ -1,7 +1,4 @@
-"""The verb `export`: identified parameters for other tools.
-
-Boundary: words to calls, results to words; the work is `results/export/`.
-"""
+"""Register and run the verb `export`: write identified parameters in the formats of other tools."""
 
 from __future__ import annotations
 

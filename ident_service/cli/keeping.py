@@ -1,7 +1,4 @@
-"""Verbs about results that stay: `accept`, `rollback`, `import`, `prune`, `backup`, `restore`.
-
-Boundary: words to calls, results to words; the work is `service/acceptance.py` and its neighbours.
-"""
+"""Register and run the verbs that keep results: `accept`, `rollback`, `import`, `prune`, `backup`, `restore`."""
 
 from __future__ import annotations
 
@@ -19,16 +16,16 @@ from ident_service.cli.words import Parser, Verbs, count
 from ident_service.errors import IdentError, UsageError
 
 _LONGEST_NAME = 80
-_PATIENCE = 1.0  # s that an act, which is done, waits for its line in the audit trail
+_PATIENCE = 1.0  # s to wait for a locked registry when an act that is done is entered in the audit trail
 
 
 def add_by(sub: Parser) -> None:
-    """The option of every verb that is a person's act."""
+    """Add the option `--by`, the name of the person who acts, to a verb."""
     sub.add_argument("--by", metavar="NAME", help="who says so (default: the name you are logged in with)")
 
 
 def at_terminal(arguments: argparse.Namespace) -> str:
-    """Who sits there, for the audit trail; no token has such a name.
+    """Return the audit-trail name `terminal:NAME` of the person at the terminal; no token has such a name.
 
     Raises:
         UsageError: no name.
@@ -46,13 +43,13 @@ def at_terminal(arguments: argparse.Namespace) -> str:
 
 
 def note_act(arguments: argparse.Namespace, what: str, about: str, **detail: Any) -> None:
-    """Enter what was done at a terminal in the audit trail, where the state folder has one.
+    """Enter an act that was done at a terminal in the audit trail, where the state folder has one.
 
     It has been done already: a registry that is kept or full changes nothing, and the line is entered later.
 
     Args:
         arguments: of the verb.
-        what: one word or two, as in the daemon's own lines.
+        what: one word or two that name the act, as in the daemon's own lines.
         about: name of the arm.
         detail: JSON values.
     """
@@ -81,7 +78,7 @@ def note_act(arguments: argparse.Namespace, what: str, about: str, **detail: Any
 
 
 def add(verbs: Verbs) -> None:
-    """Register the verbs."""
+    """Register `accept`, `rollback`, `import`, `prune`, `delete`, `backup` and `restore`."""
     sub = verbs.add("accept", _accept, "make a run's parameters the arm's current ones; earlier sets are kept")
     sub.add_argument("run", type=Path, metavar="RUN", help="folder that `identify` or `simulate` made")
     sub.add_argument("--note", required=True, help="why; for whoever reads it years later")
@@ -216,13 +213,13 @@ def _restore(arguments: argparse.Namespace) -> Answer:
 
 
 def deleted_text(document: Mapping[str, Any]) -> str:
-    """Tell what was deleted, and what becomes of what referred to it."""
+    """Format the answer of `delete`: what was deleted, and what becomes of the entries that referred to it."""
     lines = "".join(f"  {one['kind']} {one['id']}: {one['becomes']}\n" for one in document["dependents"])
     return f"{document['deleted']}: deleted\n{lines}"
 
 
 def pruned_text(document: Mapping[str, Any]) -> str:
-    """What `prune` did, or would do."""
+    """Format the answer of `prune`: the recordings that were deleted, or would be."""
     gone, verb = document["recordings"], "deleted" if document["deleted"] else "would be deleted; say --yes"
     text = "".join(f"{one['run']}/{one['name']}  {one['bytes'] / 2**20:.1f} MiB\n" for one in gone)
     text += "".join(f"left alone: {line}\n" for line in document["left_alone"])

@@ -1,8 +1,7 @@
-"""A lease that a program keeps over standard input: every line renews it, `stop` asks for a controlled stop.
+"""Keep the lease of a motion that a program renews over standard input: every line renews it, `stop` stops.
 
 It lapses when no line has come for as long as it lasts, and for ever when the input ends, as it does with the program
 at its other end however that dies. Keys do the same for a person (`moving.py`).
-Boundary: bytes and a clock; who asks, and what a stop is, is elsewhere.
 """
 
 from __future__ import annotations
@@ -23,17 +22,18 @@ if TYPE_CHECKING:
     from ident_service.config.schema import ArmConfig
 
 STOP = b"stop"
-_MOST = 4096  # bytes that a line may have; a longer one is none
+_MOST = 4096  # bytes that are kept of a line; a longer one never counts as `stop`
 
 
 class StdinLease:
-    """Whether whoever asked for motion is still there and wants it to go on.
+    """Lease of a motion that the requesting program renews with lines on standard input.
 
-    What waited while nobody looked counts as fresh: this program was busy then, and not the other one silent.
+    Lines that queued up while this program did not read count as fresh: the program was busy then, and the other side
+    not silent.
     """
 
     def __init__(self, seconds: float, fd: int, now: Callable[[], float] = time.monotonic) -> None:
-        """Begin with the first look.
+        """Create the lease; its time begins with the first call of `over`.
 
         Args:
             seconds: how long it lasts after a line [s].
@@ -46,19 +46,19 @@ class StdinLease:
         self._over = ""
 
     def over(self) -> bool:
-        """Whether the arm is to stop; once it is, it stays so."""
+        """Return whether the lease has ended, so that the arm is to stop; once ended, it stays so."""
         if not self._over:
             self._look()
         return bool(self._over)
 
     @property
     def reason(self) -> str:
-        """Why it is over, in words; empty while it is not."""
+        """Return why the lease has ended, in words; empty while it has not."""
         return self._over
 
     def _look(self) -> None:
         renewed, now = self._renewed, self._now()
-        # What comes in faster than it can be read must not keep us here.
+        # A bounded number of reads: input that arrives faster than it is read must not block the caller.
         for _ in range(16):
             if not select.select([self._fd], [], [], 0.0)[0]:
                 break
@@ -79,7 +79,7 @@ class StdinLease:
 
 
 def add_lease(sub: Parser, *, confirm: bool = True) -> None:
-    """The options of every verb that a program may have an arm moved by; `confirm` unless it has its own."""
+    """Add the lease options to a verb that moves an arm; `--confirm` too, unless the verb has its own."""
     if confirm:
         sub.add_argument("--confirm", metavar="NAME", help="with --server: the arm's name, typed by a person")
     sub.add_argument(
@@ -90,7 +90,7 @@ def add_lease(sub: Parser, *, confirm: bool = True) -> None:
 
 
 def asked_lease(arguments: argparse.Namespace, config: ArmConfig, seconds: float | None = None) -> StdinLease | None:
-    """The lease, where one was asked for.
+    """Return the lease over standard input if the verb's arguments ask for one, else None.
 
     In virtual time silence does not count, as between our own processes (`motion/lifeline.py`); the end of the input
     and the word `stop` do.
@@ -115,5 +115,5 @@ def asked_lease(arguments: argparse.Namespace, config: ArmConfig, seconds: float
 
 
 def until(stopping: Callable[[], bool], lease: StdinLease | None) -> Callable[[], bool]:
-    """A stop for either reason."""
+    """Return a function that tells whether a stop was requested or the lease has ended."""
     return stopping if lease is None else lambda: stopping() or lease.over()

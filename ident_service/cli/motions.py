@@ -1,7 +1,4 @@
-"""Verbs about motions: `design` finds one, `preview` tells what it asks of the arm and what it will teach.
-
-Boundary: words to requests, results to words; the work is `service/design.py` and `service/preview.py`.
-"""
+"""Register and run the verbs about motions: `design` searches for one, `preview` predicts its demands and use."""
 
 from __future__ import annotations
 
@@ -51,7 +48,7 @@ def add(verbs: Verbs) -> None:
     sub.add_argument("--seed", type=seed, default=0, help="of the random starts")
     searched = "time for the search, not the motion's length (default: 60, or none with --starts)"
     sub.add_argument("--search-time", type=seconds, metavar="SECONDS", help=searched)
-    sub.add_argument("--seconds", dest="search_time", type=seconds, help=argparse.SUPPRESS)  # its name before
+    sub.add_argument("--seconds", dest="search_time", type=seconds, help=argparse.SUPPRESS)  # former name
     sub.add_argument("--starts", type=count, metavar="N", help="random starts; the result is then the same every time")
     sub.add_argument("--workers", type=workers, default=2, metavar="N", help="processes")
     sub.add_argument("--resume", type=Path, metavar="FILE", help="search.json of an earlier design, to go on from")
@@ -136,7 +133,7 @@ def _design(arguments: argparse.Namespace) -> Answer:
 
 
 def _progress(arguments: argparse.Namespace) -> Callable[[Progress], None]:
-    """A line that is written over on a terminal, and every ten seconds a new one elsewhere."""
+    """Return a callback that shows search progress: one line rewritten on a terminal, else a new one every 10 s."""
     stream = sys.stderr
     last = [-10.0]
 

@@ -1,7 +1,4 @@
-"""What all verbs that move an arm share: the ticket, the run folder, the words at the end; and a key that must be held.
-
-Boundary: words and files; the run is `service/run.py`.
-"""
+"""Move an arm for all verbs that do: ticket, run folder, final report; and the key that must be held."""
 
 from __future__ import annotations
 
@@ -37,7 +34,7 @@ _MOST_MISSED = 10  # parameters that are printed
 
 
 class HeldKey:
-    """The space bar of a terminal, which must be held while the arm moves.
+    """Hold-to-run key: the space bar of a terminal, which must be held while the arm moves.
 
     The first press begins nothing; repeats do. Released, it stays so: a key that is touched again by accident must not
     move an arm that somebody may have stepped up to. So it is a new rehearsal that moves it again, and not a pause.
@@ -47,30 +44,30 @@ class HeldKey:
     """
 
     def __init__(self, fd: int, now: Callable[[], float] = time.monotonic) -> None:
-        """`fd` is a terminal's; `now` [s] is only for differences."""
+        """Take the file descriptor of a terminal, and a clock [s] that is used for differences only."""
         self._fd, self._now = fd, now
-        self._last = self._looked = -1.0  # when the key came last, and when that was looked at
+        self._last = self._looked = -1.0  # times of the last key and of the last look
         self._row = 0
         self._held = self._released = False
 
     def __enter__(self) -> HeldKey:
-        """Take keys one by one and unseen; Ctrl-C goes on working."""
+        """Read keys one by one without echo; Ctrl-C goes on working."""
         self._before = termios.tcgetattr(self._fd)
         tty.setcbreak(self._fd)
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Give the terminal back as it was, without the keys that nobody has read."""
+        """Restore the terminal's settings, and drop the keys that nobody has read."""
         with suppress(termios.error):  # a terminal that is gone needs nothing
             termios.tcsetattr(self._fd, termios.TCSAFLUSH, self._before)
 
     def held(self) -> bool:
-        """Whether it has begun to repeat, and has not been released since."""
+        """Return whether the key has begun to repeat, and has not been released since."""
         self._look()
         return self._held and not self._released
 
     def released(self) -> bool:
-        """Whether it was held and is not any more, or nobody can ever press it."""
+        """Return whether the key was held and then released, or the terminal is gone."""
         self._look()
         return self._released
 
@@ -92,8 +89,8 @@ class HeldKey:
             self._released = True
         elif KEY in keys:
             self._row = self._row + 1 if gap <= RELEASED else 1
-            # Keys that waited while nobody looked, because this program was busy, are taken for fresh ones: that is one
-            # more `RELEASED` at most, and while the arm moves the lease ends what nobody looks after.
+            # Keys that queued up while this program was busy count as fresh: that costs at most one
+            # more `RELEASED`, and while the arm moves, the lease lapses if this program stays busy.
             self._released = self._held and gap > RELEASED and not unwatched
             self._held = self._held or self._row >= REPEATS
             self._last = now
@@ -101,7 +98,7 @@ class HeldKey:
             self._released = self._held and gap > RELEASED
 
     def _keys(self) -> bytes | None:
-        """What was pressed since the last look; None where the terminal is gone."""
+        """Return the bytes typed since the last call; None where the terminal is gone."""
         if not select.select([self._fd], [], [], 0.0)[0]:
             return b""
         try:
@@ -121,17 +118,17 @@ def moved(
     stop_requested: Callable[[], bool],
     until: Target | None = None,
 ) -> Answer:
-    """Move the arm and say how it went.
+    """Move the arm along a motion or to a destination, and return the answer of the verb.
 
     Args:
         arguments: with `out`, `state` and `can_log`.
         config: of the arm.
         motion: or destination.
-        sentence: what is about to happen, told with the folder.
+        sentence: description of the motion, printed with the folder before it begins.
         speed: share of the motion's own.
         lease: how long the arm moves on when this process is gone [s]; None for the ordinary one.
         stop_requested: asked several times per lease.
-        until: what is to be known, whereupon the run is finished early.
+        until: accuracy target at which the run is finished early.
 
     Raises:
         As `service.run.run_motion`; MotionRefused without a ticket.
@@ -176,13 +173,13 @@ def moved(
         raise
     files = _files(folder)
     text = _report_text(ran.report) + f"files: {folder}\n" + "".join(f"  {name}\n" for name in files)
-    # A stop that was asked for is no fault, but what was to be done is not.
+    # A requested stop is no fault, but the motion was not completed.
     code = DONE if ran.report["state"] == "done" else FAILED
     return code, text, {"folder": str(folder), "files": files, "report": ran.report}
 
 
 def _add_facts(error: IdentError, folder: Path, state: Path, arm: str) -> None:
-    """What a run that ended in an error has left: faults, the first first, and files."""
+    """Add to an error the faults, recording and files that the run has left."""
     from ident_service.service.arm_state import fault_file
 
     faults = [{"code": code, "cause": cause} for code, cause in fault_file(state, arm).latched().items()]
@@ -199,14 +196,14 @@ def _files(folder: Path) -> list[str]:
 
 
 def add_can_log(sub: Parser) -> None:
-    """The option of every verb that moves an arm."""
+    """Add the option `--can-log` to a verb that moves an arm."""
     sub.add_argument(
         "--can-log", action="store_true", help="keep every frame of the fieldbus in can.log, beside the recording"
     )
 
 
 def require_terminal(arguments: argparse.Namespace) -> int:
-    """The descriptor of the terminal whose key is to be held.
+    """Return the file descriptor of the terminal whose key is to be held.
 
     Raises:
         UsageError: a program is asking, or standard input is no terminal.
@@ -220,7 +217,7 @@ def require_terminal(arguments: argparse.Namespace) -> int:
 
 
 def _target_text(until: dict[str, Any]) -> str:
-    """Say whether what a run was for is known, and what is not."""
+    """Format whether the accuracy target of a run was reached, and which parameters missed it."""
     if (missed := until["missed"]) is None:
         return ""
     if not missed:

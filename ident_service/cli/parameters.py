@@ -1,7 +1,4 @@
-"""Verbs about parameters that are there already: `base`, `feasible`, `correct`, `verify`.
-
-Boundary: words to calls, results to words; the work is `model/base.py`, `service/parameters.py`, `service/verify.py`.
-"""
+"""Register and run the verbs about existing parameters: `base`, `feasible`, `correct`, `verify`."""
 
 from __future__ import annotations
 

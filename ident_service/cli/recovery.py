@@ -1,7 +1,4 @@
-"""Verbs that make an arm usable again: `recover` says what is in the way, `home` leads it home, or takes it for home.
-
-Boundary: words to requests, results to words; the work is `service/recover.py`, `service/zeroing.py`, `service/run.py`.
-"""
+"""Register and run `recover` (report what prevents motion) and `home` (move home, or set the encoders' zero)."""
 
 from __future__ import annotations
 
@@ -29,7 +26,7 @@ _HELP_OUT = "run folder; must not exist (default: below the state folder)"
 
 
 def add(verbs: Verbs) -> None:
-    """Register the verbs."""
+    """Register `home` and `recover`."""
     sub = verbs.add("home", _home, "lead the arm home, at a tenth of its velocity limits at most")
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument(
@@ -66,7 +63,7 @@ def _home(arguments: argparse.Namespace) -> Answer:
 
 
 def _lead_held(arguments: argparse.Namespace, config: ArmConfig) -> Answer | None:
-    """Have the process that holds the arm after a stop lead it home; None where none does."""
+    """Have the process that holds the arm after a stop move it home; return None where no process holds it."""
     from ident_service.cli.answer import state_folder
     from ident_service.cli.keeping import note_act
     from ident_service.motion.control_file import ControlFile, in_use
@@ -78,7 +75,7 @@ def _lead_held(arguments: argparse.Namespace, config: ArmConfig) -> Answer | Non
         return None
     with ControlFile.reach(path) as controls:
         if not controls.waiting:
-            return None  # it moves, and the motion process refuses this one
+            return None  # the arm is moving; starting another motion is refused later
     if arguments.out is not None or arguments.can_log:
         raise UsageError("--out and --can-log are for a motion of its own; the run that holds the arm has its folder")
     lease, stopping = asked_lease(arguments, config), StopOnSignal()

@@ -1,7 +1,6 @@
-"""`reidentify`: is it still the arm that was accepted? Preflight, run, identification, comparison, one after another.
+"""Register and run `reidentify`: preflight, run, identification, comparison with the accepted set.
 
-Each step is the verb that the daemon has a job do, in this process; `service/maintenance` keeps what came of it.
-Boundary: words to verbs, a verdict to words and an exit code.
+Each step runs in this process the verb that the daemon runs as a job; `service/maintenance` stores the result.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ EXIT_CODES: Final = {
 
 
 def add(verbs: Verbs) -> None:
-    """Register the verb."""
+    """Register `reidentify`."""
     sub = verbs.add(
         "reidentify", _reidentify, "check, run, identify, compare with the accepted set (exit code 3: changed)"
     )
@@ -93,17 +92,17 @@ def _reidentify(arguments: argparse.Namespace) -> Answer:
 
 
 def _step(arguments: argparse.Namespace, *words: str) -> Answer:
-    """One verb, as if it had been typed; its errors are ours."""
+    """Run another verb as if it had been typed; a refused motion becomes `PersonNeeded`."""
     from ident_service.cli import parser
 
     always = ["--state", str(state_folder(arguments)), *(["--json"] if arguments.json else [])]
     parsed = parser().parse_args([*words, *always])
-    parsed.asked_ns = arguments.asked_ns  # a stop that comes between two of them, too, is of this
+    parsed.asked_ns = arguments.asked_ns  # a stop between two steps counts for the whole sequence
     tell(arguments, f"-- {words[0]}")
     try:
         answer: Answer = parsed.verb(parsed)
     except MotionRefused as error:
-        # Not the verdict that the arm has changed, which is told by the same exit code elsewhere.
+        # Distinguished from the verdict that the arm has changed, whose exit code a refused motion has otherwise.
         refused = PersonNeeded(str(error))
         refused.facts = error.facts
         raise refused from None

@@ -1,6 +1,6 @@
-"""`ident VERB ... --server URL`: the same verb, done by a daemon; and `jobs`, which looks at what daemons do.
+"""Run verbs on a daemon (`ident VERB ... --server URL`), and `jobs`, which lists, shows and cancels its jobs.
 
-Boundary: words to requests by id, answers to words. Files that are named here are read here and uploaded.
+Local files that the arguments name are read here and uploaded.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _MOVE = ("check", "run", "home", "leave_limit", "zero")  # a rehearsal has its o
 
 
 def add(verbs: Verbs) -> None:
-    """Register `jobs`."""
+    """Register `jobs list`, `jobs show`, `jobs watch` and `jobs cancel`."""
     jobs = verbs.group("jobs", "what a daemon does; without --server, that of the state folder")
     sub = jobs.add("list", _with_client(_list), "jobs, the newest first")
     sub.add_argument("--most", type=count, default=20, metavar="N")
@@ -47,7 +47,7 @@ def add(verbs: Verbs) -> None:
 
 
 def remotely(arguments: argparse.Namespace) -> Answer:
-    """Have a daemon do what the words say.
+    """Run a verb on the daemon that `--server` names.
 
     Raises:
         UsageError: a verb that no daemon does.
@@ -66,7 +66,7 @@ def remotely(arguments: argparse.Namespace) -> Answer:
 
 
 def table() -> tuple[dict[str, Verb], dict[str, frozenset[str]]]:
-    """Every verb that a daemon does, and what of it a daemon is told."""
+    """Return the verbs that a daemon can do, and for each the arguments that are sent to it."""
     from ident_service.cli import remote_maintenance, remote_results, remote_watching
 
     groups = (remote_maintenance, remote_results, remote_watching)
@@ -78,7 +78,7 @@ def table() -> tuple[dict[str, Verb], dict[str, frozenset[str]]]:
 
 
 def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
-    """The verb with a connection of its own."""
+    """Return the verb as a function that opens and closes its own connection."""
 
     def connected(arguments: argparse.Namespace) -> Answer:
         with closing(_client(arguments)) as client:
@@ -92,7 +92,7 @@ def asked(make: Callable[[IdentClient, argparse.Namespace], dict[str, Any]], end
 
     Args:
         make: the job of the words; its kind is the verb if it does not say another.
-        ended: what becomes of the answer.
+        ended: turns the job's answer into the verb's.
     """
 
     def verb(client: IdentClient, arguments: argparse.Namespace) -> Answer:
@@ -199,7 +199,7 @@ def _stop(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 
 
 def _known(client: IdentClient, arm: str) -> bool:
-    """Ask whether there is such an arm, once the stop has been sent; yes, where the question is not answered."""
+    """Return whether the daemon knows the arm, once the stop has been sent; True if it does not answer."""
     try:
         client.get(f"/api/v1/arms/{word_of_address(arm)}")
     except UnknownId:
@@ -211,7 +211,7 @@ def _known(client: IdentClient, arm: str) -> bool:
 
 def _ask(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     answer = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/{arguments.word}")
-    if not answer["reached"]:  # the exit code is that of the same words at the machine itself
+    if not answer["reached"]:  # the same exit code as for this verb on the daemon's machine
         raise UsageError(f"{arguments.arm}: nobody moves an arm of this name there")
     return DONE, f"{arguments.arm}: {arguments.word} asked\n", answer
 
@@ -278,7 +278,7 @@ LOCAL_ONLY: dict[str, str] = {
 }
 """Verbs that no daemon does, each with the reason."""
 
-# What of each verb a daemon is told; anything else that is given must not be lost in silence.
+# Arguments that are sent to a daemon, by verb; any other argument that is given is an error.
 _OURS = frozenset({"json", "state", "server", "verb", "word", "words", "asks", "asked_ns"})
 _MOTION = frozenset({"arm", "motion", "confirm"})
 _CARRIED: dict[str, frozenset[str]] = {
@@ -299,7 +299,7 @@ _CARRIED: dict[str, frozenset[str]] = {
 def _followed(
     client: IdentClient, arguments: argparse.Namespace, job: dict[str, Any], *, moves: bool, ours: bool = True
 ) -> Answer:
-    """Wait for the end of a job, its lease renewed meanwhile; Ctrl-C has it end, if it is ours."""
+    """Wait for the end of a job and renew its lease; on Ctrl-C cancel it, if this command began it."""
     stopping, cancelled, phase = StopOnSignal(), False, ""
     with stopping:
         while job["state"] in LIVE:
@@ -323,7 +323,7 @@ def _followed(
 
 
 def renew(client: IdentClient, job: str) -> None:
-    """Renew it. A lease that cannot be renewed any more is that of a motion that ends, which the next look tells."""
+    """Renew the lease of a job; ignore that it has none any more, which is so when its motion ends."""
     try:
         client.post(f"/api/v1/jobs/{job}/lease")
     except IdentError as error:
@@ -332,7 +332,7 @@ def renew(client: IdentClient, job: str) -> None:
 
 
 def told(client: IdentClient, job: dict[str, Any], code: int | None = None) -> Answer:
-    """How a job stands and what its command answered; the exit code is that of its state unless one is given."""
+    """Return a job's state and its command's answer, with the exit code of that state unless one is given."""
     result = client.get(f"/api/v1/jobs/{job['id']}/result")["answer"]
     lines = [f"job {job['id']}: {job['kind']}, {job['state']}"]
     lines += [job["detail"]] if job["detail"] else []
@@ -342,7 +342,7 @@ def told(client: IdentClient, job: dict[str, Any], code: int | None = None) -> A
 
 
 def typed(arguments: argparse.Namespace) -> str:
-    """The arm's name as a person types it, now or as `--confirm`.
+    """Return the arm's name as a person types it, now or as `--confirm`.
 
     Raises:
         UsageError: another word, or nobody to ask.
@@ -358,14 +358,14 @@ def typed(arguments: argparse.Namespace) -> str:
 
 
 def confirmation(client: IdentClient, arguments: argparse.Namespace, name: str | None = None) -> dict[str, str]:
-    """The arm's name as a person types it, or has typed it already, and a challenge for it."""
+    """Return the confirmation of a motion: the arm's name as a person typed it, and a fresh challenge."""
     name = typed(arguments) if name is None else name
     word = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/challenge")["challenge"]
     return {"name": name, "challenge": word}
 
 
 def motion_id(client: IdentClient, arm: str, motion: Path | None) -> str | None:
-    """The id of a motion; a file is uploaded first."""
+    """Return the id of a motion; upload it first if it is a file."""
     if motion is None:
         return None
     if motion.is_file():

@@ -1,7 +1,4 @@
-"""`--server` for what is checked again: `schedule`, `maintenance`, `due`, `alarm`, `reidentify`, done by a daemon.
-
-Boundary: words to requests by id, answers to words; the connection is `remote.py`.
-"""
+"""Run `schedule`, `maintenance`, `due`, `alarm` and `reidentify` on a daemon (`--server`)."""
 
 from __future__ import annotations
 
@@ -86,7 +83,7 @@ def _ack(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 
 
 def _reidentify(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    """Begin it, keep its lease, and tell its end; Ctrl-C has the arm stopped."""
+    """Begin a re-identification, renew its lease until it ends, and report it; Ctrl-C stops the arm."""
     body = {
         "arm": arguments.arm,
         "motion": motion_id(client, arguments.arm, arguments.motion),
@@ -133,4 +130,4 @@ CARRIED: dict[str, frozenset[str]] = {
     **dict.fromkeys(("due dismiss", "alarm ack"), _NUMBER | {"note"}),
     "reidentify": frozenset({"arm", "motion", "confirm"}),
 }
-"""What of each verb a daemon is told; who asks is the token's name, and not `--by`."""
+"""Arguments that are sent to a daemon, by verb; the audit trail has the token's name there, and not `--by`."""

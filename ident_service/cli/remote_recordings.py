@@ -1,4 +1,4 @@
-"""Recordings of `--server`: named by the daemon's ids, or files that are here and are uploaded."""
+"""Name recordings for a daemon (`--server`): by its ids, or by uploading local files."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 def recording(
     client: IdentClient, arguments: argparse.Namespace, arm: str, path: Path, columns: Path | None = None
 ) -> dict[str, Any]:
-    """Name a recording as the daemon does; a file that is here is uploaded first.
+    """Return a recording as jobs name it; upload it first if it is a local file.
 
     Args:
         client: of the daemon.
@@ -72,7 +72,7 @@ def word_of_address(word: str) -> str:
 
 
 def file_of(path: Path) -> Path:
-    """Return what `FILE@START:END` names without the range, unless a file is called that."""
+    """Return the file that `FILE@START:END` names, without the range, unless a file has that whole name."""
     from ident_service.record.files import split_range
 
     return path if path.is_file() else Path(split_range(str(path))[0])
@@ -86,7 +86,7 @@ def _text(path: Path) -> str:
 
 
 def _percent(arguments: argparse.Namespace, file: Path) -> Callable[[float], None]:
-    """Tell at each tenth how much of a file has arrived."""
+    """Return a callback that prints at each tenth how much of a file has been uploaded."""
     told = [-1]
 
     def share(arrived: float) -> None:

@@ -1,7 +1,6 @@
-"""`--server` for what is there already: results, parameters, acceptances, tokens, done or told by a daemon.
+"""Run the verbs about results, parameters, acceptances and tokens on a daemon (`--server`).
 
 Files that a daemon makes stay there, as exports; `--out` fetches them.
-Boundary: words to requests by id, answers to words; the connection is `remote.py`.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
     from ident_service.client import IdentClient
 
 _API = "/api/v1"
-_PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,119}")  # a name that stays in the folder it is written into
+_PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,119}")  # a name that cannot lead out of the folder it is written into
 
 
 def _run(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -39,7 +38,7 @@ def _figures(client: IdentClient, arguments: argparse.Namespace) -> dict[str, An
 
 
 def _of_file(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-    """The verbs that take a parameter file here take the run that holds one there."""
+    """Return the request of a verb that takes a parameter file locally, and on a daemon the run that holds one."""
     given = {name: getattr(arguments, name, None) for name in ("feasible_set", "arm", "metric")}
     return {"run": word_of_address(str(arguments.file)), **given}
 
@@ -59,7 +58,7 @@ def _payload(client: IdentClient, arguments: argparse.Namespace) -> dict[str, An
 
 
 def _fetched(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
-    """Bring the files of an export here, where `--out` was given."""
+    """Download the files of an export, where `--out` was given."""
     from ident_service.results.files import appearing_folder
 
     code, text, document = in_words(client, arguments, answer)
@@ -80,7 +79,7 @@ def _fetched(client: IdentClient, arguments: argparse.Namespace, answer: Answer)
 
 
 def _corrected(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
-    """The one file of a correction, under the name that it was given here."""
+    """Download the corrected parameters to the file that `--out` names."""
     code, text, document = in_words(client, arguments, answer)
     if code != DONE:
         return code, text, document
@@ -175,4 +174,4 @@ CARRIED: dict[str, frozenset[str]] = {
     "token list": frozenset(),
     "token revoke": frozenset({"name"}),
 }
-"""What of each verb a daemon is told; who asks is the token's name, and not `--by`."""
+"""Arguments that are sent to a daemon, by verb; the audit trail has the token's name there, and not `--by`."""

@@ -1,8 +1,7 @@
-"""`--server` at an arm: looking at it, its bus and its description; and the rehearsal, whose key is held here.
+"""Run the verbs at an arm, its bus and description on a daemon (`--server`), and the hold-to-run rehearsal.
 
 The key is held at this terminal and the arm is elsewhere: every look at the key that finds it held renews the lease,
 one that finds it released asks for the stop. Whatever dies between the two, the lease lapses and the arm stops.
-Boundary: words to requests by id, answers to words; the connection is `remote.py`.
 """
 
 from __future__ import annotations
@@ -113,7 +112,7 @@ def _words(value: Any) -> Iterator[str]:
 
 
 def _config_check(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    """A file is sent and judged there; any other word is the name of an arm that the daemon knows."""
+    """Send a description file to be checked; any other word is the name of an arm that the daemon knows."""
     path = Path(arguments.file)
     if not path.is_file():
         return asked(_known, in_words)(client, arguments)
@@ -137,7 +136,7 @@ def _rehearse(client: IdentClient, arguments: argparse.Namespace) -> Answer:
             tell(arguments, f"release it: the arm stops ({RELEASED:g} s without the key), and the rehearsal is over")
             if not key.wait(stopping.requested):
                 raise MotionRefused("nobody held the key; nothing has moved")
-        # Only now, so that the challenge is fresh however long nobody held the key.
+        # Asked for only now, so that the challenge is fresh however long it took until the key was held.
         body = {"job": job, "confirm": confirmation(client, arguments, name)}
         made = client.post(f"{_API}/jobs", body)
         tell(arguments, f"job {made['id']}")
@@ -159,7 +158,7 @@ def held(
             cancelled = True
             try:
                 client.post(f"{_API}/jobs/{job['id']}/cancel")
-            except UsageError:  # it has ended meanwhile, which the next look tells
+            except UsageError:  # the job has ended meanwhile, as the next poll will tell
                 looked = 0.0
         elif not cancelled:
             renew(client, job["id"])
@@ -195,4 +194,4 @@ CARRIED: dict[str, frozenset[str]] = {
     "config check": frozenset({"file"}),
     "rehearse": frozenset({"arm", "motion", "confirm", "speed", "no_key"}),
 }
-"""What of each verb a daemon is told."""
+"""Arguments that are sent to a daemon, by verb."""

@@ -1,7 +1,4 @@
-"""What a job's command answered, a JSON object, as words for a person: `--server` has no other text of it.
-
-Boundary: JSON values to lines.
-"""
+"""Format the JSON answer of a job's command as lines for a person; with `--server` there is no other text."""
 
 from __future__ import annotations
 
@@ -16,11 +13,11 @@ from ident_service.errors import IdentError
 if TYPE_CHECKING:
     from ident_service.client import IdentClient
 
-_OURS = frozenset({"exit_code", "error"})  # which the job's own lines tell
+_OURS = frozenset({"exit_code", "error"})  # keys that the job's own lines show already
 
 
 def in_words(_: IdentClient, __: argparse.Namespace, answer: Answer) -> Answer:
-    """The answer with what its command said, where a person looks for it."""
+    """Return the answer with its command's JSON object appended to the text as lines."""
     code, text, document = answer
     said = {key: value for key, value in document["answer"].items() if key not in _OURS}
     text += _ticket(said.pop("ticket", None))
@@ -41,7 +38,7 @@ def _ticket(values: Any) -> str:
 
 
 def lines_of(value: Any, indent: str = "") -> Iterator[str]:
-    """One line per value; what stands within something is moved in by two.
+    """Yield one line per value of a JSON object or list; nested values are indented by two spaces.
 
     Lists of plain values, and plain values, stand on the line of their name.
     """

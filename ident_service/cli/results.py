@@ -1,7 +1,4 @@
-"""Verbs about results that are there: `report` makes the page again, `figures` writes its drawings as files.
-
-Boundary: words to calls, results to words; the work is `results/report_files.py` and `results/figure_files.py`.
-"""
+"""Register and run `report`, which makes the report page again, and `figures`, which writes its drawings as files."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
-"""Verbs about an arm that is checked again: `schedule`, `maintenance`, `due`, `alarm`.
+"""Register and run the verbs about scheduled re-identification: `schedule`, `maintenance`, `due`, `alarm`.
 
 They work on the registry of the state folder; a daemon that serves it sees what they wrote within a second.
-Boundary: words to calls, results to words; the work is `service/maintenance`.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def add(verbs: Verbs) -> None:
-    """Register the verbs."""
+    """Register `schedule`, `maintenance`, `due` and `alarm`."""
     group = verbs.group("schedule", "when an arm is to be re-identified")
     sub = group.add("add", _add, "add a time or a trigger; what is due asks for a person")
     _arm(sub)
@@ -57,7 +56,7 @@ def add(verbs: Verbs) -> None:
 
 
 def registry(arguments: argparse.Namespace) -> Database:
-    """The registry of the state folder; it knows the shipped arms."""
+    """Open the registry of the state folder, with the shipped arms entered."""
     from ident_service.service.registry.arms import know_shipped
     from ident_service.service.registry.database import Database
 
@@ -179,19 +178,19 @@ def _shown(row: Row) -> dict[str, Any]:
 
 
 def schedule_line(row: Row) -> str:
-    """One schedule, for a person."""
+    """Format one schedule as a line for a person."""
     when = f"cron {row['cron']} (UTC)" if row["cron"] else str(row["trigger"])
     coming = f", next {_day(row['next'])}" if row["cron"] and row["enabled"] else ""
     return f"{row['id']:>4}  {row['arm']:<16} {when}{coming}{'' if row['enabled'] else ', disabled'}\n"
 
 
 def due_line(row: Row) -> str:
-    """One thing that is due, for a person."""
+    """Format one re-identification that is due as a line for a person."""
     return f"due {row['id']}: {row['arm']} since {_day(row['at'])}: {row['cause']}; `ident reidentify {row['arm']}`\n"
 
 
 def alarm_lines(rows: Sequence[Row]) -> str:
-    """Alarms, for a person."""
+    """Format drift alarms as lines for a person."""
     lines = [f"{row['id']:>4}  {row['arm']:<16} {_day(row['at'])}  {row['what']}\n" for row in rows]
     return "".join(lines) or "no alarm stands\n"
 

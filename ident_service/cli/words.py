@@ -1,7 +1,4 @@
-"""How words become arguments: the parser, the list that groups of verbs add theirs to, and the kinds of number.
-
-Boundary: words in, `argparse.Namespace` out; nothing is printed but usage, and no file is looked at.
-"""
+"""Parse command-line arguments: the parser, the list of verbs, and converters for numbers."""
 
 from __future__ import annotations
 
@@ -20,7 +17,7 @@ FEASIBLE_SETS = ("pseudo_inertia", "inertia")
 
 
 class WrongWords(SystemExit):
-    """No verb understands the words; usage and reason are on stderr already."""
+    """Exit after arguments that no verb understands; usage and reason are on stderr already."""
 
     def __init__(self, message: str) -> None:
         self.message = message
@@ -28,10 +25,10 @@ class WrongWords(SystemExit):
 
 
 class Parser(argparse.ArgumentParser):
-    """Ends with `WrongWords` where argparse only exits, so that the reason can be printed as JSON too."""
+    """Argument parser that raises `WrongWords` where argparse only exits, so that JSON can state the reason too."""
 
     def error(self, message: str) -> NoReturn:
-        """Say on stderr what argparse says, and end.
+        """Print argparse's usage and message on stderr, and raise.
 
         Raises:
             WrongWords: always.
@@ -42,18 +39,18 @@ class Parser(argparse.ArgumentParser):
 
 
 def asks_for_json(words: Sequence[str]) -> bool:
-    """Is `--json`, or what argparse takes for it, among words that could not be parsed?"""
+    """Return whether `--json`, or a prefix that argparse accepts for it, is among unparsed arguments."""
     options = takewhile(lambda word: word != "--", words)
     return any(len(word) > 2 and "--json".startswith(word) for word in options)
 
 
 @dataclass(frozen=True)
 class Verbs:
-    """Where a group of verbs adds its own.
+    """List of verbs that a group registers its own with.
 
     Attributes:
         commands: argparse's list of verbs.
-        common: what every verb understands.
+        common: parser of the options that every verb has.
         prefix: the words before the verb, with a space behind them.
     """
 
@@ -63,7 +60,7 @@ class Verbs:
 
     @classmethod
     def of(cls, parser: Parser) -> Verbs:
-        """The list of a command that has verbs and nothing else."""
+        """Create the list of verbs of a command."""
         common = Parser(add_help=False)
         common.add_argument("--json", action="store_true", help="one JSON object on stdout, nothing else")
         common.add_argument("--server", metavar="URL", help="have a daemon there do it; things are named by its ids")
@@ -87,13 +84,13 @@ class Verbs:
         return parser
 
     def group(self, name: str, text: str) -> Verbs:
-        """Add a word that verbs of its own follow, as in `ident config check`."""
+        """Add a word that is followed by verbs of its own, as in `ident config check`."""
         parser = self.commands.add_parser(name, help=text)
         return Verbs(parser.add_subparsers(required=True, metavar="VERB"), self.common, f"{self.prefix}{name} ")
 
 
 def columns_files(given: Sequence[str]) -> tuple[Path | None, dict[Path, Path]]:
-    """Tell the columns file of all recordings from those of one each.
+    """Separate the columns file of all recordings from those of single recordings.
 
     Args:
         given: values of `--columns`, `FILE` or `RECORDING=FILE`.
@@ -122,21 +119,21 @@ def columns_files(given: Sequence[str]) -> tuple[Path | None, dict[Path, Path]]:
 
 
 def seed(text: str) -> int:
-    """A whole number, 0 or more."""
+    """Parse a whole number, 0 or more."""
     if not text.isdigit():
         raise argparse.ArgumentTypeError("a seed is a whole number, 0 or more")
     return int(text)
 
 
 def replicates(text: str) -> int:
-    """A number of replicates of which a spread can be taken, or 0."""
+    """Parse a number of bootstrap replicates: 0, or at least the 2 that a spread needs."""
     if not text.isdigit() or int(text) == 1:
         raise argparse.ArgumentTypeError("a number of replicates is 0, or 2 and more")
     return int(text)
 
 
 def weight(text: str) -> float:
-    """A finite number, 0 or more."""
+    """Parse a finite number, 0 or more."""
     try:
         value = float(text)
     except ValueError:
@@ -147,31 +144,31 @@ def weight(text: str) -> float:
 
 
 def count(text: str) -> int:
-    """A whole number, 1 or more."""
+    """Parse a whole number, 1 or more."""
     if not text.isdigit() or int(text) == 0:
         raise argparse.ArgumentTypeError("a whole number, 1 or more, is needed")
     return int(text)
 
 
 def workers(text: str) -> int:
-    """A number of processes that a machine may bear."""
+    """Parse a number of processes, from 1 to 64."""
     if not text.isdigit() or not 1 <= int(text) <= 64:
         raise argparse.ArgumentTypeError("a number of processes is from 1 to 64")
     return int(text)
 
 
 def frequency(text: str) -> float:
-    """A finite number of Hz above 0."""
+    """Parse a finite number above 0 [Hz]."""
     return _positive(text, "a frequency is a number of Hz above 0")
 
 
 def seconds(text: str) -> float:
-    """A finite number of seconds above 0."""
+    """Parse a finite number above 0 [s]."""
     return _positive(text, "a number of seconds above 0 is needed")
 
 
 def share(text: str) -> float:
-    """From 0 to below 1."""
+    """Parse a number from 0 to below 1."""
     value = weight(text)
     if not value < 1.0:
         raise argparse.ArgumentTypeError("a share is a number from 0 to below 1")
@@ -179,7 +176,7 @@ def share(text: str) -> float:
 
 
 def speed(text: str) -> float:
-    """Above 0 and at most 1."""
+    """Parse a number above 0 and at most 1."""
     value = _positive(text, "a speed is a share above 0 and at most 1")
     if value > 1.0:
         raise argparse.ArgumentTypeError("a speed is a share above 0 and at most 1")
@@ -197,7 +194,7 @@ def _positive(text: str, otherwise: str) -> float:
 
 
 def delay(text: str) -> float | str:
-    """Seconds, or a word that asks for them to be found."""
+    """Parse a delay [s] of less than 1 s in magnitude, or `estimate` or `choose`."""
     if text in ("estimate", "choose"):
         return text
     try:

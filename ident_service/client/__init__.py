@@ -1,4 +1,4 @@
-"""Drive a daemon from a program: what `ident ... --server URL` uses, too.
+"""Drive a daemon from a program; `ident ... --server URL` uses this client, too.
 
 ```
 from ident_service.client import IdentClient

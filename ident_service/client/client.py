@@ -1,4 +1,4 @@
-"""Arms, jobs and motions of a daemon."""
+"""Talk to a daemon about its arms, jobs, runs and motions."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _AGAIN, _TRIES = 1.0, 30  # s between tries to take up a stream, and how many
 
 
 class IdentClient(Connection):
-    """A daemon, asked over HTTP; used from any thread."""
+    """HTTP client of a daemon; may be used from any thread."""
 
     def arms(self) -> list[dict[str, Any]]:
         """List the arms (`ArmLine`)."""
         return list(self.pages(f"{_API}/arms"))
 
     def arm(self, name: str) -> RemoteArm:
-        """Name an arm; nothing is asked yet."""
+        """Return a handle on an arm; no request is sent yet."""
         return RemoteArm(self, name)
 
     def add_arm(self, description: str, files: Mapping[str, str] = NOTHING, *, replace: bool = False) -> RemoteArm:
@@ -50,18 +50,18 @@ class IdentClient(Connection):
         return self.arm(str(self.post(f"{_API}/arms", body)["name"]))
 
     def stop(self) -> dict[str, list[str]]:
-        """Bring all arms to a controlled stop; names of the arms and jobs that were reached."""
+        """Bring all arms to a controlled stop; return the names of the arms and jobs that were reached."""
         found: dict[str, list[str]] = self.post(f"{_API}/stop")
         return found
 
     def job(self, job: str) -> Job:
-        """Look at a job."""
+        """Return the present state of a job."""
         return _job(self.get(f"{_API}/jobs/{_word(job)}"))
 
     def events(self, *, after: int | None = None, samples: bool = False) -> Iterator[Event]:
-        """Yield what happens to all arms and jobs, for as long as it is asked for.
+        """Yield the events of all arms and jobs until the caller stops iterating.
 
-        A line that is cut is taken up again where it broke off, so nothing that happens is missed or told twice.
+        After a broken connection the stream is resumed where it broke off, so that no event is missed or repeated.
 
         Args:
             after: number of the last event that was seen, by this program or an earlier one; from now on if None.
@@ -98,7 +98,7 @@ class IdentClient(Connection):
     def upload(
         self, arm: str, file: Path, *, columns: str = "", tell: Callable[[float], None] = lambda _: None
     ) -> dict[str, str]:
-        """Upload a recording of one's own in pieces; what is there already, of an earlier try, is not sent again.
+        """Upload a recording in pieces; pieces that arrived in an earlier attempt are not sent again.
 
         Args:
             arm: name of the arm that it is of.
@@ -170,26 +170,26 @@ class IdentClient(Connection):
         return seen
 
     def answer(self, job: str) -> dict[str, Any]:
-        """Read what the command of a job answered: its one JSON object."""
+        """Return the JSON object that the command of a job answered."""
         found: dict[str, Any] = self.get(f"{_API}/jobs/{_word(job)}/result")["answer"]
         return found
 
 
 class RemoteArm:
-    """An arm of a daemon."""
+    """Handle on one arm of a daemon."""
 
     def __init__(self, client: IdentClient, name: str) -> None:
-        """Nothing is asked yet."""
+        """Create the handle; no request is sent yet."""
         self.client, self.name = client, name
         self._path = f"{_API}/arms/{_word(name)}"
 
     def document(self) -> dict[str, Any]:
-        """Read its description, faults and accepted set (`ArmAnswer`)."""
+        """Return the arm's description, faults and accepted set (`ArmAnswer`)."""
         found: dict[str, Any] = self.client.get(self._path)
         return found
 
     def stop(self) -> dict[str, list[str]]:
-        """Bring it to a controlled stop."""
+        """Bring the arm to a controlled stop."""
         found: dict[str, list[str]] = self.client.post(f"{self._path}/stop")
         return found
 
@@ -214,13 +214,13 @@ class RemoteArm:
         self.client.post(f"{self._path}/faults/{_word(code)}/ack")
 
     def check(self, motion: str | None = None, *, confirm: str) -> RemoteMotion:
-        """Begin the preflight of a motion; as `run`."""
+        """Begin the preflight of a motion; arguments and errors as `run`."""
         return self._begin("check", confirm, motion=motion)
 
     def run(
         self, motion: str | None = None, *, confirm: str, speed: float | None = None, until: float | None = None
     ) -> RemoteMotion:
-        """Begin a run; it is to be used in a `with` block, which keeps its lease.
+        """Begin a run; use it in a `with` block, which renews its lease.
 
         Args:
             motion: id; the description's own if None.
@@ -235,15 +235,15 @@ class RemoteArm:
         return self._begin("run", confirm, motion=motion, speed=speed, until=share)
 
     def home(self, *, confirm: str) -> RemoteMotion:
-        """Begin the way home; as `run`."""
+        """Begin the motion to the home position; arguments and errors as `run`."""
         return self._begin("home", confirm)
 
     def finish(self) -> None:
-        """End a run early, in order."""
+        """End a run early by its regular end: the rest of the motion is left out."""
         self.client.post(f"{self._path}/finish")
 
     def accept(self, run: str, note: str) -> dict[str, Any]:
-        """Accept the parameters of a run, by a person's word (`AcceptanceAnswer`)."""
+        """Accept the parameters of a run on a person's decision (`AcceptanceAnswer`)."""
         found: dict[str, Any] = self.client.post(f"{self._path}/acceptances", {"run": run, "note": note})
         return found
 
@@ -275,7 +275,7 @@ class RemoteMotion:
 
     @property
     def ended(self) -> Job:
-        """The job after its end.
+        """Return the job after its end.
 
         Raises:
             UsageError: the block has not been left.
@@ -302,7 +302,7 @@ class RemoteMotion:
         self.client.post(f"{_API}/jobs/{self.id}/cancel")
 
     def __enter__(self) -> Self:
-        """Renew the lease from now on."""
+        """Begin to renew the lease."""
         self._thread.start()
         return self
 
@@ -337,7 +337,7 @@ class RemoteMotion:
             try:
                 self.client.post(f"{_API}/jobs/{self.id}/lease")
             except MotionRefused:
-                return  # nothing to renew any more: the job ends, or has
+                return  # the lease cannot be renewed any more: the job is ending or has ended
             except IdentError:
                 continue  # the next one may come through; if none does, the arm stops
 

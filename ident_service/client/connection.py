@@ -1,4 +1,4 @@
-"""Requests to a daemon, and its refusals as our errors."""
+"""Send HTTP requests to a daemon, and raise its refusals as errors of `ident_service.errors`."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ _PLACE: Final = re.compile(r"(?P<path>.+?):(?P<line>\d+):(?P<column>\d+): (?P<me
 
 
 class Connection:
-    """A daemon, asked over HTTP for JSON; used from any thread."""
+    """HTTP connection to a daemon for JSON requests; may be used from any thread."""
 
     def __init__(self, url: str, token: str | None = None, *, patience: float = _PATIENCE) -> None:
-        """Nothing is asked yet.
+        """Create the connection; no request is sent yet.
 
         Args:
             url: of the daemon: scheme, host and port.
-            token: to say who asks; None for a stop on the daemon's own machine.
+            token: that authenticates the caller; None for a stop on the daemon's own machine.
             patience: how long to wait for an answer [s].
 
         Raises:
@@ -74,7 +74,7 @@ class Connection:
         self.url = url.rstrip("/")
         headers = {} if token is None else {"Authorization": f"Bearer {token}"}
         secure = parts.scheme == "https"
-        # The other one, which nobody is checked by, is made faster.
+        # Without TLS no certificate is checked; an empty context is quicker to make.
         verify = ssl.create_default_context() if secure else ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         try:
             self._http = httpx.Client(
@@ -84,15 +84,15 @@ class Connection:
             raise UsageError(f"{url}: cannot be asked with this token: {error}") from None
 
     def get(self, path: str) -> Any:
-        """Read what stands at a path; raises as `ask`."""
+        """Send GET for a path and return the answer; raises as `ask`."""
         return self.ask("GET", path)
 
     def post(self, path: str, body: Any = None, headers: Mapping[str, str] = NOTHING) -> Any:
-        """Have something done; raises as `ask`."""
+        """Send POST to a path and return the answer; raises as `ask`."""
         return self.ask("POST", path, {} if body is None else body, headers)
 
     def delete(self, path: str) -> Any:
-        """Delete what stands at a path; raises as `ask`."""
+        """Send DELETE for a path and return the answer; raises as `ask`."""
         return self.ask("DELETE", path)
 
     def ask(
@@ -119,14 +119,14 @@ class Connection:
         return self._document(*self._exchange(method, path, body, headers, patience)[:2])
 
     def pages(self, path: str) -> Iterator[Any]:
-        """Read a list to its end, page by page; raises as `ask`."""
+        """Yield the entries of a paged list, page by page to its end; raises as `ask`."""
         after: str | None = path
         while after is not None:
             status, content, after = self._exchange("GET", after, None, {})
             yield from self._document(status, content)
 
     def content(self, path: str) -> bytes:
-        """Download a file.
+        """Download a file and return its bytes.
 
         Raises:
             IdentError: as `ask`; or it is larger than what is taken.
@@ -139,21 +139,21 @@ class Connection:
         return content
 
     def close(self) -> None:
-        """End the connections."""
+        """Close the HTTP connections."""
         self._http.close()
 
     def __enter__(self) -> Self:
-        """Nothing more to do."""
+        """Return the connection itself."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close."""
+        """Close the connection."""
         self.close()
 
     def stream(self, path: str, headers: Mapping[str, str] = NOTHING) -> Iterator[tuple[str, int | None, Any]]:
-        """Read server-sent events until the daemon ends them: kind, number and JSON value.
+        """Yield server-sent events as (kind, number, JSON value) until the daemon ends the stream.
 
         An event without a number has None, one without a value is told for its number alone.
 
@@ -182,12 +182,12 @@ class Connection:
     def _exchange(
         self, method: str, path: str, body: Any, headers: Mapping[str, str], patience: float | None = None
     ) -> tuple[int, bytes, str | None]:
-        """Return status, body (as far as it is taken) and the path of the next page."""
+        """Return status, body (at most `_MOST` bytes) and the path of the next page."""
         raw = isinstance(body, bytes)
         content = body if raw or body is None else json.dumps(body).encode()
         kind = {} if body is None else {"Content-Type": f"application/{'octet-stream' if raw else 'json'}"}
         sent, timeout = {**headers, **kind}, httpx.USE_CLIENT_DEFAULT if patience is None else patience
-        # A connection that lay idle may have been closed meanwhile: what only reads is asked again.
+        # An idle connection may have been closed meanwhile: requests that only read are sent again.
         for last in (False, True) if method == "GET" else (True,):
             try:
                 with self._http.stream(method, path, content=content, headers=sent, timeout=timeout) as answer:

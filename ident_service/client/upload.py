@@ -1,4 +1,4 @@
-"""Upload a recording to a daemon in pieces, again and again from where it broke off."""
+"""Upload a recording to a daemon in pieces, and resume where the connection broke off."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _CHECKING = 600.0  # s for the hash of the longest recording
 
 
 def upload(connection: Connection, arm: str, file: Path, columns: str, tell: Callable[[float], None]) -> dict[str, str]:
-    """Upload a file; as `IdentClient.upload`."""
+    """Upload a file; arguments, result and errors as `IdentClient.upload`."""
     if not file.is_file():
         raise UsageError(f"{file}: no such file")
     try:
@@ -48,7 +48,7 @@ def _send(connection: Connection, stream: BinaryIO, seen: dict[str, Any], tell: 
         tell(seen["received"] / seen["bytes"])
         stream.seek(seen["received"])
         try:
-            if failed:  # what has arrived of the piece that was torn stays
+            if failed:  # the bytes of an interrupted piece that arrived are kept
                 time.sleep(_AGAIN)
                 before, seen = seen["received"], connection.get(path)
                 failed = 1 if seen["received"] > before else failed

@@ -1,1 +1,1 @@
-"""What an arm is, in configuration, and where each mistake in it stands."""
+"""Describe an arm in configuration files, and report each mistake in them with its place."""

@@ -1,7 +1,7 @@
-"""CANopen drives (CiA 301, CiA 402) on one or two buses, as an arm's description names them.
+"""Describe CANopen drives (CiA 301, CiA 402) on one or two buses in an arm's description.
 
-Boundary: data only. Frames and their cost on the wire are `drivers/canopen`, gears and couplings the section
-`transmission` of the arm, whose motors are the drives here, in this order.
+Frames and their cost on the wire are `drivers/canopen`, gears and couplings the section `transmission` of the arm,
+whose motors are the drives here, in this order.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from ident_service.config.watchdogs import (
 )
 
 InhibitTime = Annotated[float, Field(strict=True, ge=0.0001, le=6.5)]  # 100 us of 16 bits
-_KERNELS = ("raw", "socketcan")  # two ways to the same interfaces
-_DUMMIES = frozenset({2, 3, 5, 6})  # that fit the 16 bits of a torque, alone or twice
+_KERNELS = ("raw", "socketcan")  # two ways to access the same kernel interfaces
+_DUMMIES = frozenset({2, 3, 5, 6})  # data types of 8 or 16 bits, which fill the 16 bits of a torque
 _MOST_PER_MILLE = 32_767  # of a torque of 16 bits
 EmergencyCode = Annotated[int, Field(strict=True, ge=1, le=0xFFFF)]
 # CiA 301, table 26: CAN controller in error passive; no heartbeat, or no torque frame, of the host.
@@ -49,7 +49,7 @@ Unsigned32 = Annotated[int, Field(strict=True, ge=0, le=0xFFFF_FFFF)]
 
 
 class CanBus(Section):
-    """One bus, and who gives access to it.
+    """One CAN bus, and the interface that gives access to it.
 
     `interface` is python-can's name of an interface, or `raw` for a CAN socket of the kernel without python-can, or
     `lock_step` for emulated drives in this process and in virtual time. `options` go to python-can as they are.
@@ -63,7 +63,7 @@ class CanBus(Section):
 
     @property
     def medium(self) -> str:
-        """Return what `channel` is a name of: `kernel` for CAN interfaces of the kernel, else the interface."""
+        """Return the namespace of `channel`: `kernel` for CAN interfaces of the kernel, else the interface."""
         return "kernel" if self.interface in _KERNELS else self.interface
 
     @model_validator(mode="after")
@@ -74,7 +74,7 @@ class CanBus(Section):
 
 
 class DriveIdentity(Section):
-    """What object 1018h must answer; what is left out is logged but not compared."""
+    """Expected identity of a drive (object 1018h); fields left out are logged but not compared."""
 
     vendor: Unsigned32 | None = None
     product: Unsigned32 | None = None
@@ -89,7 +89,7 @@ class CanopenDrive(GrownSection):
     where the drive does not let it be set; a torque is sent in thousandths of it. `torque_scale` is how much torque
     the motor really gives for one that was asked for. `max_torque` [N m] and `max_speed` [turns per minute] of the
     motor are set as 6072h and 6080h. `notices` are the emergency codes by which this drive, as its manual says, only
-    informs: they are told and recorded, and stop nothing.
+    informs: they are reported and recorded, and stop nothing.
 
     `watchdog` says what makes this drive stop by itself when the host is gone: torque frames that stay away
     (`rpdo_timer`, 1400h:05), the host's heartbeat (1016h), SYNC, node guarding (100Ch, 100Dh), or something of its
@@ -154,7 +154,7 @@ class CanopenDrive(GrownSection):
 
 
 class Reactions(Section):
-    """Set how a drive reacts by itself: option codes of CiA 402, as its manual numbers them.
+    """Reactions of a drive to faults and stops: option codes of CiA 402, as its manual numbers them.
 
     Left out, `quick_stop` is 2, or 6 for an arm whose `control.after_stop` is `hold` or `lower`: it has no brakes, and
     stays in quick stop, where the drive goes on holding the motor.
@@ -168,14 +168,14 @@ class Reactions(Section):
 
 
 class StatusReports(Section):
-    """When a drive sends status word and torque (TPDO2) [s]: on change, not within `inhibit`, and every `period`."""
+    """Timing [s] of status word and torque (TPDO2): on change, not within `inhibit`, and every `period`."""
 
     period: Seconds = 0.1
     inhibit: InhibitTime = 0.05
 
 
 class Emulation(GrownSection):
-    """Describe the arm behind emulated drives: one with true parameters, noise and faults, as `SimulatedDriver` has.
+    """Simulated arm behind emulated drives, with true parameters, noise and faults, as `SimulatedDriver` has.
 
     A drive whose power stage is off leaves its motor coasting, or braked where `windings_off` is `shorted`. `eds` are
     data sheets of makers: the drives are emulated by them, one after the other and then from the first again.
@@ -192,7 +192,7 @@ class Emulation(GrownSection):
 
 
 class CanopenDriver(GrownSection):
-    """Drives in cyclic synchronous torque mode.
+    """CANopen drives in cyclic synchronous torque mode.
 
     `torque_frames` says whether up to four drives share a frame, by dummy mapping, or each has its own.
     `torque_deadline` [s] without torque frames makes a drive stop by itself (1400h:05). After `lost_cycles` in a row
@@ -227,11 +227,11 @@ class CanopenDriver(GrownSection):
 
     @property
     def watchdog(self) -> float:
-        """Return how long any drive goes on at most when the host is gone [s]."""
+        """Return the longest time that any drive keeps its torque after the host is gone [s]."""
         return max(self.watchdog_seconds(drive) for drive in self.drives)
 
     def watchdog_seconds(self, drive: CanopenDrive) -> float:
-        """Return how long a drive goes on when what its watchdog watches stays away [s]."""
+        """Return the time after which a drive's watchdog trips when its signal stays away [s]."""
         times = {
             "rpdo_timer": self.torque_deadline,
             "heartbeat": self.heartbeats.waits,
@@ -241,33 +241,33 @@ class CanopenDriver(GrownSection):
 
     @property
     def sheets(self) -> tuple[DataSheet, ...]:
-        """Return what the data sheet of each drive lists."""
+        """Return the data sheet (EDS) of each drive."""
         return tuple(data_sheet(self.sheet_file(number).text) for number in range(len(self.drives)))
 
     def sheet_file(self, number: int) -> TextFile:
-        """Return the data sheet of a drive: its own, or that of all."""
+        """Return the file of a drive's data sheet: its own, or the one common to all drives."""
         return self.drives[number].eds or self.eds
 
     @property
     def shares_by_sheet(self) -> bool:
-        """Return whether every drive's data sheet lets the torques of others be left out of a frame."""
+        """Return whether every drive's data sheet allows dummy mapping, so that drives can share torque frames."""
         return all(sheet.dummies & _DUMMIES for sheet in self.sheets)
 
     @property
     def families(self) -> tuple[Family, ...]:
-        """Return the families that the description brings; raises DriverError for a file that is none."""
+        """Return the drive families that `profiles` add; raises DriverError for a file that describes none."""
         return tuple(family_from(one.name, one.text) for one in self.profiles)
 
     @property
     def torque_reports(self) -> Literal["cyclic", "status", "none"]:
-        """With what drives report the torque that they measure."""
+        """Return whether drives report measured torque in every cycle, with their status, or not at all."""
         if self.measured_torque is not None:
             return self.measured_torque
         return "status" if all(sheet.has(0x6077) for sheet in self.sheets) else "none"
 
     @property
     def report_delay(self) -> float:
-        """How much later than it happens a drive may tell it [s]."""
+        """Return the largest delay with which a drive reports a change of its status [s]."""
         return self.status.inhibit
 
     @model_validator(mode="after")
@@ -292,7 +292,7 @@ class CanopenDriver(GrownSection):
 
 
 def motor_speeds(transmission: Transmission, velocities: Sequence[float | None]) -> list[float]:
-    """Return how fast each motor turns at most [turns per minute] when all joints move at their velocity limits.
+    """Return the motor speeds [turns per minute] when all joints move at their velocity limits.
 
     Args:
         transmission: the arm's.
@@ -308,7 +308,7 @@ def motor_speeds(transmission: Transmission, velocities: Sequence[float | None])
 def quick_stop_decelerations(
     driver: CanopenDriver, transmission: Transmission, accelerations: Sequence[float | None]
 ) -> list[int | None]:
-    """Return what 6085h of each drive is set to, None where nothing says it.
+    """Return the value of 6085h for each drive, None where nothing determines it.
 
     Args:
         driver: the section `driver`.

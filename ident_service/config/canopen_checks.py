@@ -1,4 +1,4 @@
-"""Hold a description's CANopen drives against its joints, gears and rate, and against the drives' data sheets."""
+"""Check a description's CANopen drives against its joints, gears, rate and the drives' data sheets."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ident_service.config.recording import Transmission
 from ident_service.config.watchdogs import ABORTING
 from ident_service.errors import DriverError
 
-_ASKED = 0.7  # of the guard time, after which a drive is asked again
+_ASKED = 0.7  # of the guard time, after which a drive is asked again; all must be asked within it
 _WHOLE_TURNS = 0.999  # 6080h holds whole turns per minute
 _LEAST_DEADLINE = 2.0  # cycles: one frame may be late
 
@@ -23,7 +23,7 @@ def disagreements(
     homeless: Sequence[str] = (),
     velocities: Sequence[float | None] = (),
 ) -> Iterator[tuple[tuple[str | int, ...], str]]:
-    """What does not fit an arm of these joints: the place in the arm's file, and what is wrong.
+    """Yield what is inconsistent with an arm of these joints: the place in the file, and the mistake.
 
     Args:
         driver: the section `driver`.

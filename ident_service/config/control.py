@@ -1,7 +1,4 @@
-"""The control loop of an arm as its description has it, and what follows when the arm has been stopped.
-
-Boundary: data only; what it does is `motion/`.
-"""
+"""Describe the control loop of an arm, and what follows when the arm has been stopped."""
 
 from __future__ import annotations
 
@@ -16,7 +13,7 @@ _FASTEST = 10_000.0  # Hz; no torque loop over a fieldbus is faster
 
 
 class Control(GrownSection):
-    """The computed-torque loop (eq. 76): rate [Hz] and cut-off of the velocity low-pass [Hz].
+    """Computed-torque loop (eq. 76): rate [Hz] and cut-off of the velocity low-pass [Hz].
 
     The cut-off is one number or one per joint: light joints need a fast loop, heavy ones a quiet torque.
 
@@ -43,7 +40,7 @@ class Control(GrownSection):
 
 
 def disagreements(control: Control, joints: Sequence[str]) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Yield what does not fit an arm of these joints: the place in the arm's file, and what is wrong.
+    """Yield what is inconsistent with an arm of these joints: the place in the file, and the mistake.
 
     Args:
         control: the section `control`.

@@ -1,4 +1,4 @@
-"""What the search for an excitation aims at, and what it keeps free of the arm's limits."""
+"""Describe the search for an excitation motion: its criterion, and the margins it keeps to the arm's limits."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ Criterion = Literal["d_optimal", "condition_number", "a_optimal"]
 
 
 class Design(Section):
-    """How motions for an arm are designed; the command line may ask for something else.
+    """Settings for the design of motions for an arm; options of the command line override them.
 
     Attributes:
         criterion: `d_optimal` (log-determinant of the whitened information), `condition_number` (of the stacked
             regressor, as in the paper) or `a_optimal` (sum of variances of `parameters`, each in units of its square).
         parameters: expressions of the base parameters that `a_optimal` is about; all of them when empty.
-        motion: `fourier` (eq. 78), or `postures`: slow ways through a few postures and back again, which teach gravity
-            and friction where there is no room for more.
+        motion: `fourier` (eq. 78), or `postures`: slow motions through a few postures and back, which identify gravity
+            and friction only, where there is no space for more.
         base_frequency: [Hz].
         harmonics: of the Fourier series.
         periods: how often it repeats.
         ramp: how long the Fourier motion takes to swell from rest and to die down [s].
         postures: how many.
-        way: how long a way from posture to posture takes [s]; the ways back take twice as long.
+        way: duration of the motion from posture to posture [s]; the motions back take twice as long.
         dwell: how long the arm stands at each posture [s].
         position_margin: kept free at every position limit [rad or m], per joint or one number for all.
-        torque_margin: share of every torque limit kept free for what the model does not know.
+        torque_margin: share of every torque limit kept free for torques that the model does not predict.
         friction_guess: Coulomb friction, and viscous friction at the velocity limit, in shares of the torque limit,
-            where the prior has no friction: control does not know it, so the arm falls behind by what it takes.
+            where the prior has no friction: control does not compensate it, so it causes a following error.
     """
 
     criterion: Criterion = "d_optimal"
@@ -50,7 +50,7 @@ class Design(Section):
 
 
 def disagreements(design: Design, joints: Sequence[str]) -> Iterator[tuple[tuple[str, ...], str]]:
-    """What does not fit an arm of these joints: the place in the arm's file, and what is wrong.
+    """Yield what is inconsistent with an arm of these joints: the place in the file, and the mistake.
 
     Args:
         design: the section `design`.

@@ -1,4 +1,4 @@
-"""What an arm's driver section may be: a simulated arm, CANopen drives, or another distribution's driver."""
+"""Describe an arm's driver section: a simulated arm, CANopen drives, or another distribution's driver."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ident_service.config.simulation import SimulatedDriver
 
 
 class PluginDriver(Section):
-    """A driver that another distribution provides; it checks its own options."""
+    """Driver that another distribution provides; it checks its own options."""
 
     model_config = ConfigDict(frozen=True, extra="allow")
 
@@ -24,7 +24,7 @@ def _driver_kind(value: Any) -> str:
     return kind if kind in ("simulated", "canopen") else "plugin"
 
 
-# A driver of ours with a mistake must not pass for somebody else's.
+# Chosen by `kind`, so that a mistake in a built-in driver's section is not taken for a plug-in's options.
 Driver = Annotated[
     Annotated[SimulatedDriver, Tag("simulated")]
     | Annotated[CanopenDriver, Tag("canopen")]

@@ -1,4 +1,4 @@
-"""Read what an EDS or DCF (CiA 306-1) lists, as far as it can be read: makers' files have oddities of every kind."""
+"""Read the entries of an EDS or DCF (CiA 306-1) as far as possible, in spite of oddities in makers' files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Final
 
-LONGEST: Final = 2**19  # characters, which ini readers take a second for
+LONGEST: Final = 2**19  # characters; an ini reader takes about a second for them
 
 _OBJECT = re.compile(r"^([0-9a-f]{4})(?:sub([0-9a-f]{1,2}))?$", re.IGNORECASE)
 _NODE = re.compile(r"\+?\$NODEID\+?", re.IGNORECASE)
@@ -39,11 +39,11 @@ class Listed:
 
     @property
     def writable(self) -> bool:
-        """Whether a host may write it."""
+        """Return whether a host may write the entry."""
         return self.access in ("rw", "rww", "rwr", "wo")
 
     def number(self, node: int) -> int | None:
-        """Return its value as a number, None where it is none.
+        """Return the entry's value as a number, None where it has none.
 
         Args:
             node: that COB-IDs are relative to.
@@ -53,7 +53,7 @@ class Listed:
 
 @dataclass(frozen=True)
 class DataSheet:
-    """What a file lists.
+    """Contents of an EDS or DCF file.
 
     Attributes:
         entries: by `index << 8 | sub-index`.
@@ -68,13 +68,13 @@ class DataSheet:
     mistake: str | None = None
 
     def has(self, index: int, sub: int | None = None) -> bool:
-        """Return whether it lists an object, or an entry of it."""
+        """Return whether the data sheet lists an object, or one sub-index of it."""
         return any(key >> 8 == index for key in self.entries) if sub is None else index << 8 | sub in self.entries
 
 
 @lru_cache(maxsize=32)
 def data_sheet(text: str) -> DataSheet:
-    """Read the text of an EDS or DCF; never raises. What cannot be read of it is left out."""
+    """Parse the text of an EDS or DCF; never raises, what cannot be read is left out."""
     if len(text) > LONGEST:
         return DataSheet(mistake=f"longer than {LONGEST} characters")
     if why := _strange_line(text):
@@ -102,10 +102,10 @@ def data_sheet(text: str) -> DataSheet:
 
 
 def _listed(section: Mapping[str, str], sub: int) -> Iterator[tuple[int, Listed]]:
-    """Return the entries of one section: one, or many of a compact array."""
+    """Yield the entries of one section: one, or all elements of a compact array."""
     text = section.get("defaultvalue") or None
     own = section.get("parametervalue") or None
-    if own is not None and not (text is not None and _NODE.search(text)):  # which would be another node's
+    if own is not None and not (text is not None and _NODE.search(text)):  # that is another node's
         text = own
     low, high = (_number(section.get(key, ""), 0) for key in ("lowlimit", "highlimit"))
     kind = _number(section.get("datatype", ""), 0) or 0
@@ -127,9 +127,9 @@ def _number(text: str, node: int) -> int | None:
 
 
 def _strange_line(eds: str) -> str | None:
-    """Find the first line that is no ini file's; Python's reader takes the square of their number to list them all."""
+    """Return what is wrong with the first line that is not ini syntax, as configparser is quadratic in such lines."""
     begun = False
-    level: int | None = None  # of the option that deeper lines continue
+    level: int | None = None  # indentation of the option that deeper lines continue
     for number, line in enumerate(eds.split("\n"), 1):
         text = line.strip()
         indent = len(line) - len(line.lstrip())
@@ -138,7 +138,7 @@ def _strange_line(eds: str) -> str | None:
         section, at = re.match(r"\[.+\]", text), re.search("[=:]", text)
         begun = begun or section is not None
         if not begun:
-            return None  # the reader says so at once
+            return None  # configparser reports it at once
         if section is None and at is None:
             return f"line {number} is neither a section nor a key with a value: {text[:40]!r}"
         if at is not None and at.start() == 0:

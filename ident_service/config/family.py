@@ -1,4 +1,4 @@
-"""Describe what is special about a maker's drives: data files beside the driver, or beside a user's description.
+"""Describe maker-specific properties of drives: data files beside the driver, or beside a user's description.
 
 A family replaces what differs from `generic402`, whose lists are the fallbacks of CiA 402 in their order. An entry is
 written `6071:0/i16`: index and sub-index in hexadecimal digits, and its type.
@@ -15,27 +15,27 @@ from ident_service.errors import DriverError
 
 EntryText = Annotated[str, Field(pattern=r"^[0-9A-F]{4}:[0-9A-F]{1,2}/[iu](8|16|32)$")]
 Unsigned32 = Annotated[int, Field(strict=True, ge=0, le=0xFFFF_FFFF)]
-TargetText = Annotated[str, Field(pattern=r"^[0-9A-F]{4}:[0-9A-F]{1,2}/i16$")]  # as torque frames carry it
+TargetText = Annotated[str, Field(pattern=r"^[0-9A-F]{4}:[0-9A-F]{1,2}/i16$")]  # 16 bits, as torque frames carry it
 _MOST_MODE = 127
 _NEEDS_NO_SOURCE = frozenset({"name", "proved", "sources", "notes"})
 
 
 class Match(Section):
-    """Which drives belong to a family (1018h:01, 1018h:02); no product is every product of the vendor's."""
+    """Identity of the drives in a family (1018h:01, 1018h:02); an empty `product` matches all of the vendor's."""
 
     vendor: Unsigned32 | None = None
     product: tuple[Unsigned32, ...] = ()
 
 
 class ModeEntry(Section):
-    """A maker's own entry that takes the place of 6060h; `display` tells what is in effect."""
+    """Maker-specific entry that replaces 6060h; `display` reads back the mode in effect."""
 
     entry: EntryText
     display: EntryText
 
 
 class TorquePath(Section):
-    """How torques are streamed: a mode, its bit in 6502h where it has one, and the entry that takes the torque."""
+    """Way to stream torques: a mode, its bit in 6502h where it has one, and the entry that takes the torque."""
 
     mode: Annotated[int, Field(strict=True, ge=-128, le=0xFFFF)]
     supported: Annotated[int, Field(strict=True, ge=0, le=31)] | None = None
@@ -51,7 +51,7 @@ class TorquePath(Section):
 
 
 class TorqueUnit(Section):
-    """What a count of the target is: a thousandth of `rated`, or `count`, in `unit`; mA need a torque constant."""
+    """Size of a count of the target: a thousandth of `rated`, or `count`, in `unit`; `mA` needs a torque constant."""
 
     rated: EntryText | None = None
     count: Positive | None = None
@@ -68,7 +68,7 @@ class TorqueUnit(Section):
 
 
 class TorqueLimit(Section):
-    """Where the largest torque stands, in counts of the target or thousandths of `per`; `negative`: the other way."""
+    """Entry of the largest torque, in counts of the target or thousandths of `per`; `negative`: other direction."""
 
     entry: EntryText
     per: EntryText | None = None
@@ -76,7 +76,7 @@ class TorqueLimit(Section):
 
 
 class MakersWatchdog(Section):
-    """An entry of the maker's that makes the drive miss torque frames."""
+    """Maker-specific entry that sets the drive's watchdog on missing torque frames."""
 
     entry: EntryText
     unit: str
@@ -84,7 +84,7 @@ class MakersWatchdog(Section):
 
 
 class Family(Section):
-    """What is known of some drives.
+    """Known properties of a family of drives.
 
     `refuse` is the sentence with which drives without a torque mode are refused. `sources` says for every other key
     where it is from; `proved` whether somebody has run it on hardware.
@@ -113,12 +113,12 @@ class Family(Section):
         return self
 
     def over(self, generic: Family) -> Family:
-        """Return this family with what it leaves open as in another one."""
+        """Return this family, completed with the values of `generic` where it has none."""
         return generic.model_copy(update={key: getattr(self, key) for key in self.model_fields_set})
 
 
 def family_from(name: str, text: str) -> Family:
-    """Read a family.
+    """Read a family of drives from YAML.
 
     Args:
         name: of the file.

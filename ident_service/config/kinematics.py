@@ -1,4 +1,4 @@
-"""The mechanism of an arm: a DH table, or a URDF or MJCF file and which part of it is the arm (decision 0054)."""
+"""Describe the mechanism of an arm: a DH table, or the part of a URDF or MJCF file that is the arm (decision 0054)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _RPY = re.compile(r"""(\brpy\s*=\s*)(["'])([^"']*)\2""")
 
 
 def snapped(urdf: str) -> str:
-    """Write the angles of `rpy` attributes that are nearly multiples of 15 degrees as those, with all digits."""
+    """Return the URDF with `rpy` angles that are nearly multiples of 15 degrees replaced by the exact multiples."""
 
     def angle(text: str) -> str:
         try:
@@ -108,6 +108,6 @@ class Kinematics(Section):
 
     @model_serializer(mode="wrap")
     def _unless_whole(self, serialized: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # Descriptions without these keys keep the hashes that results and tickets have named them by.
+        # Left out at their defaults, so that older descriptions keep the hash that results and tickets store.
         document: dict[str, Any] = serialized(self)
         return {key: value for key, value in document.items() if key not in ("base", "tip", "lock", "snap") or value}

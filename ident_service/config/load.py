@@ -1,4 +1,4 @@
-"""From a file name, or the name of a shipped arm, to a checked `ArmConfig`."""
+"""Load and check an arm description, by file name or by the name of a shipped arm."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from ident_service.config.source import KeyPath, Tree, first_problems, read_tree
 from ident_service.errors import ConfigError, Problem, UsageError
 
 _MOST_JSON = 4 * 2**20  # bytes: a text, a URDF and an EDS at their limits
-_MOST_VALUES = 10_000  # each may be a mistake, which takes a kilobyte
+_MOST_VALUES = 10_000  # each may cause an error message of about a kilobyte
 _Described = TypeVar("_Described", bound=Section)
 _PER_JOINT = ("encoder_resolution", "torque_resolution", "torque_noise")
 
 
 def find_arm(arm: str) -> Path:
-    """The file of an arm given as a path or as the name of a shipped description.
+    """Return the file of an arm given as a path or as the name of a shipped description.
 
     Raises:
         UsageError: neither exists.
@@ -61,7 +61,7 @@ def load_arm(arm: str | Path, *, upload: bool = False) -> ArmConfig:
 
 
 def with_sheets(config: ArmConfig, files: Sequence[str]) -> ArmConfig:
-    """Return an arm whose drives are emulated by data sheets of makers.
+    """Return the arm's description with its emulated drives described by makers' data sheets.
 
     Args:
         config: of the arm.
@@ -80,7 +80,7 @@ def with_sheets(config: ArmConfig, files: Sequence[str]) -> ArmConfig:
 
 
 def sheet_file(name: str) -> TextFile:
-    """Read an EDS or DCF of any encoding; raises UsageError."""
+    """Read an EDS or DCF file of any encoding; raises UsageError."""
     try:
         return TypeAdapter(AnyTextBeside).validate_python(name)
     except ValidationError as error:
@@ -88,7 +88,7 @@ def sheet_file(name: str) -> TextFile:
 
 
 def arm_from_json(path: Path) -> ArmConfig:
-    """Read a description that a folder of results or a recording keeps: whole, without the files it was made from.
+    """Read the complete description that a folder of results or a recording contains.
 
     Raises:
         UsageError: no such file.
@@ -109,7 +109,7 @@ def arm_from_json(path: Path) -> ArmConfig:
 
 
 def _count(data: bytes) -> int:
-    """Count the values of a JSON text; none where it is no such text, as its reader says."""
+    """Count the values of a JSON text; 0 if it is not JSON, which its reader reports."""
     try:
         left, count = [json.loads(data)], 0
     except (ValueError, RecursionError):
@@ -145,7 +145,7 @@ def folder_of(arm: str | Path, where: KeyPath) -> Path:
 
 
 def mistake(arm: str | Path, where: KeyPath, message: str) -> ConfigError:
-    """A mistake that only shows when a description is put to use, with its place.
+    """Return the error for a mistake that only shows when a description is used, with its place in the file.
 
     Args:
         arm: a YAML file, or the name of a shipped description.
@@ -182,7 +182,7 @@ def _problems(error: ValidationError, tree: Tree, path: Path) -> Iterator[Proble
 
 
 def _where(loc: tuple[int | str, ...], value: Any) -> KeyPath:
-    """The part of a validator's location that exists in the file: it also names union branches and missing keys."""
+    """Return the part of a validator's location that exists in the file, without union branches and missing keys."""
     where: list[str | int] = []
     for part in loc:
         if isinstance(value, tuple) and isinstance(part, int):
@@ -194,7 +194,7 @@ def _where(loc: tuple[int | str, ...], value: Any) -> KeyPath:
 
 
 def _disagreements(config: ArmConfig) -> Iterator[tuple[KeyPath, str]]:
-    """Mistakes that only show when two sections are held together."""
+    """Yield the mistakes that only show when two sections of a description are compared."""
     names = _joint_names(config.kinematics.dh, config)
     if (
         config.kinematics.dh is not None

@@ -1,7 +1,4 @@
-"""Types of single values in a configuration: angles, positive numbers, intervals, files read beside the YAML.
-
-Boundary: one value at a time; what a value means for an arm is `schema.py`.
-"""
+"""Define the types of single configuration values: angles, positive numbers, intervals, files beside the YAML."""
 
 from __future__ import annotations
 
@@ -30,29 +27,29 @@ _DEGREES = re.compile(r"^\s*([+-]?\d+(?:\.\d*)?)\s*deg\s*$")
 
 
 class LocatedStr(str):
-    """A YAML string that remembers the folder of the file it stands in, so that paths mean the same everywhere."""
+    """YAML string that keeps the folder of its file, so that relative paths mean the same everywhere."""
 
     __slots__ = ("folder",)
     folder: Path
 
     def __new__(cls, value: str, folder: Path) -> LocatedStr:
-        """Make the string with its folder."""
+        """Create the string with the folder of its file."""
         located = super().__new__(cls, value)
         located.folder = folder
         return located
 
 
 class Section(BaseModel):
-    """A frozen part of a configuration that refuses keys it does not know."""
+    """Frozen part of a configuration that refuses unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class GrownSection(Section):
-    """A section that got keys after descriptions were hashed.
+    """Section that got new keys after hashes of descriptions had been stored.
 
-    Those of `later` are left out of documents while they have their defaults, so that a description without them keeps
-    the hash that motions and results name it by.
+    Keys in `later` are left out of documents while they have their defaults, so that a description without them keeps
+    the hash that motions and results store.
     """
 
     later: ClassVar[frozenset[str]] = frozenset()
@@ -95,14 +92,14 @@ PerJoint = NonNegative | tuple[NonNegative, ...]
 
 
 class TextFile(Section):
-    """The whole content of a file named in the configuration, so that the arm's hash covers it."""
+    """Whole content of a file named in the configuration, so that the arm's hash covers it."""
 
     name: str
     text: str
 
 
 def read_beside(value: Any, info: ValidationInfo) -> Any:
-    """Read the file a `LocatedStr` names, relative to the YAML file it stands in; bounded in size, and UTF-8.
+    """Read the file that a `LocatedStr` names, relative to the YAML file it stands in; bounded in size, and UTF-8.
 
     Where the validation's context names that folder as `upload`, only files in it are read, and none is looked for
     elsewhere: who sends a description learns nothing about other files.
@@ -125,7 +122,7 @@ def _read(value: Any, info: ValidationInfo, otherwise: str | None) -> Any:
     path = folder / value
     try:
         there = path.is_file()
-    except OSError:  # what is too long for a name, say
+    except OSError:  # for example, the name is too long
         there = False
     if not there:
         raise ValueError(f"no such file: {path}")

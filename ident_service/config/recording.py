@@ -1,8 +1,8 @@
-"""How an arm's recordings lie in files, in what units, and the gears between its motors and its joints.
+"""Describe the file format and units of an arm's recordings, and the gears between its motors and its joints.
 
 With `r` the motor's turns per turn of the joint, `C` the coupling and `q0` the offsets: `q_motor = diag(r) C (q - q0)`,
-hence `dq_motor = diag(r) C dq`, and since what the motors put in the joints give out (`tau_motor . dq_motor =
-tau . dq`), `tau = C^T diag(r) tau_motor`. Boundary: data and its own consistency; `record/transmission.py` computes.
+hence `dq_motor = diag(r) C dq`, and since what the motors put in the joints give out (`tau_motor . dq_motor = tau .
+dq`), `tau = C^T diag(r) tau_motor`.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from pydantic import (
 
 from ident_service.config.quantities import Angle, GrownSection, NonNegative, Number, Positive, Section
 
-# Beyond, rounding would eat half of the digits on the way from motor to joint.
+# Beyond it, rounding would lose half of the digits between motor and joint.
 _WORST_CONDITION = 1e8
 _FASTEST = 100_000.0  # Hz, of recordings; beyond, samples would fill any memory
 _NUMBERED = re.compile(r"(q|dq|tau)(\d+)")
-_SAME = 0.01  # a factor this near to a unit's own conversion is that conversion a second time
+_SAME = 0.01  # a factor this near to a unit's own conversion is taken for a repetition of it
 
 _QUANTITIES = {"t": "time", "q": "position", "dq": "velocity", "tau": "torque"}
 _SI = {"time": "s", "position": "rad or m", "velocity": "rad/s or m/s", "torque": "N m or N"}
 _TURN = 2.0 * math.pi
-# Units with a conversion of their own to SI. Revolutions and degrees are of turning joints, metres of sliding ones.
+# Units with a fixed conversion to SI. Revolutions and degrees are for revolute joints, metres for prismatic ones.
 _TURNING = {
     "position": {"rad": 1.0, "mrad": 1e-3, "deg": math.radians(1.0), "rev": _TURN},
     "velocity": {"rad/s": 1.0, "mrad/s": 1e-3, "deg/s": math.radians(1.0), "rpm": _TURN / 60.0, "rev/s": _TURN},
@@ -48,7 +48,7 @@ _SLIDING = {
 _CONVERTED = {"time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}} | {
     quantity: _TURNING[quantity] | _SLIDING[quantity] for quantity in _TURNING
 }
-# Units that become a quantity by a constant of the arm alone, with what it then is a factor per.
+# Units that need an arm-specific factor, each with its size in the unit that the factor is given per.
 _WITH_FACTOR = {
     "time": {"counts": (1.0, "count")},
     "position": {"counts": (1.0, "count")},
@@ -60,7 +60,7 @@ ColumnName = Annotated[str, Field(pattern=r"^(t|(q|dq|tau)[1-9]\d{0,3})$")]
 
 
 class Column(Section):
-    """One column of a CSV file: what the file calls it, and how its numbers become SI.
+    """One column of a CSV file: its name in the file, and the conversion of its numbers to SI.
 
     The value is `factor` times the number converted from `unit`; both may be left out. A negative factor turns the
     sign. Currents (`A`, `mA`), encoder `counts` and `%` of a rated torque need a factor: N m per A, rad per count,
@@ -90,11 +90,11 @@ class Column(Section):
 
     @model_serializer(mode="wrap")
     def _name_alone(self, serialized: SerializerFunctionWrapHandler) -> Any:
-        # A plain name keeps the hash that descriptions had before there were units.
+        # A plain name, so that descriptions without units keep the hash they had before units existed.
         return self.column if self.unit is None and self.factor == 1.0 else serialized(self)
 
     def scale(self, name: str) -> float:
-        """Return what a number of this column is multiplied by to be in SI.
+        """Return the factor that converts a number of this column to SI.
 
         Args:
             name: ours, such as `tau3`, which says the quantity.
@@ -195,7 +195,7 @@ def motor_groups(transmission: Transmission) -> NDArray[np.bool_]:
 
 
 class RecordingFormat(Section):
-    """How an arm's recordings are read; `columns`, `joint_names`, `topic`, sides are for the files of others only.
+    """Format of an arm's recordings; `columns`, `joint_names`, `topic` and sides are for foreign files only.
 
     `columns` gives a CSV file's own name for each of `t`, `q1`, `tau1` and optionally `dq1`, or that name with unit and
     factor (`Column`); `joint_names` a JointState's own name for a joint of the arm. `side` says where positions,
@@ -244,7 +244,7 @@ class RecordingFormat(Section):
 
     @model_serializer(mode="wrap")
     def _unless_default(self, serialized: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # Descriptions without these keys keep the hash that results have named them by.
+        # Left out at their defaults, so that older descriptions keep the hash that results store.
         document: dict[str, Any] = serialized(self)
         later = {"torque_side": None, "missing": "refuse", "standstill": "keep"}
         return {key: value for key, value in document.items() if key not in later or value != later[key]}
@@ -272,9 +272,9 @@ def _joints(columns: Mapping[str, Column]) -> int:
 
 
 def units_of_other_joints(form: RecordingFormat, joints: Sequence[str], revolute: Sequence[bool]) -> Iterator[str]:
-    """Find columns whose unit is of a sliding joint where the arm's joint turns, or the other way round.
+    """Yield columns with a unit of a prismatic joint where the arm's joint is revolute, or vice versa.
 
-    What was measured at a motor turns whatever the joint does, and is not looked at.
+    Quantities measured at a motor are rotary whatever the joint is, and are not checked.
 
     Args:
         form: the section `recording`.
@@ -300,7 +300,7 @@ def units_of_other_joints(form: RecordingFormat, joints: Sequence[str], revolute
 def disagreements(
     form: RecordingFormat, transmission: Transmission | None, joints: Sequence[str]
 ) -> Iterator[tuple[tuple[str, ...], str]]:
-    """What does not fit together in an arm of these joints: the place in the arm's file, and what is wrong.
+    """Yield what is inconsistent in an arm of these joints: the place in the file, and the mistake.
 
     Args:
         form: the section `recording`.

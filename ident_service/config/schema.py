@@ -1,7 +1,7 @@
-"""What an arm is, in configuration: kinematics, limits, gains, physical constraints, motions, driver.
+"""Describe an arm in configuration: kinematics, limits, gains, physical constraints, motions, driver.
 
-Boundary: data only. Reading YAML is `source.py` and `load.py`; what the numbers do is other rooms' business.
-SI units; angles in radians. Tables 2, 4, 5 and 7 and eqs. 25, 26, 28 of Sousa & Cortesao 2014 have their place here.
+`source.py` and `load.py` read the YAML. SI units; angles in radians. Tables 2, 4, 5 and 7 and eqs. 25, 26, 28 of Sousa
+& Cortesao 2014 have their place here.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Box(Section):
 
 
 class Ellipsoid(Section):
-    """An ellipsoid in a link frame that no mass of the link lies outside of: centre and half-axes [m].
+    """Ellipsoid in a link frame that contains all mass of the link: centre and half-axes [m].
 
     The rows of `axes` are unit vectors along the half-axes; those of the frame when left out.
     """
@@ -82,7 +82,7 @@ class Ellipsoid(Section):
 
 
 class Body(Section):
-    """What is known beforehand about the link a joint moves (eqs. 25, 26).
+    """Prior knowledge about the link that a joint moves (eqs. 25, 26).
 
     Its mass, a box and a convex hull of points that its centre of mass lies in, an ellipsoid that all its mass lies in,
     and the coordinate planes of its frame that it is symmetric about.
@@ -196,7 +196,7 @@ class Smoothing(Section):
 
 
 class Reversal(Section):
-    """Which rows of a joint are near standstill: slower than `speed`, or within `window` [s] of turning round.
+    """Rows of a joint near standstill: slower than `speed` [rad/s or m/s], or within `window` [s] of a reversal.
 
     Their friction is known less well than that of a joint in motion, and they count as their residuals allow.
     """
@@ -206,7 +206,7 @@ class Reversal(Section):
 
 
 class FrictionShape(Section):
-    """What in the friction is not linear, per joint or one number for all, given or fitted (`fit`).
+    """Nonlinear friction parameters, per joint or one number for all, given or fitted (`fit`).
 
     `presliding` is the way [rad or m] over which friction turns round with the velocity (Dahl 1968), 0 for at once;
     `stribeck_velocity` [rad/s or m/s] is v_s of the term `stribeck`.
@@ -217,7 +217,7 @@ class FrictionShape(Section):
 
 
 class PriorPull(Section):
-    """How strongly constrained estimates are drawn towards the prior (CAD) parameters, and in which sense.
+    """Regularisation of constrained estimates towards the prior (CAD) parameters: divergence and weight.
 
     `weight` is that of one unit of divergence against one residual variance, or `held_out`: the one that explains best
     the last third of the recordings, fitted to the rest.
@@ -228,12 +228,12 @@ class PriorPull(Section):
 
 
 class Identification(GrownSection):
-    """How a recording becomes equations, and equations an estimate.
+    """Settings that turn a recording into equations, and equations into an estimate.
 
     `method` is the estimator, by default the one of `wls` and `huber` that predicts held-out parts of the recordings
     better; `edge` [s] is left out at both ends of every recording, two periods of the cut-off by default; `block` [s]
-    is what doubt is computed from; `delay` [s] is how much later the torque's stamps are than the position's, by
-    default none, or one of a few samples where that predicts held-out parts clearly better; `period` [s] averages a
+    is the block length of the uncertainty estimate; `delay` [s] is the delay of torque stamps against position stamps,
+    by default none, or one of a few samples where that predicts held-out parts clearly better; `period` [s] averages a
     periodic motion over its periods, without the filters of the torque. `torque` is what drives measured or what they
     were told; left out, what they measured where a recording has it in every sample.
     """
@@ -275,7 +275,7 @@ class FourierJoint(Section):
 
 
 class FourierMotion(Section):
-    """A finite Fourier series (eq. 78), `base_frequency` in Hz, that swells and dies down in `ramp` [s]."""
+    """Finite Fourier series (eq. 78) with `base_frequency` [Hz] that fades in and out over `ramp` [s]."""
 
     kind: Literal["fourier"]
     base_frequency: Positive
@@ -291,7 +291,7 @@ class FourierMotion(Section):
 
 
 class SeededMotion(GrownSection):
-    """A random Fourier motion, the same for the same seed, scaled into the arm's limits with a share left over.
+    """Random Fourier motion, the same for the same seed, scaled into the arm's limits with a margin.
 
     It is about the middle of the position limits, or about home. About home the torque, of which gravity takes its part
     whatever `use` is, may take 70 % of its limit.
@@ -373,18 +373,18 @@ class ArmConfig(GrownSection):
     unattended_motion: Literal["refused", "allowed"] = "refused"
 
     def has_brake(self, joint: str) -> bool:
-        """Tell whether a joint is held where its drive has no power."""
+        """Return whether a holding brake holds the joint when its drive has no power."""
         said = self.joints[joint].brake if joint in self.joints else None
         return said if said is not None else self.driver is not None and self.driver.kind == "simulated"
 
     @property
     def sha256(self) -> str:
-        """SHA-256 of the whole resolved description, files it names included."""
+        """Return the SHA-256 of the whole resolved description, files it names included."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
 
     @property
     def motion_sha256(self) -> str:
-        """SHA-256 of what the safety of a motion depends on: the mechanism, its limits, its model and its surroundings.
+        """Return the SHA-256 of all that the safety of a motion depends on: mechanism, limits, model, surroundings.
 
         Other estimators, recording formats, motions or drivers leave it as it is.
         """

@@ -1,6 +1,6 @@
-"""The simulated arm as a configuration describes it, and the faults to inject: kind, joint, time, duration, size.
+"""Describe the simulated arm, and the faults to inject: kind, joint, time, duration, size.
 
-Boundary: data only. What each kind does to readings and to the plant is `sim_backend`.
+`sim_backend` implements the effect of each kind on readings and plant.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ident_service.config.quantities import (
 
 
 class FaultKind(Enum):
-    """What can go wrong; `FAULT_RULES` says what each means."""
+    """Kinds of faults that can be injected; `FAULT_RULES` describes each."""
 
     LOST_FEEDBACK = "lost_feedback"
     DELAYED_FEEDBACK = "delayed_feedback"
@@ -51,7 +51,7 @@ class FaultKind(Enum):
 
 @dataclass(frozen=True)
 class FaultRule:
-    """How one kind of fault is described.
+    """Rule for the description of one kind of fault.
 
     Attributes:
         does: what it does, in words.
@@ -67,7 +67,7 @@ class FaultRule:
 
 
 FAULT_RULES: dict[FaultKind, FaultRule] = {
-    # What the host reads; the plant does not notice.
+    # Faults of what the host reads; the plant is not affected.
     FaultKind.LOST_FEEDBACK: FaultRule("no answer: invalid, ageing, the last position repeated, counted as lost"),
     FaultKind.DELAYED_FEEDBACK: FaultRule("old positions, invalid and of that age", "delay [s]", stays=True),
     FaultKind.HIDDEN_DELAY: FaultRule("old positions, as if they were fresh", "delay [s]", stays=True),
@@ -76,7 +76,7 @@ FAULT_RULES: dict[FaultKind, FaultRule] = {
     FaultKind.FROZEN_ENCODER: FaultRule("the last position repeated, as if it were fresh"),
     FaultKind.NAN_POSITION: FaultRule("not a number, as if it were one"),
     FaultKind.POSITION_SIGN: FaultRule("the position with the wrong sign", stays=True),
-    # What the drives make of a torque; a sample says what acts, unless the fault is that nobody knows.
+    # Faults of the torque that acts; a sample reports that torque, unless the fault is that it does not.
     FaultKind.STUCK_TORQUE: FaultRule("the torque of the cycle before goes on acting"),
     FaultKind.TORQUE_SIGN: FaultRule("the opposite torque acts, and the sample does not say so", stays=True),
     FaultKind.TORQUE_SATURATION: FaultRule("torques clipped below the limit", "share of the limit", stays=True),
@@ -86,9 +86,9 @@ FAULT_RULES: dict[FaultKind, FaultRule] = {
         stays=True,
     ),
     FaultKind.EMERGENCY_STOP: FaultRule("no torque until reset; status says so", of_joint=False, stays=True),
-    # What happens to the plant.
+    # Faults of the plant.
     FaultKind.LOAD_ATTACHED: FaultRule("a point mass on the last link", "mass [kg]", of_joint=False, stays=True),
-    # What happens on the way.
+    # Faults of the communication.
     FaultKind.BUS_GONE: FaultRule("exchange raises; drives hear nothing, their watchdogs run", of_joint=False),
     FaultKind.LATE_CYCLE: FaultRule("exchange returns late", "lateness [s]", of_joint=False),
     FaultKind.CLOCK_JUMP: FaultRule("stamps are wrong by size", "[s]", of_joint=False, stays=True),
@@ -144,7 +144,7 @@ class SimulatedFault(Section):
 
 
 class SimulatedDriver(GrownSection):
-    """The simulated arm: true parameters and imperfections, all per joint or one number for all.
+    """Simulated arm: true parameters and imperfections, all per joint or one number for all.
 
     `process` says where its plant lives; `bus` names a separate one that other processes may ask for, `status` the file
     it reports to, `deadline` [s] how long an answer of it may take. `watchdog` [s] without a torque frame makes
@@ -175,14 +175,14 @@ class SimulatedDriver(GrownSection):
 def disagreements(
     driver: SimulatedDriver, joints: Sequence[str], rate: float
 ) -> Iterator[tuple[tuple[str | int, ...], str]]:
-    """What does not fit an arm of these joints: the place in the arm's file, and what is wrong.
+    """Yield what is inconsistent with an arm of these joints: the place in the file, and the mistake.
 
     Args:
         driver: the section `driver`.
         joints: names of the arm's joints; none where the file does not name them.
         rate: cycles per second.
     """
-    # What the message tells to set is rounded to six digits.
+    # The value that the message suggests is rounded to six digits.
     if driver.watchdog * rate < _LEAST_WATCHDOG * (1.0 - 1e-5):
         yield (
             ("driver", "watchdog"),

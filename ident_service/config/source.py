@@ -1,4 +1,4 @@
-"""YAML that remembers where everything stands.
+"""Read YAML and keep the place of every value.
 
 `read_tree` turns a file (and the files it extends) into plain Python values and a map from the path of every value to
 the file, line and column it came from. Aliases, merge keys, tags and duplicate keys are refused: a description of
@@ -36,7 +36,7 @@ class Tree:
     places: dict[KeyPath, tuple[Path, int, int]] = field(default_factory=dict)
 
     def problem(self, path: KeyPath, message: str, fallback: Path) -> Problem:
-        """A problem at `path`, or at its nearest ancestor that stands somewhere."""
+        """Return a problem at `path`, or at its nearest ancestor that has a place in the file."""
         for length in range(len(path), -1, -1):
             if place := self.places.get(path[:length]):
                 return Problem(*place, message)
@@ -56,7 +56,7 @@ def _shortened(message: str) -> str:
 
 
 def read_tree(path: Path, _chain: tuple[Path, ...] = (), *, upload: bool = False) -> Tree:
-    """Read a YAML file and, underneath it, the file that its `extends` names, or the shipped description of that name.
+    """Read a YAML file and, underneath it, the file or shipped description that its `extends` names.
 
     Mappings merge key by key, everything else is replaced.
 
@@ -106,7 +106,7 @@ def _merge(base: Any, over: Any) -> Any:
 
 
 def read_alone(path: Path) -> Tree:
-    """Read a YAML file and no other, whatever it `extends`.
+    """Read a single YAML file without the one that it `extends`.
 
     Raises:
         ConfigError: unreadable file, bad YAML, or something refused.
@@ -123,12 +123,12 @@ def read_alone(path: Path) -> Tree:
 
 
 class _Builder:
-    """Values made straight from the parser's events, in one pass; nothing expands."""
+    """Builder of values straight from the parser's events, in one pass; nothing expands."""
 
     def __init__(self, path: Path, text: str) -> None:
         self._path, self._text = path, text
         self._tree = Tree(None)
-        self._refused: list[Problem] = []  # what would expand, or be more than text
+        self._refused: list[Problem] = []  # anchors, aliases, tags, further documents, too deep nesting
         self._wrong: list[Problem] = []
 
     def tree(self) -> Tree:
@@ -140,7 +140,7 @@ class _Builder:
             raise ConfigError([Problem(self._path, line, column, error.problem or "not YAML")]) from None
         except yaml.YAMLError as error:
             raise ConfigError([Problem(self._path, 1, 1, f"not YAML: {error}")]) from None
-        # First what makes the rest of the file another one than it seems.
+        # First the constructs that would change the meaning of the rest of the file.
         if problems := self._refused or self._wrong:
             raise ConfigError(first_problems(problems))
         return self._tree

@@ -1,4 +1,4 @@
-"""Describe how a CANopen drive stops by itself when its host is gone, as its section of a description says it."""
+"""Describe how a CANopen drive stops by itself when its host is gone."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from ident_service.config.quantities import GrownSection, Section
 NodeId = Annotated[int, Field(strict=True, ge=1, le=127)]
 Seconds = Annotated[float, Field(strict=True, ge=0.001, le=60.0)]  # whole ms of 16 bits in the drive
 WatchdogKind = Literal["rpdo_timer", "heartbeat", "sync_loss", "node_guarding", "vendor"]
-# Whose reaction 6007h chooses; a maker's own watchdog may have a reaction of its own.
+# Watchdogs whose reaction 6007h selects; a maker's own watchdog may have a reaction of its own.
 ABORTING: Final = ("rpdo_timer", "heartbeat", "sync_loss", "node_guarding")
 _MAKERS = range(0x2000, 0x6000)  # indices that CiA 301 leaves to makers of drives
 
 
 class WatchdogEntry(Section):
-    """An entry of the maker's, of type `type`, by which a drive's watchdog is set; it is written and read back."""
+    """Maker-specific entry of type `type` that sets a drive's watchdog; it is written and read back."""
 
     index: Annotated[int, Field(strict=True, ge=_MAKERS.start, lt=_MAKERS.stop)]
     sub: Annotated[int, Field(strict=True, ge=0, le=0xFF)] = 0
@@ -34,7 +34,7 @@ class WatchdogEntry(Section):
 
 
 class Heartbeats(GrownSection):
-    """Set who says that it lives, how often, and how long the others wait for it [s] (1017h, 1016h).
+    """Heartbeats of host and drives: periods and timeouts [s] (1017h, 1016h).
 
     Drives whose watchdog it is wait for the host's for `host_timeout`, which is `timeout` where it is left out.
     """
@@ -48,7 +48,7 @@ class Heartbeats(GrownSection):
 
     @property
     def waits(self) -> float:
-        """Return how long drives wait for the host's [s]."""
+        """Return how long drives wait for the host's heartbeat [s]."""
         return self.timeout if self.host_timeout is None else self.host_timeout
 
     @model_validator(mode="after")
@@ -61,7 +61,7 @@ class Heartbeats(GrownSection):
 
 
 class NodeGuarding(Section):
-    """Set how `watchdog: node_guarding` asks: every `period` [s] (100Ch), of which `factor` may be missed (100Dh)."""
+    """Timing of `watchdog: node_guarding`: every `period` [s] (100Ch), of which `factor` may be missed (100Dh)."""
 
     period: Seconds = 0.02
     factor: Annotated[int, Field(strict=True, ge=2, le=255)] = 3

@@ -1,4 +1,4 @@
-"""What a motion must not touch, and what the supply can give: bodies of the links, obstacles, power.
+"""Describe the surroundings of an arm and its supply: bodies of the links, obstacles, allowed box, power.
 
 SI units. Shapes of links are in the link frame, obstacles and the allowed box in the base frame.
 """
@@ -12,7 +12,7 @@ from pydantic import ConfigDict, Field, model_validator
 
 from ident_service.config.quantities import Angle, Interval, NonNegative, Positive, Section, Vector3
 
-BASE = "base"  # the name, among the links, of what does not move
+BASE = "base"  # name of the fixed base among the links
 
 
 class Capsule(Section):
@@ -34,7 +34,7 @@ class SolidBox(Section):
 
 
 class HalfSpace(Section):
-    """Everything behind a plane: points x with `normal . x < offset` [m] are solid; the normal points to free space."""
+    """Solid half-space behind a plane: points x with `normal . x < offset` [m]; the normal points to free space."""
 
     normal: Vector3
     offset: float
@@ -61,7 +61,7 @@ class Obstacle(Section):
 
 
 class Inside(Section):
-    """The box in the base frame that no part of a moving link may leave [m]."""
+    """Box in the base frame that no part of a moving link may leave [m]."""
 
     x: Interval | None = None
     y: Interval | None = None
@@ -69,7 +69,7 @@ class Inside(Section):
 
 
 class Workspace(Section):
-    """Where the arm may be.
+    """Allowed space of the arm and its obstacles.
 
     Attributes:
         clearance: smallest distance that must remain between any two things that may not touch [m].
@@ -89,9 +89,9 @@ Geometry = dict[str, Annotated[tuple[Capsule, ...], Field(min_length=1)]]
 
 
 class Supply(Section):
-    """What feeds the drives.
+    """Power supply of the drives.
 
-    Drive k draws `torque velocity + loss torque^2`, never less than nothing: what a braking drive feeds back is not
+    Drive k draws `max(0, torque velocity + loss torque^2)` [W]: power that a braking drive feeds back is not
     counted on.
 
     Attributes:
@@ -118,7 +118,7 @@ class Supply(Section):
 
     @property
     def budget(self) -> float:
-        """The smaller of both limits [W]."""
+        """Return the power that the drives may draw, the smaller of both limits [W]."""
         from_current = float("inf") if self.current is None or self.voltage is None else self.current * self.voltage
         return min(self.power or float("inf"), from_current)
 
@@ -126,7 +126,7 @@ class Supply(Section):
 def disagreements(
     geometry: Geometry, workspace: Workspace, supply: Supply | None, joints: Sequence[str]
 ) -> Iterator[tuple[tuple[str | int, ...], str]]:
-    """What does not fit an arm of these joints: the place in the arm's file, and what is wrong.
+    """Yield what is inconsistent with an arm of these joints: the place in the file, and the mistake.
 
     Args:
         geometry: the section `geometry`.

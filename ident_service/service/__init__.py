@@ -1,1 +1,1 @@
-"""Service: the jobs that the command line and, later, the daemon run."""
+"""Carry out the jobs that the command line and the daemon share."""

@@ -1,4 +1,4 @@
-"""Accepting is a person's act: from then on a run's parameters are the arm's current ones, under a path that stays.
+"""Accept a run's parameters, on a person's decision, as the arm's current ones under a fixed path.
 
 ```
 STATE/arms/NAME/accepted/0001/    every set that was ever accepted: its files, and acceptance.json
@@ -38,7 +38,7 @@ _LONGEST_NAME = 100
 
 @dataclass(frozen=True)
 class Acceptance:
-    """One act.
+    """One acceptance of a set of parameters.
 
     Attributes:
         arm: name.
@@ -111,7 +111,7 @@ def rollback(db: Database, state: Path, arm: str, note: str, who: str, to: int |
 
     Raises:
         UsageError: no note, no name, or there is no such set.
-        ParameterError: the set is not what was accepted.
+        ParameterError: the set's files were changed after the acceptance.
     """
     note, who = _noted(note), _named(who)
     with _acting(state, arm):
@@ -140,10 +140,10 @@ def rollback(db: Database, state: Path, arm: str, note: str, who: str, to: int |
 
 
 def acceptances(state: Path, arm: str) -> list[Acceptance]:
-    """All acts about an arm, the earliest first.
+    """Return all acceptances of an arm, the earliest first.
 
     Raises:
-        ParameterError: a file of them was damaged by somebody.
+        ParameterError: a file of them is damaged.
     """
     place, acts = arm_folder(state, arm) / ACCEPTED, list[Acceptance]()
     while (folder := place / f"{len(acts) + 1:04d}").is_dir():
@@ -155,11 +155,11 @@ def acceptances(state: Path, arm: str) -> list[Acceptance]:
 
 
 def accepted_set(state: Path, arm: str, number: int | None = None) -> tuple[Acceptance, Path]:
-    """A set that was accepted, and the folder with its files; the current one if `number` is None.
+    """Return an acceptance and the folder with its files; the current one if `number` is None.
 
     Raises:
         UsageError: nothing was accepted, or nothing of this number.
-        ParameterError: it is not what was accepted.
+        ParameterError: its files were changed after the acceptance.
     """
     acts = acceptances(state, arm)
     if not acts:
@@ -173,7 +173,7 @@ def accepted_set(state: Path, arm: str, number: int | None = None) -> tuple[Acce
 
 
 def settle(db: Database, state: Path) -> None:
-    """Bring `current` and the registry up to date with what was accepted, for every arm; after a kill, for example."""
+    """Bring `current` and the registry up to date with the accepted sets of every arm; after a kill, for example."""
     place = state / "arms"
     for folder in sorted(place.iterdir()) if place.is_dir() else ():
         if (folder / ACCEPTED).is_dir():
@@ -182,7 +182,7 @@ def settle(db: Database, state: Path) -> None:
 
 
 def accepted_runs(db: Database) -> set[str]:
-    """Ids of the runs that any acceptance stems from."""
+    """Return the ids of the runs that any acceptance stems from."""
     return {row["run"] for row in db.rows("SELECT DISTINCT run FROM acceptances")}
 
 
@@ -240,13 +240,13 @@ def _write(state: Path, act: Acceptance, source: Path) -> None:
 
 
 def _follow(db: Database, state: Path, arm: str) -> None:
-    """`current` and the registry say what the folders of acceptances say."""
+    """Bring an arm's `current` folder and the registry up to date with the folders of its acceptances."""
     acts = acceptances(state, arm)
     if not acts:
         return
     source, current = _folder(state, arm, acts[-1].number), arm_folder(state, arm) / CURRENT
     current.mkdir(exist_ok=True)
-    # The parameters last: who has seen them sees a URDF that is as new.
+    # The parameters last: whoever reads them finds a URDF that is at least as new.
     for name in (URDF, ARM, PARAMETERS):
         if not (source / name).is_file():
             (current / name).unlink(missing_ok=True)
@@ -266,7 +266,7 @@ def _copied(source: Path, target: Path) -> None:
 
 @contextmanager
 def _acting(state: Path, arm: str) -> Iterator[None]:
-    """One act at a time about an arm, from whichever process."""
+    """Hold the lock that admits one acceptance or roll-back at a time per arm, over all processes."""
     folder = arm_folder(state, arm)
     try:
         folder.mkdir(parents=True, exist_ok=True)

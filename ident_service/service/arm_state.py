@@ -1,4 +1,4 @@
-"""What is remembered of an arm between runs, in the state folder: its controls, its faults, its ticket."""
+"""Locate the files of an arm in the state folder that last between runs: controls, faults, preflight ticket."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from ident_service.motion.fault_file import CONTROLS, FaultFile
 
 
 def arm_folder(state: Path, arm: str) -> Path:
-    """Where things of one arm are."""
+    """Return the folder of one arm in the state folder."""
     return state / "arms" / arm
 
 
@@ -19,15 +19,15 @@ def known_arms(state: Path) -> list[str]:
 
 
 def control_path(state: Path, arm: str) -> Path:
-    """The arm's control file (`motion/control_file.py`)."""
+    """Return the path of the arm's control file (`motion/control_file.py`)."""
     return arm_folder(state, arm) / CONTROLS
 
 
 def ticket_path(state: Path, arm: str) -> Path:
-    """The arm's last preflight ticket."""
+    """Return the path of the arm's last preflight ticket."""
     return arm_folder(state, arm) / "ticket.json"
 
 
 def fault_file(state: Path, arm: str) -> FaultFile:
-    """The arm's faults, until a person acknowledges them (`motion/fault_file.py`)."""
+    """Return the store of the arm's faults that no person has acknowledged (`motion/fault_file.py`)."""
     return FaultFile(arm_folder(state, arm))

@@ -1,4 +1,4 @@
-"""A state folder as one file, and back: for a disk that dies, and before new software changes the registry.
+"""Back up a state folder as one file and restore it: for a failed disk, and before software upgrades.
 
 ```
 ident-backup.json        what this is: format, version, when, by which software
@@ -9,7 +9,7 @@ manifest.json            SHA-256 of each
 
 It is a tar file. Left out is what belongs to this machine and moment: locks, controls, the owner's token, preflight
 tickets, sessions of the page. The registry is copied first, so that what it names is in the file unless it was pruned
-meanwhile. Boundary: nothing here opens the registry of a running service other than to read it.
+meanwhile.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _HALF = (".mcap", ".mcap.partial")  # of a run that the registry does not know
 
 @dataclass(frozen=True)
 class Backup:
-    """A backup that was made, or put back.
+    """Backup that was made, or restored.
 
     Attributes:
         file: where it is.
@@ -119,7 +119,7 @@ def back_up(state: Path, file: Path, *, recordings: bool = True) -> Backup:
 
 
 def restore(file: Path, state: Path, who: str, *, replace: bool = False) -> Backup:
-    """Put a backup into a state folder, upgraded to this software; all of it is checked before anything changes.
+    """Restore a backup into a state folder, upgraded to this software; all is checked before anything changes.
 
     Args:
         file: the backup.
@@ -188,7 +188,7 @@ def _add_files(tar: tarfile.TarFile, state: Path, snapshot: Path, *, recordings:
             found = os.fstat(fd)
             if not stat.S_ISREG(found.st_mode):
                 continue
-            # What grows is taken as far as it is now.
+            # A growing file is copied up to its present length.
             entry = tarfile.TarInfo(_PREFIX + name)
             entry.size, entry.mtime, entry.mode = found.st_size, int(found.st_mtime), 0o600
             reader = _Hashing(stream)
@@ -199,10 +199,10 @@ def _add_files(tar: tarfile.TarFile, state: Path, snapshot: Path, *, recordings:
 
 
 def _documents(state: Path) -> Iterator[tuple[str, Path]]:
-    """Name and path of every file that is worth keeping."""
+    """Yield name and path of every file that belongs in a backup."""
     for folder, folders, files in os.walk(state):
         place = Path(folder).relative_to(state)
-        # What begins with a dot is being written, and has no name yet.
+        # Names with a leading dot are temporary: such files are still being written.
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         if not place.parts:
             folders[:] = [name for name in folders if not name.startswith(REPLACED)]
@@ -222,7 +222,7 @@ def _add_document(tar: tarfile.TarFile, name: str, content: Mapping[str, Any], a
 
 
 class _Hashing(io.RawIOBase):
-    """Reads a file and hashes what is read."""
+    """Reader that hashes what is read."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream, self.digest = stream, hashlib.sha256()
@@ -234,7 +234,7 @@ class _Hashing(io.RawIOBase):
 
 
 def _extract(file: Path, staging: Path) -> tuple[dict[str, Any], int, int]:
-    """Unpack a backup and check every hash; the head, how many files, and their bytes.
+    """Unpack a backup and check every hash; return its head, the number of files, and their bytes.
 
     Raises:
         UsageError: not a backup, or not whole.
@@ -304,7 +304,7 @@ def _read_document(tar: tarfile.TarFile, entry: tarfile.TarInfo, most: int) -> d
 
 
 def _standing(state: Path) -> list[str]:
-    """Names of what a state folder holds that restoring would touch."""
+    """Return the names of the state folder's entries that restoring would replace."""
     return [
         path.name
         for path in state.iterdir()
@@ -313,15 +313,16 @@ def _standing(state: Path) -> list[str]:
 
 
 def _exchange(state: Path, staging: Path) -> str | None:
-    """Let a folder's content take the place of what stands in the state folder; the folder that holds that now.
+    """Replace the state folder's content with a folder's; return the folder that holds the old content, or None.
 
-    The folder itself stays: its parent may be somebody else's. Between the first move and the last, `.restoring` is
-    there, and everybody refuses the state folder; whoever restores again begins anew, and what stood is kept.
+    The folder itself stays, because its parent may belong to somebody else. Between the first move and the last,
+    `.restoring` exists, and every process refuses the state folder; a restore that is run again begins anew, and the
+    old content is kept.
     """
     standing = [name for name in _standing(state) if name != RESTORING]
     marker, folder = state / RESTORING, None
     os.sync()  # what was unpacked, before anything moves
-    for left in marker.iterdir() if marker.exists() else ():  # by a restore that broke off
+    for left in marker.iterdir() if marker.exists() else ():  # left by a restore that was interrupted
         shutil.rmtree(left) if left.is_dir() else left.unlink()
     staging.rename(marker)
     if standing:

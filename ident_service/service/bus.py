@@ -1,7 +1,4 @@
-"""The bus budget of an arm: worked out, as text for people and as JSON values; refused where it does not fit.
-
-Boundary: what frames cost is `drivers/canopen/budget.py`; here it is asked for and shown.
-"""
+"""Compute the bus budget of an arm and format it as text and as JSON values; refuse one that does not fit."""
 
 from __future__ import annotations
 
@@ -19,7 +16,7 @@ _UNDER = f"  {'':<53}{'least':>8}{'typical':>8}{'worst':>8}{'least':>8}{'typical
 
 
 def bus_load(config: ArmConfig, rate: float | None = None) -> Budget:
-    """What an arm's frames cost on its buses.
+    """Return what an arm's frames cost on its buses.
 
     Args:
         config: the arm's.
@@ -35,7 +32,7 @@ def bus_load(config: ArmConfig, rate: float | None = None) -> Budget:
 
 
 def require_budget(arm: str | Path, config: ArmConfig) -> Budget | None:
-    """The budget of an arm with CANopen drives, which must fit; None for other arms.
+    """Return the bus budget of an arm with CANopen drives, which must fit; None for other arms.
 
     Args:
         arm: its file, or its name if it is shipped.
@@ -53,7 +50,7 @@ def require_budget(arm: str | Path, config: ArmConfig) -> Budget | None:
 
 
 def bus_lines(found: Budget) -> str:
-    """The verdict in one line a bus."""
+    """Format the verdict as one line per bus."""
     return "".join(
         f"bus {bus.profile.number} ({bus.profile.bus.channel}): {100 * bus.load.worst:.1f} % worst,"
         f" {100 * bus.load.typical:.1f} % typical at {found.rate:g} Hz; up to {bus.highest_rate} Hz\n"
@@ -62,7 +59,7 @@ def bus_lines(found: Budget) -> str:
 
 
 def bus_text(name: str, found: Budget) -> str:
-    """The budget for people, with a last line break."""
+    """Format the budget as text, with a last line break."""
     lines = [f"{name} at {found.rate:g} Hz: {'fits' if found.fits else 'DOES NOT FIT'}"]
     for bus in found.buses:
         lines += ["", *_bus_lines(bus)]
@@ -72,7 +69,7 @@ def bus_text(name: str, found: Budget) -> str:
 
 
 def bus_document(name: str, found: Budget) -> dict[str, Any]:
-    """The budget as JSON values."""
+    """Return the budget as JSON values."""
     return {
         "arm": name,
         "rate": found.rate,

@@ -1,7 +1,7 @@
-"""What the drives of an arm can, held against what the driver needs; as text for people and as JSON values.
+"""Compare the capabilities of an arm's drives with what the driver needs; format them as text and as JSON values.
 
-Drives are asked by SDO uploads alone; of one that does not answer, and of files without a drive, the data sheet
-foretells. Boundary: what is asked and how it is judged is `drivers/canopen/capabilities.py`.
+Drives are read by SDO uploads alone; for a drive that does not answer, and for files without a drive, the capabilities
+are derived from the data sheet.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from ident_service.errors import DriverError, UsageError
 
 @dataclass(frozen=True)
 class Probed:
-    """One drive, or one file.
+    """Capabilities of one drive, or of one data sheet.
 
     Attributes:
-        title: what it is called.
+        title: `drive N`, or the name of the file.
         node: number of the drive, as the description has it.
         silent: why it was not asked, or did not answer; empty for one that did.
-        can: what it can; None where neither it nor a file tells.
+        can: its capabilities; None where neither the drive nor a file tells them.
     """
 
     title: str
@@ -43,13 +43,13 @@ class Probed:
 
     @property
     def drivable(self) -> bool:
-        """Whether it can be driven as the description stands."""
+        """Return whether the drive can be driven as the description stands."""
         return self.can is not None and not (self.silent or self.can.problems or self.can.changes)
 
 
 @dataclass(frozen=True)
 class Probe:
-    """All of them.
+    """Capabilities of all drives of an arm, or of all data sheets.
 
     Attributes:
         probed: the drives in the arm's order, or the files.
@@ -65,7 +65,7 @@ class Probe:
 
     @property
     def good(self) -> bool:
-        """Whether every one can be driven."""
+        """Return whether every drive can be driven."""
         return all(one.drivable for one in self.probed)
 
     @property
@@ -79,7 +79,7 @@ def bus_probe(
     files: Sequence[TextFile] = (),
     open_bus: Callable[[ArmConfig], list[Link]] = open_links,
 ) -> Probe:
-    """Ask the drives of an arm what they can; nothing is changed.
+    """Read the capabilities of an arm's drives; nothing is changed.
 
     Args:
         config: the arm's.
@@ -88,7 +88,7 @@ def bus_probe(
 
     Raises:
         UsageError: the arm's driver has no bus.
-        DriverError: a bus that is in use, by another host too, or that cannot be had or is lost.
+        DriverError: a bus is in use, by another host too, cannot be opened, or is lost.
     """
     driver = config.driver
     if not isinstance(driver, CanopenDriver):
@@ -137,7 +137,7 @@ def _foretold(driver: CanopenDriver, number: int, file: TextFile) -> Capabilitie
 
 
 def probe_text(config: ArmConfig, found: Probe) -> str:
-    """A probe for people, with a last line break."""
+    """Format a probe as text, with a last line break."""
     bad = [one for one in found.probed if not one.drivable]
     verdict = f"{len(bad)} of {len(found.probed)} NOT AS IT IS" if bad else "every drive can be driven"
     lines = [f"{config.name}: {verdict}; nothing was written"]
@@ -175,7 +175,7 @@ def _lines(one: Probed, found: Probe) -> Iterator[str]:
 
 
 def _facts(one: Probed, found: Probe) -> dict[str, str]:
-    """Return what was chosen, in words; both forms of a probe have it."""
+    """Return the chosen torque path, limits, watchdogs and frames of a drive, in words."""
     can = one.can
     if can is None:
         return {}
@@ -200,7 +200,7 @@ def _facts(one: Probed, found: Probe) -> dict[str, str]:
 
 
 def probe_document(config: ArmConfig, found: Probe) -> dict[str, Any]:
-    """A probe as JSON values."""
+    """Return a probe as JSON values."""
     return {
         "arm": config.name,
         "good": found.good,

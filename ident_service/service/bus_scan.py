@@ -1,7 +1,4 @@
-"""Who is on the buses of an arm, held against its configuration; as text for people and as JSON values.
-
-Boundary: what nodes say is `drivers/canopen/scan.py`; here it is judged and shown.
-"""
+"""Compare the nodes on an arm's buses with its configuration; format them as text and as JSON values."""
 
 from __future__ import annotations
 
@@ -20,7 +17,7 @@ from ident_service.errors import UsageError
 
 
 class Match(StrEnum):
-    """How a node and the configuration go together."""
+    """Result of comparing a node with the configuration."""
 
     CONFIGURED = "configured"
     OTHER = "another one"  # than the configured one
@@ -34,15 +31,15 @@ _GOOD = (Match.CONFIGURED, Match.UNKNOWN)
 
 @dataclass(frozen=True)
 class Line:
-    """One node, or a configured drive that is not there.
+    """One node, or a configured drive that is missing.
 
     Attributes:
         bus: number of its bus, from 0.
         node: its number.
         drive: number of the configured drive, from 1; None for a node that is none.
-        match: how it goes with the configuration.
+        match: result of the comparison with the configuration.
         why: what is different, in words; empty where nothing is.
-        found: what it says; None where it is missing.
+        found: its identity, state and errors; None where it is missing.
     """
 
     bus: int
@@ -55,7 +52,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Scan:
-    """All buses.
+    """Nodes on all buses of an arm.
 
     Attributes:
         lines: by bus and node number.
@@ -66,12 +63,12 @@ class Scan:
 
     @property
     def complete(self) -> bool:
-        """See above."""
+        """Return whether every configured drive is there and is the configured one."""
         return all(line.match in _GOOD for line in self.lines)
 
 
 def bus_scan(config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_links) -> Scan:
-    """Listen and ask on every bus of an arm; nothing is changed.
+    """Find and identify the nodes on every bus of an arm; nothing is changed.
 
     Args:
         config: the arm's.
@@ -112,7 +109,7 @@ def _judged(node: FoundNode | None, drive: CanopenDrive) -> tuple[Match, str]:
 
 
 def scan_text(config: ArmConfig, found: Scan) -> str:
-    """A scan for people, with a last line break."""
+    """Format a scan as text, with a last line break."""
     lines = [f"{config.name}: {_verdict(found)}"]
     assert isinstance(config.driver, CanopenDriver)  # noqa: S101 - bus_scan has seen to it
     for number, bus in enumerate(config.driver.buses):
@@ -158,7 +155,7 @@ def _node_lines(line: Line) -> Iterator[str]:
 
 
 def scan_document(config: ArmConfig, found: Scan) -> dict[str, Any]:
-    """A scan as JSON values."""
+    """Return a scan as JSON values."""
     return {
         "arm": config.name,
         "complete": found.complete,

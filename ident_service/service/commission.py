@@ -1,4 +1,4 @@
-"""The whole job: move the arm twice, identify from one motion, validate on the other, keep everything in one folder."""
+"""Commission a simulated arm: move it twice, identify from one motion, validate on the other, in one folder."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ Tell = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Commissioning:
-    """What came out of the whole job.
+    """Result of a commissioning.
 
     Attributes:
         folder: where everything is.
@@ -100,7 +100,7 @@ def record_motion(
 
 
 def require_clear_from_home(model: ArmModel, motion: Excitation) -> None:
-    """See whether an arm that stands at home may be led along a motion and back.
+    """Check that an arm that stands at home may be moved along a motion and back.
 
     Raises:
         MotionRefused: it would leave limits, or come too near to something.
@@ -122,7 +122,7 @@ def simulate(
     tell: Tell = lambda _: None,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> Commissioning:
-    """Commission the simulated arm of a configuration and score the result against its truth.
+    """Commission the simulated arm of a configuration, and score the result against its true parameters.
 
     Args:
         config: with a simulated driver.
@@ -137,7 +137,7 @@ def simulate(
 
     Raises:
         UsageError: the folder exists, or the arm is not simulated.
-        ArmError: somebody asked for a stop.
+        ArmError: a stop was requested.
         IdentError: anything the steps raise; no folder is left behind.
     """
     if folder.exists():
@@ -148,7 +148,7 @@ def simulate(
         raise UsageError(f"{config.name} has no simulated driver; use a description that has one")
     first = excitation(model, "identification") if motion is None else replace(motion, name="identification")
     motions = [first, excitation(model, "validation")]
-    for planned in motions[1:]:  # the first is looked at when it begins; nothing shall have moved in vain
+    for planned in motions[1:]:  # the first is checked when it begins; a later refusal would waste it
         require_clear_from_home(model, planned)
     reports, observed = [], list[Truth]()
     with appearing_folder(folder) as staging:
@@ -161,7 +161,7 @@ def simulate(
                 arm.observer = observed.append
             report = record_motion(arm, model, planned, path, stop_requested)
             if report.state is not State.DONE:
-                # Who asked for a stop does not want to see the arm move again.
+                # After a requested stop the arm must not move again.
                 raise ArmError(f"{planned.name} motion: stopped on request; nothing was kept")
             reports.append(report)
             write_atomically(staging / f"{planned.name}.excitation.json", planned.to_json() + "\n")
@@ -182,7 +182,7 @@ def simulate(
 
 
 def score_document(scored: Score) -> dict[str, object]:
-    """A score as JSON values."""
+    """Return a score as JSON values."""
     return {
         "worst_identified_sigma": scored.worst_identified,
         "worst_identified_parameter": scored.worst_expression,

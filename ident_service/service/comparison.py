@@ -1,4 +1,4 @@
-"""Parameter sets against each other, from files to files: what `ident compare` does."""
+"""Compare parameter sets from files and write the results, as `ident compare` does."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ def compare_files(paths: Sequence[Path], out: Path | None = None) -> tuple[Compa
 
 
 def compare_into(reference: Path, folder: Path) -> Comparison:
-    """Compare a folder of results with a reference, and keep the comparison in it, named by its manifest.
+    """Compare a folder of results with a reference, and store the comparison in it, named by its manifest.
 
-    A kill in between leaves files that the manifest does not name, which nobody believes.
+    A kill in between leaves files that the manifest does not name, and which are therefore ignored.
 
     Args:
         reference: folder of results or parameter file.

@@ -1,7 +1,7 @@
-"""Delete runs, motions and arms; what refers to one is named first, and nothing that is in use goes.
+"""Delete runs, motions and arms; entries that refer to one are listed first, and nothing in use is deleted.
 
-A folder is renamed to a hidden name before the registry forgets it: a kill in between leaves a row without a folder,
-and whoever deletes again completes it. What was renamed is removed at the next start, too. The audit trail stays.
+A folder is renamed to a hidden name before its row is deleted: a kill in between leaves a row without a folder, and
+deleting again completes it. Renamed folders are also removed at the next start. The audit trail stays.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def delete_run(db: Database, state: Path, run: str, who: str, *, anyway: bool = 
 
 
 def delete_motion(db: Database, state: Path, motion: str, who: str, *, anyway: bool = False) -> list[Dependent]:
-    """Delete a motion, and the schedules that are to begin it; runs keep their copy of it. As `delete_run`."""
+    """Delete a motion, and the schedules that would run it; runs keep their copy of it. Arguments as `delete_run`."""
     row = known_motion(db, motion)
     found = _of_motion(db, row)
     _require_idle(db, f"the motion {motion}", _jobs_about(db, row["arm"], motion))
@@ -68,7 +68,7 @@ def delete_motion(db: Database, state: Path, motion: str, who: str, *, anyway: b
 
 
 def delete_arm(db: Database, state: Path, arm: str, who: str, *, anyway: bool = False) -> list[Dependent]:
-    """Delete an arm that was uploaded, with its motions, runs, schedules and acceptances; as `delete_run`.
+    """Delete an uploaded arm with its motions, runs, schedules and acceptances; arguments as `delete_run`.
 
     A shipped arm of the same name is there again afterwards.
 
@@ -96,7 +96,7 @@ def delete_arm(db: Database, state: Path, arm: str, who: str, *, anyway: bool = 
     ]
     _require_none(f"the arm {arm}", found, anyway=anyway)
     with ExitStack() as held:
-        try:  # from now on nobody at a terminal moves it
+        try:  # held, so that nobody at a terminal can move the arm
             held.enter_context(ControlFile.take(control_path(state, arm), None))
         except DriverError as error:
             raise InUse(f"the arm {arm} is being moved: {error}") from None
@@ -108,7 +108,7 @@ def delete_arm(db: Database, state: Path, arm: str, who: str, *, anyway: bool = 
         with db.transaction():
             if db.row("SELECT id FROM runs WHERE arm = ?", arm):
                 raise InUse(f"a run of the arm {arm} came meanwhile; delete the arm again")
-            # In here, so that whoever adds the arm again finds its description, or does not.
+            # Within the transaction, so that adding the arm again sees its description either complete or gone.
             gone = [_hide(arm_folder(state, arm))]
             gone += [_hide(path) for path in (place.iterdir() if place.is_dir() else ()) if own.fullmatch(path.name)]
             for table in ("schedules", "dues", "alarms", "acceptances", "reidentifications", "maintenance_events"):
@@ -121,7 +121,7 @@ def delete_arm(db: Database, state: Path, arm: str, who: str, *, anyway: bool = 
 
 
 def remove_deleted(state: Path) -> None:
-    """Remove what was being deleted when a process died."""
+    """Remove the hidden folders of deletions that a killed process left unfinished."""
     for place in (state / name for name in _PLACES):
         _remove(path for path in (place.iterdir() if place.is_dir() else ()) if path.name.endswith(_GONE))
 
@@ -153,7 +153,7 @@ def _numbered(
 
 
 def _made_from(db: Database, arm: str, run: str) -> list[str]:
-    """Return runs and exports that were made from the recordings of a run."""
+    """Return the ids of runs and exports that were made from the recordings of a run."""
     return [
         job["run"]
         for job in db.rows("SELECT * FROM jobs WHERE arm = ? AND state = 'done' ORDER BY number", arm)
@@ -187,11 +187,11 @@ def _require_none(what: str, found: list[Dependent], *, anyway: bool) -> None:
 
 
 def forget_run(db: Database, state: Path, run: str, who: str) -> None:
-    """Delete a run whatever refers to it: its folder first, then its row; raises UnknownId."""
+    """Delete a run even if something refers to it: its folder first, then its row; raises UnknownId."""
     row = known_run(db, run)
     gone = _hide(state / RUNS / run)
     with db.transaction():
-        # The hours that the arm has been driven are not forgotten.
+        # The operating hours of the run still count for the arm's schedules.
         db.write("UPDATE schedules SET counted = counted - ? WHERE arm = ?", row["seconds"] or 0.0, row["arm"])
         db.write("DELETE FROM runs WHERE id = ?", run)
         note(db, who, "run deleted", run, arm=row["arm"], manifest_sha256=row["manifest_sha256"])

@@ -1,7 +1,4 @@
-"""A description as it is judged before anybody uses it: its mistakes, its bus budget, its gains; as text and as values.
-
-Boundary: the work is `config/load.py`, `service/bus.py` and `motion/preflight/stability.py`; here it is put together.
-"""
+"""Check a description before use: its mistakes, its bus budget, its gains; format the result."""
 
 from __future__ import annotations
 
@@ -26,14 +23,14 @@ _NAMED = re.compile(r"kinematics\.(\w+): ")  # the key that a complaint about a 
 
 @dataclass(frozen=True)
 class CheckedDescription:
-    """A description without mistakes.
+    """Description without mistakes.
 
     Attributes:
         model: of its arm.
         budget: of its buses; None for an arm without CANopen drives.
         gains: how stable they are; None for an arm that can be identified but not moved.
         after_stop: what follows a stop, or why nothing may move; None likewise.
-        warnings: what is allowed and probably not meant, in words.
+        warnings: what is allowed but probably a mistake, in words.
     """
 
     model: ArmModel
@@ -44,20 +41,20 @@ class CheckedDescription:
 
     @property
     def good(self) -> bool:
-        """Whether nothing is objected to."""
+        """Return whether there are no objections to the gains or to what follows a stop."""
         return (self.gains is None or self.gains.stable) and not isinstance(self.after_stop, str)
 
 
 def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescription:
-    """Judge a description.
+    """Check a description: load it, build its model, and judge bus budget, gains and stop behaviour.
 
     Args:
         arm: its file, or its name if it is shipped.
         upload: whether somebody has sent it (`load_arm`).
 
     Raises:
-        ConfigError: every mistake in it, each with line and column; a mechanism that cannot be computed with, and a bus
-            budget that does not fit, are one.
+        ConfigError: every mistake in it, each with line and column; also for an invalid mechanism, and for a bus
+            budget that does not fit.
     """
     config = load_arm(arm, upload=upload)
     try:
@@ -80,7 +77,7 @@ def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescri
 
 
 def _place(message: str) -> tuple[str, ...]:
-    """The keys that a model's complaint is about."""
+    """Return the keys of the description that a model's error message is about."""
     if named := _NAMED.search(message):
         return ("kinematics", named.group(1))
     about = {
@@ -93,7 +90,7 @@ def _place(message: str) -> tuple[str, ...]:
 
 
 def _require_names(arm: str | Path, model: ArmModel, where: tuple[str, ...]) -> None:
-    """See that a simulated plant's parameters are those of this arm."""
+    """Check that a simulated plant's parameters are those of this arm."""
     section: Any = model.config
     for key in where:
         section = getattr(section, key, None)
@@ -105,7 +102,7 @@ def _require_names(arm: str | Path, model: ArmModel, where: tuple[str, ...]) -> 
 
 
 def description_document(checked: CheckedDescription) -> dict[str, Any]:
-    """As JSON values."""
+    """Return a checked description as JSON values."""
     config, report = checked.model.config, checked.gains
     gains = None if report is None else {"stable": report.stable, "objections": report.objections()}
     return {
@@ -121,7 +118,7 @@ def description_document(checked: CheckedDescription) -> dict[str, Any]:
 
 
 def description_text(arm: str, checked: CheckedDescription) -> str:
-    """For a person; `arm` as they named it."""
+    """Format a checked description as text; `arm` as the user named it."""
     model = checked.model
     head = f"{arm}: {model.config.name}, {model.chain.joints} joints, {model.layout.size} parameters: good\n"
     if (payload := model.config.payload) is not None:
@@ -137,7 +134,7 @@ def description_text(arm: str, checked: CheckedDescription) -> str:
 
 
 def _after_stop_text(follows: AfterStop | str | None) -> str:
-    """One line, or none for an arm without a model."""
+    """Format what follows a stop as one line; empty for an arm without a model."""
     words = {
         AfterStop.BRAKE: "held for two seconds, then left to brakes or to itself; nothing can fall",
         AfterStop.HOLD: "held until a person confirms that the arm is supported (`ident supported`)",
@@ -149,7 +146,7 @@ def _after_stop_text(follows: AfterStop | str | None) -> str:
 
 
 def _gains_text(report: StabilityReport) -> str:
-    """Margins per joint, and what is objected to."""
+    """Format the stability margins per joint, and the objections to them."""
     joints = report.joints
     width = max(5, *(len(one.joint) for one in joints))
     cycles = "one cycle" if report.delay_cycles == 1 else f"{report.delay_cycles} cycles"

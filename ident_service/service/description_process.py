@@ -1,6 +1,7 @@
-"""Judge a description that somebody has sent, as a program; `judge_apart` runs it within limits.
+"""Judge an uploaded description as a separate program; `judge_apart` runs it within limits.
 
-A description within the limits of size has been read in the daemon by then; here stands what computes with it.
+The daemon has loaded the description by then, within the limits of size; this process does the computations on its
+model.
 """
 
 from __future__ import annotations
@@ -12,20 +13,20 @@ from typing import Any, Final
 from ident_service.errors import ConfigError, IdentError, ModelError, Problem
 from ident_service.model.limited_process import answer_within, ask_process
 
-MOST_MEMORY: Final = 2 * 2**30  # bytes of addresses
-MOST_SECONDS: Final = 20  # of computing; ordinary arms take one
+MOST_MEMORY: Final = 2 * 2**30  # bytes of address space
+MOST_SECONDS: Final = 20  # s of CPU time; ordinary arms take one
 _DEADLINE = 60.0  # s
 
 
 def judge_apart(path: Path) -> dict[str, Any]:
-    """Judge an uploaded description in a process of its own.
+    """Judge an uploaded description in a separate process.
 
     Returns:
         `arm`, `sha256`, `stable`, `objections` and `text`.
 
     Raises:
         ConfigError: its mistakes.
-        ModelError: whatever else stands against it, or it takes too long or breaks what computes with it.
+        ModelError: any other error of it, or judging it takes too long or crashes.
     """
     try:
         answer = ask_process("ident_service.service.description_process", path, _DEADLINE)
@@ -58,7 +59,7 @@ def _document(path: str) -> dict[str, Any]:
 
 
 def main(words: list[str]) -> int:
-    """Judge one file."""
+    """Judge the description file that the first argument names."""
     return answer_within(MOST_MEMORY, MOST_SECONDS, lambda: _document(words[0]))
 
 

@@ -1,4 +1,4 @@
-"""Design a motion for an arm and keep everything in one folder: motion, search, preview, drawings."""
+"""Design a motion for an arm and write motion, search, preview and drawings to one folder."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ FILES = (MOTION, SEARCH, PREVIEW, DOCUMENT, *DRAWINGS)
 
 @dataclass(frozen=True)
 class Knowledge:
-    """What is known of an arm beside its description.
+    """Data about an arm beside its description: identified parameters, noise, recordings.
 
     Attributes:
         parameters: a parameter file whose link parameters predict the torques, instead of the prior.
@@ -56,7 +56,7 @@ class Knowledge:
 
 @dataclass(frozen=True)
 class DesignRequest:
-    """What is asked for.
+    """Request to design a motion.
 
     Attributes:
         arm: description file, or the name of a shipped one.
@@ -83,7 +83,7 @@ def design_files(
     tell: Callable[[Progress], None] = lambda _: None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> tuple[Designed, Preview]:
-    """Search for a motion and write it, the search, and its preview.
+    """Search for a motion and write the motion, the search, and a preview.
 
     Args:
         request: what is asked for.
@@ -92,7 +92,7 @@ def design_files(
         cancelled: True ends the search with what it has.
 
     Raises:
-        UsageError, ConfigError: the request or the description cannot be meant.
+        UsageError, ConfigError: the request or the description is not valid.
         MotionRefused: limits that contradict each other, home in collision, no posture that keeps them.
         RecordingError, ParameterError: a file of the knowledge cannot be used.
     """
@@ -131,7 +131,7 @@ def design_files(
 
 
 def preview_files(arm: str, motion: Path | None, knowledge: Knowledge, folder: Path | None) -> Preview:
-    """Look at a motion, and draw it where a folder is given.
+    """Preview a motion, and write text and drawings where a folder is given.
 
     Args:
         arm: description file, or the name of a shipped one.
@@ -140,7 +140,7 @@ def preview_files(arm: str, motion: Path | None, knowledge: Knowledge, folder: P
         folder: where the text and the drawings go; others in it stay.
 
     Raises:
-        UsageError, ConfigError: a file that does not exist or cannot be meant.
+        UsageError, ConfigError: a file that does not exist or is not valid.
         MotionRefused: the motion was made for another arm.
     """
     model = known_model(arm, knowledge)
@@ -161,7 +161,7 @@ def write_preview(folder: Path, seen: Preview) -> None:
 
 
 def known_model(arm: str, knowledge: Knowledge) -> ArmModel:
-    """The arm's model, with identified link parameters where the knowledge has some.
+    """Return the arm's model, with identified link parameters if the knowledge has some.
 
     Raises:
         UsageError: the parameter file has no link parameters of this arm.
@@ -179,14 +179,14 @@ def known_model(arm: str, knowledge: Knowledge) -> ArmModel:
 
 
 def known_noise(model: ArmModel, knowledge: Knowledge) -> NoiseModel:
-    """The noise of the arm's torques, as far as known."""
+    """Return the noise model of the arm's torques, from the knowledge or else from the description."""
     if knowledge.noise is not None:
         return recorded_noise(knowledge.noise, model)
     return described_noise(model, motion_limits(model.config))
 
 
 def known_information(model: ArmModel, base: BaseParameters, knowledge: Knowledge, noise: Array) -> Array | None:
-    """Information of the recordings, whitened by `noise` of shape (joints,), shape (base, base); None without any."""
+    """Return the information of the recordings, whitened by `noise` of shape (joints,); None without any."""
     if not knowledge.recordings:
         return None
     opened = open_together(knowledge.recordings, model).recordings
@@ -214,7 +214,7 @@ def _changed(design: Design, changes: dict[str, Any]) -> Design:
 
 
 def _of_length(design: Design, length: float, given: frozenset[str]) -> Design:
-    """Return a design whose Fourier motion lasts a time [s]: as many periods as come nearest to the base frequency.
+    """Return a design whose Fourier motion lasts `length` [s], in whole periods near the base frequency.
 
     Raises:
         UsageError: nothing is left between the ramps, or the length follows from what else was given.

@@ -1,4 +1,4 @@
-"""A description of an arm as it is drawn up, and as the YAML file that a person goes on with."""
+"""Draft an arm's description, and write it as the YAML file that a person completes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LARGEST_USE = 0.6  # share of the limits of the first motion that is tried
 
 @dataclass
 class Draft:
-    """What is decided, to be written as YAML.
+    """Decided content of a description, to be written as YAML.
 
     Attributes:
         name: of the arm.
@@ -55,12 +55,12 @@ class Draft:
 
 
 def short(value: float, digits: int = 4) -> float:
-    """A number as people write it."""
+    """Round a number to some significant digits."""
     return float(f"{value:.{digits}g}")
 
 
 def in_yaml(draft: Draft) -> str:
-    """The description as YAML with comments."""
+    """Return the description as YAML with comments."""
     guessed = "\n".join(f"#   {line}" for line in draft.remarks)
     head = f"""\
 # {draft.name}, begun by `ident new` from {draft.urdf}. Look through it before a real arm moves by it.
@@ -126,6 +126,6 @@ terms: [drive_inertia, viscous, coulomb, offset]
 
 
 def _flow(value: Any) -> str:
-    """A value in YAML's flow style on as many lines as it needs, indented as a nested value."""
+    """Return a value in YAML's flow style on one line."""
     text = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10**6).strip()
     return text.removesuffix("\n...").removesuffix("...").strip()

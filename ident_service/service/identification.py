@@ -1,4 +1,4 @@
-"""From recording files to a folder of results: what `ident identify` does."""
+"""Identify an arm from recording files and write a folder of results, as `ident identify` does."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from ident_service.service.recordings import (
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked for.
+    """Request for an identification: recordings and options.
 
     Attributes:
         arm: description file or name of a shipped one.
@@ -86,7 +86,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Identified:
-    """What came out.
+    """Result of an identification, and the files written.
 
     Attributes:
         estimate: with everything known of it.
@@ -112,7 +112,7 @@ def identify_files(request: Request, folder: Path, tell: Callable[[str], None] =
         tell: called with a line at each step that takes longer.
 
     Raises:
-        UsageError, ConfigError: the request or the arm's description cannot be meant, or the folder holds anything
+        UsageError, ConfigError: the request or the arm's description is not valid, or the folder holds anything
             else.
         RecordingError: a recording cannot be used.
         SolverError: a solver stopped without an optimum.
@@ -146,7 +146,7 @@ def identify_files(request: Request, folder: Path, tell: Callable[[str], None] =
     except CustomError as error:
         raise mistake(request.arm, CUSTOM, str(error)) from error
     except SolverError as error:
-        # Numbers of another size than the solver can hold are the recording's fault, and the reason says so.
+        # Values too large or small for the solver come from the recording; the error then names the reason.
         for recording, seen in found:
             for reason in reasons_in_recording(recording.path.name, seen.joints, model):
                 raise RecordingError(recording.path, reason) from error
@@ -194,7 +194,7 @@ def custom_of(arm: str, config: ArmConfig) -> CustomFunction | None:
 
 
 def unusable_because(estimate: Estimate, found: Sequence[tuple[Recording, Quality]]) -> tuple[str, ...]:
-    """Say why an estimate must not be used, from the recordings that it knows and from its errors."""
+    """Return the reasons, from its recordings and its errors, why an estimate must not be used."""
     model = estimate.model
     seen = (reasons_in_recording(recording.path.name, one.joints, model) for recording, one in found)
     fitted = set(estimate.recordings)

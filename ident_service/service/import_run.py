@@ -1,4 +1,4 @@
-"""A run folder from another machine, brought below the state folder: verified, copied whole, entered.
+"""Import a run folder from another machine below the state folder: verify it, copy it, enter it.
 
 Only what the manifest names is copied, by plain names, into a folder of a plain name: nothing in it can lead elsewhere.
 """
@@ -23,7 +23,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,119}")
 
 
 def import_run(db: Database, state: Path, folder: Path, who: str) -> Row:
-    """Import a run folder.
+    """Import a run folder into the state folder and the registry.
 
     Args:
         db: the registry.
@@ -65,11 +65,11 @@ def import_run(db: Database, state: Path, folder: Path, who: str) -> Row:
 def _copy(folder: Path, target: Path) -> None:
     with appearing_folder(target) as staging:
         for name in (*named_files(folder), MANIFEST):
-            # Without following a link that has come since it was looked at.
+            # Without following a link that was put there since the verification.
             fd = os.open(folder / name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
             with os.fdopen(fd, "rb") as reading, (staging / name).open("xb") as writing:
                 shutil.copyfileobj(reading, writing, 1 << 20)
                 writing.flush()
                 os.fsync(writing.fileno())
-        # Of the copy, which nobody else can change any more.
+        # Verifies the copy, which nobody else can change.
         verified_files(staging)

@@ -1,9 +1,9 @@
-"""A run while it moves, for those who watch: samples thinned for the eye, and doubt that shrinks.
+"""Show a run while it moves: samples thinned for display, and parameter deviations so far.
 
-All is read from what the recorder has flushed into the run's file: the motion process, its ring and its recorder are
-never asked for anything. Ten viewers cost what one does: whoever looks first reads on for all. Doubt is worked out by a
-thread, one bounded step every second and a half, and only while somebody watches. The thread keeps the service's own
-priority: with a lower one it could be kept waiting while it holds the interpreter, and a stop with it.
+All is read from what the recorder has flushed into the run's file: the motion process, its ring buffer and its recorder
+are never asked for anything. Ten viewers cost as much as one: the first to ask reads on for all. The parameter
+deviations are computed by a thread, one bounded step every 1.5 s, and only while somebody watches. The thread keeps the
+service's own priority: with a lower one it could be kept waiting while it holds the interpreter, and a stop with it.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from ident_service.errors import IdentError, RecordingError
 from ident_service.record.recording import Block
 from ident_service.record.tail import RecordingTail, Samples
 
-if TYPE_CHECKING:  # estimation is loaded by the thread that needs it: the service starts without
+if TYPE_CHECKING:  # the thread that needs estimation imports it, so that the service starts without
     from ident_service.estimation.growing import Doubt, GrowingInformation
 
 ARM, RECORDING = "arm.json", "run.mcap"
-BIN_NS: Final = 20_000_000  # one point for the eye
-_LOOK = 0.08  # s between looks at the file, however many watch
-_WORK = 1.5  # s between steps of the doubt
-_PATIENCE = 5.0  # s without a viewer, after which nobody works for them
-_FRAMES = 600  # that are kept for who comes late
-_MOST_WAITING = 120  # pieces of at most a MiB of the file that may wait for the doubt
+BIN_NS: Final = 20_000_000  # one point of the display
+_LOOK = 0.08  # s between reads of the file, however many viewers there are
+_WORK = 1.5  # s between updates of the deviations
+_PATIENCE = 5.0  # s without a viewer, after which the deviations are not updated
+_FRAMES = 600  # frames kept for viewers who join late
+_MOST_WAITING = 120  # pieces of at most a MiB of the file that may wait for the thread
 _MOST_RUNS = 8
 _LOG = logging.getLogger("ident.live")
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One piece of news, as JSON: `kind` is `samples` or `doubt`."""
+    """One event for viewers, as JSON: `kind` is `samples` or `doubt`."""
 
     number: int
     kind: str
@@ -50,10 +50,10 @@ class Frame:
 
 
 class LiveRun:
-    """One run that is being recorded; used from any thread."""
+    """One run that is being recorded, with its viewers' events; may be used from any thread."""
 
     def __init__(self, folder: Path, now: Callable[[], float] = time.monotonic) -> None:
-        """Nothing is read before the first look.
+        """Create the follower; nothing is read before the first call of `since`.
 
         Args:
             folder: of the run, there or not yet.
@@ -72,7 +72,7 @@ class LiveRun:
         self.broken = ""
 
     def since(self, number: int) -> list[Frame]:
-        """News after the frame of this number; reads on in the file if nobody has just done so."""
+        """Return the frames after this number; read on in the file if no viewer has just done so."""
         now = self._now()
         self._seen = now
         if self._lock.acquire(blocking=False):
@@ -88,7 +88,7 @@ class LiveRun:
         return [frame for frame in list(self._frames) if frame.number > number]
 
     def close(self) -> None:
-        """Let the file go."""
+        """Close the file."""
         with self._lock:
             self._seen = -math.inf
             if self._tail is not None:
@@ -118,7 +118,7 @@ class LiveRun:
             self._worker.start()
 
     def _thinned(self, samples: Samples, names: tuple[str, ...]) -> dict[str, Any]:
-        """The last position and torque of every 20 ms, and the largest following error in them."""
+        """Return the last position and torque of every 20 ms, and the largest following error in them."""
         if self._first_ns is None:
             self._first_ns = int(samples.stamp_ns[0])
         bins = (samples.stamp_ns - self._first_ns) // BIN_NS
@@ -139,7 +139,7 @@ class LiveRun:
         self._number += 1
         self._frames.append(Frame(self._number, kind, json.dumps(value, allow_nan=False)))
 
-    # --- the thread that works out the doubt
+    # --- the thread that computes the deviations
 
     def _work(self) -> None:
         from ident_service.estimation.growing import GrowingInformation
@@ -150,7 +150,7 @@ class LiveRun:
                 self._growing = GrowingInformation(arm_model(arm_from_json(self._folder / ARM)))
             while self._now() - self._seen < _PATIENCE:
                 time.sleep(_WORK)
-                # What was not looked at is not in the factor, and a gap must not be told as knowledge.
+                # Samples were dropped: the deviations would be those of a run with a gap.
                 if self._lost:
                     return
                 self._one_step(self._growing)
@@ -169,13 +169,13 @@ class LiveRun:
 
 
 class LiveRuns:
-    """The runs that somebody watches, the last few."""
+    """Table of the runs that somebody watches, the last few."""
 
     def __init__(self) -> None:
         self._lock, self._runs = threading.Lock(), OrderedDict[str, LiveRun]()
 
     def run(self, name: str, folder: Path) -> LiveRun:
-        """The one of this id."""
+        """Return the run of this id, added if it is new."""
         with self._lock:
             found = self._runs.setdefault(name, LiveRun(folder))
             self._runs.move_to_end(name)
@@ -184,12 +184,12 @@ class LiveRuns:
         return found
 
     def close(self) -> None:
-        """Forget all."""
+        """Close all runs."""
         for name in list(self._runs):
             self.forget(name)
 
     def forget(self, name: str) -> None:
-        """One that has ended."""
+        """Close and remove a run that has ended."""
         with self._lock:
             found = self._runs.pop(name, None)
         if found is not None:
@@ -224,5 +224,5 @@ def _told(doubt: Doubt, expressions: tuple[str, ...], units: tuple[str, ...]) ->
 
 
 def _numbers(values: np.ndarray[Any, Any], digits: int) -> list[float | None]:
-    """Numbers for JSON; null for one that is none."""
+    """Return rounded numbers for JSON; None for one that is not finite."""
     return [round(value, digits) if math.isfinite(value) else None for value in values.tolist()]

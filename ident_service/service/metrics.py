@@ -1,4 +1,4 @@
-"""Figures of the service for Prometheus, by its own client library.
+"""Collect the metrics of the service for Prometheus, with its own client library.
 
 | figure | tells |
 |---|---|
@@ -7,7 +7,7 @@
 | `ident_cycle_lateness_seconds` | how late cycles of runs woke, from what each run wrote down |
 | `ident_job_seconds`, `ident_job_wait_seconds` | how long jobs took, and waited |
 
-Counts are since the service was started. What the registry knows is read when somebody asks.
+Counts are since the service was started. Gauges are read from the registry at each request.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Sizes = Mapping[str, int]
 
 
 class Metrics:
-    """Counters and histograms; used from any thread, none of which waits."""
+    """Counters and histograms; may be used from any thread, and never waits."""
 
     def __init__(self) -> None:
         self._registry = registry = CollectorRegistry()
@@ -73,11 +73,11 @@ class Metrics:
             self._stop.observe(seconds)
 
     def renewed(self, age: float) -> None:
-        """Count a lease that was renewed at an age [s]."""
+        """Record the renewal of a lease at an age [s]."""
         self._lease.observe(age)
 
     def job(self, kind: str, state: str, waited: float, ran: float | None) -> None:
-        """Count a job that has ended.
+        """Record a job that has ended.
 
         Args:
             kind: of the job.
@@ -90,13 +90,13 @@ class Metrics:
             self._job.labels(kind, state).observe(ran)
 
     def lateness(self, document: Any) -> None:
-        """Add the cycles of a run, as its `ended.json` tells them; anything else is left out."""
+        """Add the cycles of a run from its `ended.json`; a document of another form is left out."""
         self._lateness.add(document)
 
     def text(
         self, jobs: Mapping[tuple[str, str], int], moving: Iterable[str], faults: Sizes, due: Sizes, alarms: Sizes
     ) -> str:
-        """Write all figures in the text format.
+        """Return all metrics in Prometheus' text format.
 
         Args:
             jobs: number by kind and state.
@@ -111,7 +111,7 @@ class Metrics:
 
 
 class _Now(Collector):
-    """What the registry and the arms' files say now."""
+    """Collector of gauges: the present state of the registry and the arms' files."""
 
     def __init__(self, jobs: Mapping[tuple[str, str], int], moving: Sizes, faults: Sizes, due: Sizes, alarms: Sizes):
         self._jobs, self._arms = jobs, {"moving": moving, "faults": faults, "due": due, "drift_alarms": alarms}
@@ -135,13 +135,13 @@ class _Now(Collector):
 
 
 class _Lateness(Collector):
-    """Cycles of runs by how late they woke: sums of the runs' own histograms (`motion/histogram.py`)."""
+    """Collector of the wake-up lateness of cycles: sums of the runs' own histograms (`motion/histogram.py`)."""
 
     def __init__(self) -> None:
         self._lock, self._edges, self._counts = threading.Lock(), list[float](), list[int]()
 
     def add(self, document: Any) -> None:
-        """Add one run's; a document of another shape is left out."""
+        """Add the histogram of one run; a document of another form is left out."""
         if not isinstance(document, dict):
             return
         edges, counts = document.get("edges_us"), document.get("counts")

@@ -1,4 +1,4 @@
-"""A motion as drawings: joints over time, and the arm as a stick figure along it."""
+"""Draw a motion: joints over time, and the arm as a stick figure along it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _SAMPLES, _POSTURES = 6000, 400
 
 
 def drawings(seen: Preview) -> dict[str, str]:
-    """The SVG files of a preview, by name."""
+    """Return the SVG files of a preview, by name."""
     name = f"{seen.excitation.name} motion of {seen.model.config.name}"
     pictures = (joints_over_time(_traces(seen), name), stick_figure(_postures(seen), name))
     return dict(zip(DRAWINGS, pictures, strict=True))
@@ -93,7 +93,7 @@ def _solid(name: str, obstacle: ConfiguredObstacle) -> Box | Plane | Rod:
 
 
 def _turned(rpy: tuple[float, float, float]) -> Array:
-    """Roll about x, pitch about y and yaw about z of the base, in this order, shape (3, 3)."""
+    """Return the rotation by roll about x, pitch about y and yaw about z of the base, in this order, shape (3, 3)."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
     x = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
     y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])

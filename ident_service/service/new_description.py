@@ -1,9 +1,9 @@
-"""A first description of an arm from its URDF: everything that a simulated run needs, guessed where nothing is known.
+"""Draft an arm's description from its URDF, with all that a simulated run needs, guessed where unknown.
 
-What the URDF says is taken over; what it lacks is guessed as a careful person would, and said to be a guess in a
-comment. The simulated arm is another one than the prior: its links, drives and friction are drawn about it, so that
-identifying it shows what identification does. Before anything is written, the description is loaded, home and both
-motions are found clear; gains that are not stable are said to be.
+Values of the URDF are taken over; missing ones are guessed cautiously, and marked as guesses in a comment. The
+simulated arm differs from the prior: its links, drives and friction are drawn at random about it, so that identifying
+it shows what identification does. Before anything is written, the description is loaded, and home and both motions are
+checked to be clear; gains that are not stable are reported.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ from ident_service.service.commission import require_clear_from_home
 from ident_service.service.draft import CLEARANCE, ENCODER, LARGEST_USE, RATE, Draft, in_yaml, short
 from ident_service.service.urdf_says import Said, arm_part, said_of
 
-_MOST_TURNS = 8.0 * np.pi  # rad, from which a range is degrees
+_MOST_TURNS = 8.0 * np.pi  # rad; a larger range is taken for degrees
 _TURN, _SLIDE = 3.14, 0.5  # rad and m either way, of joints without limits
 _VELOCITY = {True: 2.0, False: 0.3}  # rad/s, m/s
-_SECONDS = 0.25  # in which a joint reaches its velocity, at most acceleration
+_SECONDS = 0.25  # s in which a joint reaches its velocity limit at its acceleration limit
 _FOLLOWS = {True: 0.2, False: 0.05}  # rad, m
 _GAINS = ((400.0, 40.0), (225.0, 30.0), (100.0, 20.0), (49.0, 14.0))  # all of damping 1
-_LIGHT = 0.3  # of the torque limits, that holding home should take at most
-_HEAVY = 1.5  # times what holds the arm anywhere, that a torque limit should be at least
+_LIGHT = 0.3  # share of the torque limits that holding the home posture may take
+_HEAVY = 1.5  # smallest torque limit in units of the largest gravity torque
 _FRICTION = 0.03  # of the torque limit, Coulomb, and viscous at the velocity limit
 _DRIVE = 0.02  # s in which a geared drive alone would reach its velocity limit with its torque limit
-_RATE_SHARE = 0.15  # of the torque rate that the guard lets through, that a motion's jerk may ask for
+_RATE_SHARE = 0.15  # share of the guard's torque-rate limit that a motion's jerk may use
 _POSTURES, _SEED = 300, 20140101
 _COUNT_SHARE = 0.4  # of the torque rate that the guard lets through, that one count of the encoder may make
 _CUTOFFS = (30.0, 20.0, 15.0, 10.0)  # Hz, of the velocity's low-pass: slow where a count makes much torque
@@ -71,7 +71,7 @@ def new_description(
     tip: str | None = None,
     tell: Callable[[str], None] = lambda _: None,
 ) -> tuple[Path, tuple[str, ...]]:
-    """Write the description of an arm, and its URDF beside it where that is elsewhere.
+    """Write the description of an arm, and a copy of its URDF beside it.
 
     Args:
         urdf: the file.
@@ -137,7 +137,7 @@ def _plain(name: str) -> str:
 
 
 def _which(model: ArmModel, draft: Draft) -> list[str]:
-    """What the arm is, where the file holds more."""
+    """Return a remark on which part of the URDF is the arm, where the file holds more."""
     file = model.config.kinematics.urdf
     if file is None or "tip" not in draft.part:
         return []
@@ -148,7 +148,7 @@ def _which(model: ArmModel, draft: Draft) -> list[str]:
 
 
 def _joints(draft: Draft, model: ArmModel, said: Mapping[str, Said]) -> None:
-    """Limits of every joint: the URDF's, else guesses; torque limits that can hold the arm."""
+    """Set the limits of every joint: the URDF's, else guesses; torque limits that can hold the arm."""
     chain = model.chain
     likely = likely_bodies(with_urdf_bodies(model))
     if likely.guessed:
@@ -194,7 +194,7 @@ def _joints(draft: Draft, model: ArmModel, said: Mapping[str, Said]) -> None:
         if missing:
             draft.remarks.append(f"{name}: {', '.join(missing)} limit guessed; the URDF has none that could be meant")
         draft.joints[name] = {
-            # What the URDF says to the digit: a limit that is rounded may be wider than the arm's.
+            # The URDF's exact values: a rounded limit may be wider than the arm's.
             "position": list(ranges[k]),
             "velocity": velocity,
             "acceleration": short(acceleration),
@@ -215,7 +215,7 @@ def _prior(model: ArmModel) -> Array:
 
 
 def _worst(model: ArmModel, ranges: list[tuple[float, float]]) -> tuple[Array, Array]:
-    """Largest torque of gravity, and largest inertia of each joint, over random postures."""
+    """Return the largest gravity torque and the largest inertia of each joint over random postures."""
     low, high = np.array(ranges).T
     dynamics = InverseDynamics(model.chain, model.layout, _prior(model))
     still, gravity, inertia = np.zeros(model.chain.joints), np.zeros(model.chain.joints), np.zeros(model.chain.joints)
@@ -226,7 +226,7 @@ def _worst(model: ArmModel, ranges: list[tuple[float, float]]) -> tuple[Array, A
 
 
 def _bodies(draft: Draft, loaded: Callable[[], ArmModel], folder: Path) -> None:
-    """Capsules in place of meshes, and pairs that touch whatever the arm does."""
+    """Set capsules in place of meshes, and list the pairs of links that touch in most postures."""
     model = loaded()
     chain = model.chain
     capsules, unread = mesh_capsules(model.config.kinematics, chain, folder)
@@ -273,7 +273,7 @@ def _home(draft: Draft, loaded: Callable[[], ArmModel]) -> ArmModel:
     good = (free >= 3.0 * CLEARANCE) & (held <= _LIGHT)
     if good.any():
         place = int(np.argmax(good))
-    else:  # the lightest of those that have room, or what has most
+    else:  # the least torque among postures with clearance, or the one with most clearance
         roomy = free >= min(3.0 * CLEARANCE, float(free.max()))
         place = int(np.argmin(np.where(roomy, held, np.inf)))
     if not (free[place] > CLEARANCE and held[place] <= 1.0 / _HEAVY):
@@ -289,7 +289,7 @@ def _home(draft: Draft, loaded: Callable[[], ArmModel]) -> ArmModel:
 
 
 def _drives(draft: Draft, model: ArmModel) -> None:
-    """Draw the simulated arm: links about the prior's, drives and friction of their own."""
+    """Draw the true parameters of the simulated arm at random: links about the prior's, drives and friction."""
     rng = np.random.default_rng(_SEED)
     chain, layout, prior = model.chain, model.layout, _prior(model)
     limits = motion_limits(model.config)
@@ -378,7 +378,7 @@ def _clear_motions(draft: Draft, loaded: Callable[[], ArmModel]) -> None:
             draft.seeds = (seed, seed)
             model = loaded()
             try:
-                # A glance, before all of the way is proven.
+                # A quick check of a few postures, before the whole path is verified.
                 path = excitation(model, "identification", checked=False).path
                 seen = collision.distances(path.at(np.linspace(0.0, path.duration, _GLANCES))[0])
                 if seen.min(initial=np.inf) < _GLANCE * CLEARANCE:

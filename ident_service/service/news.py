@@ -1,11 +1,11 @@
-"""Watch all arms and jobs for those who ask: what has happened, and how things stand.
+"""Report to viewers what happens to arms and jobs, and their present state, from one poll for all viewers.
 
-What has happened is a line of the audit trail. It has that line's number, so whoever comes again names the last one and
-misses nothing, after a restart of the service, too. How an arm or a job stands has no number: it is told anew to
-whoever comes, and whenever it changes.
+An event is a line of the audit trail and has that line's number, so a viewer who reconnects names the last one and
+misses nothing, also after a restart of the service. The state of an arm or a job has no number: it is sent to each new
+viewer, and whenever it changes.
 
-Whoever looks first looks for all: fifty viewers cost the registry what one does, and none costs nothing. Nothing that
-acts (a stop, a lease, a job) knows of viewers or waits for them. Boundary: values; the stream is `api/events.py`.
+One poll serves all viewers: fifty cost the registry as much as one, and none costs nothing. Nothing that
+acts (a stop, a lease, a job) knows of viewers or waits for them.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from ident_service.service.registry import jobs as rows
 from ident_service.service.registry.audit import last_line, trail_after
 from ident_service.service.registry.database import Database, Row
 
-LOOK: Final = 0.25  # s between looks, however many watch
+LOOK: Final = 0.25  # s between polls, however many viewers there are
 _PAGE = 500  # lines that are read at a time
-_KEPT = 1000  # lines in memory, for those who keep up
+_KEPT = 1000  # lines in memory, for viewers who keep up
 _GONE = 30.0  # s that the end of a job is kept for those who watch
 
 
 @dataclass(frozen=True)
 class News:
-    """One piece of news.
+    """One event for viewers.
 
     Attributes:
         kind: `happened`, `arm` or `job`.
         data: JSON.
-        number: of what has happened; None for how something stands.
+        number: of a `happened` event; None for a state.
     """
 
     kind: str
@@ -49,7 +49,7 @@ class News:
 
 @dataclass
 class Seen:
-    """Remember how far one viewer is.
+    """Position of one viewer in the events.
 
     Attributes:
         line: number of the last line of the audit trail.
@@ -68,7 +68,7 @@ class _Standing:
 
 
 class Watch:
-    """Looks for all who watch; used from any thread."""
+    """Poller of registry and arms for all viewers; may be used from any thread."""
 
     def __init__(
         self,
@@ -77,7 +77,7 @@ class Watch:
         shown: Callable[[Row], dict[str, Any]],
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Nothing is looked at before somebody watches.
+        """Create the poller; nothing is read before somebody watches.
 
         Args:
             db: the registry.
@@ -88,27 +88,27 @@ class Watch:
         self._db, self._state, self._shown, self._now = db, state, shown, now
         self._lock, self._looked, self._version = threading.Lock(), float("-inf"), 0
         self._lines = deque[News](maxlen=_KEPT)
-        self._line: int | None = None  # up to which lines were read
+        self._line: int | None = None  # number of the last line that was read
         self._standing = dict[tuple[str, str], _Standing]()
         self._ending = set[str]()  # jobs whose end may not have been seen
 
     def begin(self, after: int | None) -> Seen:
-        """Begin to watch.
+        """Return the position of a new viewer.
 
         Args:
-            after: number of the last line that was seen; what has happened from now on is told if None.
+            after: number of the last line that was seen; only events from now on are reported if None.
         """
         last = last_line(self._db)
-        # A number that there was never: of another state folder, or from before a restore.
+        # A number beyond the last line comes from another state folder, or from before a restore.
         return Seen(last if after is None or after > last else after)
 
     @property
     def due(self) -> bool:
-        """Tell whether it is time to look again."""
+        """Return whether it is time to poll again."""
         return self._now() - self._looked >= LOOK
 
     def look(self) -> None:
-        """Look, unless somebody looks now or has just done so."""
+        """Poll the registry and the arms, unless another thread polls now or has just done so."""
         if not self._lock.acquire(blocking=False):
             return
         try:
@@ -121,18 +121,18 @@ class Watch:
             self._lock.release()
 
     def behind(self, seen: Seen) -> bool:
-        """Tell whether a viewer misses lines that are not in memory any more."""
+        """Return whether a viewer misses lines that are no longer in memory."""
         return self._line is not None and seen.line < self._line and not self._remembers(seen.line)
 
     def earlier(self, seen: Seen) -> list[News]:
-        """Read a page of lines from the registry for a viewer who is behind."""
+        """Return a page of lines from the registry for a viewer who is behind."""
         found = [_line(row) for row in trail_after(self._db, seen.line, _PAGE)]
-        # Nothing there: the registry has been put back to an earlier state.
+        # No lines: the registry has been restored to an earlier state.
         seen.line = (found[-1].number if found else self._line) or 0
         return found
 
     def since(self, seen: Seen) -> list[News]:
-        """Return what is in memory and new to a viewer; waits for nothing."""
+        """Return the events in memory that are new to a viewer, without waiting."""
         found = [one for one in list(self._lines) if one.number is not None and one.number > seen.line]
         if found and found[-1].number is not None:
             seen.line = found[-1].number
@@ -182,7 +182,7 @@ class Watch:
             try:
                 faults = sorted(fault_file(self._state, folder.name).latched())
             except IdentError:
-                faults = ["unreadable"]  # a file that somebody damaged stands in the way like one
+                faults = ["unreadable"]  # a damaged file prevents motion like a fault
             self._stand("arm", folder.name, {"arm": folder.name, "moves": folder.name in moving, "faults": faults})
 
     def _stand(self, kind: str, name: str, value: dict[str, Any], *, gone: bool = False) -> None:

@@ -1,4 +1,4 @@
-"""Feasibility test and correction of parameter files, with or without an arm."""
+"""Test the feasibility of parameter files and correct them, with or without an arm."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from ident_service.service.verify import custom_note
 
 @dataclass(frozen=True)
 class CheckedFile:
-    """A parameter file against a feasible set."""
+    """Result of a feasibility test of a parameter file."""
 
     kind: FeasibleSetName
     result: FeasibilityTest
@@ -38,7 +38,7 @@ class CheckedFile:
 
 @dataclass(frozen=True)
 class CorrectedFile:
-    """The nearest feasible parameters to a file's."""
+    """Feasible parameters nearest to those of a file."""
 
     kind: FeasibleSetName
     result: FeasibleEstimate
@@ -48,7 +48,7 @@ class CorrectedFile:
 def check_file(
     path: Path, kind: FeasibleSetName | None = None, arm: str | None = None, notation: Notation | None = None
 ) -> CheckedFile:
-    """Feasibility test of a parameter file (BPFT, eq. 51).
+    """Test the feasibility of a parameter file (BPFT, eq. 51).
 
     Args:
         path: the file.
@@ -73,7 +73,7 @@ def correct_file(
     metric: Literal["euclidean", "covariance"] = "euclidean",
     notation: Notation | None = None,
 ) -> CorrectedFile:
-    """Write the nearest feasible parameters of a file (BPFC, eq. 55) into another; everything else stays as it was.
+    """Write the feasible parameters nearest to a file's (BPFC, eq. 55) to another file; other content is copied.
 
     What no longer holds for the new values is left out: covariances, verdicts, fit and validation.
 

@@ -1,4 +1,4 @@
-"""From an identified arm and a recording with a load to a folder: what `ident payload` does."""
+"""Identify the payload of an identified arm from recordings and write a folder, as `ident payload` does."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ DOCUMENT, TEXT = "payload.json", "payload.txt"
 
 @dataclass(frozen=True)
 class Found:
-    """What came out.
+    """Result of a payload identification, and the files written.
 
     Attributes:
         arm: as it was identified.
@@ -57,7 +57,7 @@ class Found:
 
 
 def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_offsets: bool = False) -> Found:
-    """Identify what an identified arm carries and write the results.
+    """Identify the payload that an identified arm carries, and write the results.
 
     Args:
         run: folder of results of the arm.
@@ -78,7 +78,7 @@ def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_off
     require_replaceable(out)
     side = read_side(run)
     arm = known_arm(side)
-    known = side.content.get("torque")  # the difference of two torques is the load's only where both are of one kind
+    known = side.content.get("torque")  # the torque difference is the load's only if both torques are of the same kind
     opened = open_together(
         recordings, arm.model, torque=known if known in ("measured", "commanded") else None
     ).recordings
@@ -111,7 +111,7 @@ def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_off
 
 
 def known_arm(side: Side) -> KnownArm:
-    """The arm of a folder of results.
+    """Return the identified arm of a folder of results.
 
     Raises:
         ParameterError: the parameters have no covariance, or belong to another mechanism.
@@ -138,7 +138,7 @@ def _require_new(side: Side, recordings: Sequence[Recording]) -> None:
 
 
 def _compared(side: Side, staging: Path, out: Path) -> Comparison:
-    """The arm against the arm with its load, which will stand elsewhere than where it is built."""
+    """Return the comparison of the arm with the arm under load, under the paths of the final folder."""
     loaded = read_side(staging / PARAMETERS)
     config = None if side.config is None else loaded_config(side.config)
     return compare([side, Side(out / PARAMETERS, loaded.sha256, loaded.file, config)])

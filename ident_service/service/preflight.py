@@ -1,4 +1,4 @@
-"""Tickets and looks at an arm, as text for people and as JSON values, and the file of a ticket."""
+"""Format preflight tickets and readings of an arm as text and as JSON values, and write the ticket's file."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ def write_ticket(path: Path, ticket: Ticket) -> None:
 
 
 def ticket_document(ticket: Ticket) -> dict[str, Any]:
-    """The ticket as JSON values: what stands in its file."""
+    """Return the ticket as JSON values, as in its file."""
     return ticket_values(ticket)
 
 
 def ticket_text(ticket: Ticket, *, every_measure: bool = False) -> str:
-    """The ticket for people.
+    """Format the ticket as text.
 
     Args:
         ticket: to be shown.
@@ -83,7 +83,7 @@ def _check_lines(check: Check, every_measure: bool) -> list[str]:
 
 
 def _nearest(check: Check) -> Measure | None:
-    """The measure that is nearest to its limit."""
+    """Return the measure that is nearest to its limit."""
 
     def room(one: Measure) -> float:
         assert one.value is not None  # noqa: S101
@@ -99,7 +99,7 @@ def _nearest(check: Check) -> Measure | None:
 
 
 def watch_text(seen: Watched) -> str:
-    """What was seen of an arm, for people."""
+    """Format the readings of an arm at rest as text."""
     width = max(5, *(len(name) for name in seen.joint_names))
     lines = [
         f"{seen.cycles} cycles, {seen.lost} frames lost",
@@ -116,7 +116,7 @@ def watch_text(seen: Watched) -> str:
 
 
 def watch_document(seen: Watched) -> dict[str, Any]:
-    """What was seen of an arm, as JSON values."""
+    """Return the readings of an arm at rest as JSON values."""
 
     def number(value: float) -> float | None:
         return float(value) if isfinite(value) else None

@@ -1,4 +1,4 @@
-"""What a motion asks of an arm and what it will teach, told before anything moves."""
+"""Predict the demands of a motion on an arm, and the accuracy of the parameters it will give."""
 
 from __future__ import annotations
 
@@ -36,20 +36,20 @@ from ident_service.motion.surroundings import Nearest, stop_clearance
 from ident_service.motion.way import calm_way
 from ident_service.results.parameter_file import read_parameters
 
-_LOOKED_AT = 2000  # samples of every part of a motion that the following error is forecast at
-_USED = 0.25  # of the torque limits, by an arm of which nothing is known
+_LOOKED_AT = 2000  # samples of each part of a motion for the forecast of the following error
+_USED = 0.25  # share of the torque limits used by an arm without a prior
 KINDS = ("velocity", "acceleration", "jerk", "torque")
 
 
 @dataclass(frozen=True)
 class Preview:
-    """Everything that can be said of a motion beforehand.
+    """Prediction of a motion: demands, clearances, expected deviations.
 
     Attributes:
         model: of the arm.
         excitation: the motion.
         limits: of the arm.
-        proof: what it asks, at every instant.
+        proof: verified bounds of its demands at every instant.
         objections: every limit that is not kept, in words; empty for a motion that may run.
         stops: lowest and highest positions that a stop from anywhere on the motion reaches, each of shape (joints,).
         stop_clearance: the smallest distance on stops out of the motion.
@@ -84,7 +84,7 @@ class Preview:
 def preview(
     model: ArmModel, excitation: Excitation, noise: NoiseModel | None = None, added: Array | None = None
 ) -> Preview:
-    """Look at a motion.
+    """Predict a motion before anything moves.
 
     Args:
         model: of the arm, with prior parameters.
@@ -149,7 +149,7 @@ def preview(
 
 
 def _negligible(path: FourierPath | PosturePath, model: ArmModel, base: BaseParameters, limits: MotionLimits) -> Array:
-    """Give sizes below which parameters are as good as zero, shape (base,).
+    """Return the sizes below which parameters are as good as zero, shape (base,).
 
     The torques are those of the arm's prior; without one, a quarter of what the joints may have.
     """
@@ -163,7 +163,7 @@ def _negligible(path: FourierPath | PosturePath, model: ArmModel, base: BasePara
 
 
 def _warnings(model: ArmModel, limits: MotionLimits, forecast_error: Array | None) -> list[str]:
-    """Return what nobody can prove or forbid; of a forecast only where no arm was simulated."""
+    """Return warnings on what can neither be proven nor forbidden; on following errors only from a forecast."""
     names, found = model.chain.names, []
     ahead = np.zeros_like(limits.following_error) if forecast_error is None else forecast_error
     if late := [name for k, name in enumerate(names) if ahead[k] > limits.following_error[k]]:
@@ -186,7 +186,7 @@ def _following(model: ArmModel, excitation: Excitation, limits: MotionLimits) ->
 
 
 def recorded_noise(file: Path, model: ArmModel) -> NoiseModel:
-    """Noise as an earlier identification of the arm found it.
+    """Return the noise model from an earlier identification of the arm.
 
     Per joint the residual's root mean square; and by how much the deviations found in blocks exceed those that white
     noise would give, in the geometric mean.
@@ -212,7 +212,7 @@ def recorded_noise(file: Path, model: ArmModel) -> NoiseModel:
 
 
 def preview_document(seen: Preview) -> dict[str, Any]:
-    """The preview as JSON values."""
+    """Return the preview as JSON values."""
     asked = seen.proof.demands
     clearances = {"clearance": seen.proof.clearance, "approach_clearance": seen.proof.approach}
     return {

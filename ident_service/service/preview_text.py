@@ -1,4 +1,4 @@
-"""A preview in words: peaks against limits, clearances, and what the motion will teach."""
+"""Format a preview as text: peaks against limits, clearances, and the expected accuracy of parameters."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ident_service.service.preview import KINDS, Preview
 
 
 def preview_text(seen: Preview) -> str:
-    """The preview for people."""
+    """Format the preview as text."""
     path, asked, limits = seen.excitation.path, seen.proof.demands, seen.limits
     names = seen.model.chain.names
     width = max(5, *(len(name) for name in names))
@@ -66,7 +66,7 @@ def preview_text(seen: Preview) -> str:
 
 
 def _teaching(seen: Preview) -> list[str]:
-    """The table of what is to be expected."""
+    """Format the table of expected parameter deviations."""
     prior = np.zeros(len(seen.base.names)) if seen.model.prior is None else seen.model.prior
     values = seen.base.K @ prior
     words = verdicts(values, seen.deviations, seen.negligible)
@@ -89,6 +89,6 @@ def _percent(share: float) -> str:
 
 
 def _position_shares(lowest: Array, highest: Array, limits: MotionLimits) -> Array:
-    """Share of the way from the middle of a position range to its ends that is used, shape (joints,)."""
+    """Return the used share of the way from the middle of a position range to its ends, shape (joints,)."""
     middle, half = 0.5 * (limits.lower + limits.upper), 0.5 * (limits.upper - limits.lower)
     return np.asarray(np.maximum(highest - middle, middle - lowest) / half)

@@ -1,4 +1,4 @@
-"""A run's target from its parent's side: a process that follows the recording is started, and asked without waiting.
+"""Watch a run's accuracy target: start a process that follows the recording, and poll it without waiting.
 
 It may die or be late: then the motion just goes on to its end. Asking is one look at a pipe, so that neither the lease
 nor a stop ever waits for it.
@@ -27,7 +27,7 @@ _MOST = 4096  # bytes that are read at once
 
 
 def require_target(target: Target, model: ArmModel) -> None:
-    """Refuse a target that cannot be watched.
+    """Check that an accuracy target can be watched.
 
     Raises:
         UsageError: a share not between 0 and 1, or a parameter that is none of the arm's.
@@ -38,26 +38,26 @@ def require_target(target: Target, model: ArmModel) -> None:
 
 
 def least_seconds(motion: Excitation, speed: float) -> float:
-    """Of the motion, before which it is not finished early: its first period; nothing where it has none [s]."""
+    """Return the time before which the motion is not finished early [s]: its first period; 0 without a period."""
     return motion.path.series.period / speed if isinstance(motion.path, FourierPath) else 0.0
 
 
 class Reaching:
-    """Whether a run's target has been reached.
+    """Monitor of a run's accuracy target.
 
     Attributes:
-        said: what the process said then, `seconds` of the motion and the largest `share`; None before.
+        said: result once the target is reached, `seconds` of the motion and the largest `share`; None before.
         period: of the motion [s], zero where it has none.
     """
 
     def __init__(self, folder: Path, target: Target, least: float, tell: Callable[[str], None]) -> None:
-        """Nothing is started before the block is entered.
+        """Create the monitor; no process is started before the block is entered.
 
         Args:
             folder: of the run.
             target: to be reached.
             least: seconds of the motion, before which nothing counts: its period, zero where it has none.
-            tell: is told once when it is reached, or when nobody looks any more.
+            tell: called once, when the target is reached or when the process has failed.
         """
         self._request = {"folder": str(folder), "share": target.share, "parameters": target.parameters, "least": least}
         self.period = least
@@ -65,7 +65,7 @@ class Reaching:
         self.said: dict[str, Any] | None = None
 
     def __enter__(self) -> Self:
-        """Start looking."""
+        """Start the process that follows the recording."""
         paths = os.pathsep.join(path or str(Path.cwd()) for path in sys.path)
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "ident_service.service.target_process"],
@@ -81,13 +81,13 @@ class Reaching:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """It holds nothing that could be lost."""
+        """Kill the process, which holds nothing that could be lost."""
         self._process.kill()
         with self._process:
             pass
 
     def reached(self) -> bool:
-        """Whether it is; never waits."""
+        """Return whether the target has been reached; never waits."""
         stdout = self._process.stdout
         assert stdout is not None  # noqa: S101 - asked for
         while not self._over and select.select([stdout], [], [], 0.0)[0]:

@@ -1,4 +1,4 @@
-"""Recordings as a person names them: `FILE@START:END`, columns of their own, standstill at the ends left out."""
+"""Open recordings as a person names them: `FILE@START:END`, own columns files, standstill cut at the ends."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from ident_service.record.part import RangeRecording, first_stamp, without_stand
 from ident_service.record.quality import Quality, quality
 from ident_service.record.recording import Recording
 
-# What of a format says how all recordings become samples, and not how one file is laid out.
-_STOPPING = 40  # level of the events that tell of a fault which stopped the arm (`motion/faults.py`)
+# `_OF_ALL`: keys of a format about how all recordings become samples, not about the layout of one file.
+_STOPPING = 40  # level of events for a fault that stopped the arm (`motion/faults.py`)
 _ENDS = (State.STOPPED.value, State.FAULTED.value)
 _OF_ALL = ("trim", "gap", "stamps", "rate")
 
 
 def file_and_range(path: Path) -> tuple[Path, tuple[float, float] | None]:
-    """Split `FILE@START:END`, seconds of the recording either of which may be left out, where no such file exists.
+    """Split `FILE@START:END` into file and seconds, either of which may be left out, unless such a file exists.
 
     Raises:
         UsageError: the range ends before it begins.
@@ -43,12 +43,12 @@ def file_and_range(path: Path) -> tuple[Path, tuple[float, float] | None]:
 
 
 Torque = Literal["measured", "commanded"]
-RECORDED: Final = "recorded"  # the one torque of another program's file, which does not say where it comes from
+RECORDED: Final = "recorded"  # torque of another program's file, which does not say whether it is measured
 
 
 @dataclass(frozen=True)
 class Opened:
-    """Hold recordings that are read for one estimate.
+    """Recordings that are read for one estimate.
 
     Attributes:
         recordings: in the order in which they were named.
@@ -67,9 +67,9 @@ def open_together(
     forms: Mapping[Path, RecordingFormat] = MappingProxyType({}),
     torque: Torque | None = None,
 ) -> Opened:
-    """Open recordings for one estimate, so that all of ours give the same torque.
+    """Open recordings for one estimate, with the same kind of torque in all that ident recorded.
 
-    Torques that drives measured and ones that they were only told differ by what current loops leave, and each has its
+    Torques that drives measured and commanded ones differ by the error of the current loops, and each has its
     own delay. So measured ones are used where all recordings have them, and commanded ones otherwise.
 
     Args:
@@ -105,7 +105,7 @@ def open_together(
 
 
 def torque_in(recording: Recording) -> str:
-    """Say which torque a recording gives: `measured`, `commanded`, or `recorded` for a file of another program."""
+    """Return which torque a recording gives: `measured`, `commanded`, or `recorded` for a file of another program."""
     if isinstance(recording, KeptRecording | RangeRecording):
         return torque_in(recording.whole)
     if isinstance(recording, MeasuredRecording):
@@ -116,7 +116,7 @@ def torque_in(recording: Recording) -> str:
 def open_for(
     path: Path, model: ArmModel, form: RecordingFormat | None = None, torque: Torque | None = None
 ) -> Recording:
-    """Open a recording, or a range of one, as it is to be read for an arm.
+    """Open a recording, or a range of one, for an arm.
 
     Args:
         path: the file, or `FILE@START:END`.
@@ -130,7 +130,7 @@ def open_for(
     """
     file, seconds = file_and_range(path)
     form, gears = form or model.config.recording, model.config.transmission
-    # Quality, friction, equations and evidence each read it.
+    # Cached, because quality, friction, equations and evidence each read the recording.
     torque = torque or model.config.identification.torque
     whole = open_recording(file, model.chain.names, fmt=form, transmission=gears, torque=torque)
     recording: Recording = KeptRecording(whole)
@@ -141,14 +141,14 @@ def open_for(
     if seconds is not None:
         recording = RangeRecording(recording, *seconds, label=path.name.removeprefix(file.name))
     if form.standstill == "cut":
-        # Rows near the ends are not used, for want of neighbours; standstill may well be those.
+        # Rows near the ends are not used anyway, for want of neighbours; standstill may remain there.
         edge = model.config.identification.edge
         recording = without_standstill(recording, EDGE / USUAL if edge == "choose" else edge)
     return recording
 
 
 def _ended(whole: McapRecording | MeasuredRecording, recording: Recording) -> float | None:
-    """Say when a stop or a fault ended the motion of a recording of ours [s after its first sample]; None if neither.
+    """Return when a stop or a fault ended the motion in a recording by ident [s after its first sample]; None if none.
 
     From then on brakes or the drives themselves hold the arm, and the recorded torque is not what acts on it.
     """
@@ -163,7 +163,7 @@ def _ended(whole: McapRecording | MeasuredRecording, recording: Recording) -> fl
 def own_formats(
     columns: Mapping[Path, Path], recordings: Sequence[Path], model: ArmModel
 ) -> dict[Path, RecordingFormat]:
-    """Read the columns files that are each for one recording.
+    """Read the columns files that each belong to one recording.
 
     Args:
         columns: the columns file of each recording.
@@ -203,7 +203,7 @@ def standstill_left_out(recording: Recording) -> tuple[float, float]:
 
 
 def require_no_fault(path: Path, recording: Recording) -> None:
-    """Refuse a recording of our own in which a fault stopped the arm, unless its range ends before.
+    """Refuse a recording made by ident in which a fault stopped the arm, unless its range ends before.
 
     Args:
         path: as it was named.
@@ -232,7 +232,7 @@ def require_no_fault(path: Path, recording: Recording) -> None:
 
 
 def recording_quality(recording: Recording, model: ArmModel) -> Quality:
-    """What a recording is worth, held against the arm's torque limits."""
+    """Return the quality of a recording, judged against the arm's torque limits."""
     joints = [model.config.joints.get(name) for name in model.chain.names]
     limits = np.array([np.nan if joint is None or joint.torque is None else joint.torque for joint in joints])
     return quality(recording, model.config.recording, limits)

@@ -1,7 +1,7 @@
-"""What stands between an arm and its next motion after a fault, a stop or a loss of power, and what a person does next.
+"""Find what prevents an arm's next motion after a fault, a stop or a loss of power, and what a person does next.
 
 Looking sends no torque and changes no state. When every latched fault has been acknowledged by name, drives that have
-latched something are reset (`Arm.reset`), which energises nothing. Boundary: nothing here moves an arm.
+latched something are reset (`Arm.reset`), which energises nothing.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ LOOK = 0.3  # s
 AT_HOME = 0.05  # rad or m
 _SUPPORT = "Support the arm, or see that it rests on something: nothing holds it up now."
 _HELD = "Support the arm, then `ident supported {}`: its drives hold it in quick stop, and let it go by that."
-_SEEN = 20  # cycles in which drives say what they do
+_SEEN = 20  # cycles until the drives' status has arrived
 
 
 @dataclass(frozen=True)
 class Recovery:
-    """What was found, and what to do.
+    """Findings about an arm after a fault or a stop, and the next steps.
 
     Attributes:
         arm: name.
@@ -44,10 +44,10 @@ class Recovery:
         unreachable: why not, or empty.
         zero_lost: why the arm does not know where it stands, or empty; nothing else is then seen of it.
         reset: axes whose drives were reset just now.
-        tripped: what drives still say, by axis.
+        tripped: what drives still have latched, by axis.
         outside: joints outside their position limits, in words.
         steps: what to do next, one sentence each, in order; the last one is what a usable arm needs as well.
-        usable: whether nothing stands in the way of `ident check`.
+        usable: whether `ident check` can be run.
     """
 
     arm: str
@@ -64,7 +64,7 @@ class Recovery:
 
 
 def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str | None = None) -> Recovery:
-    """Look at an arm, reset its drives if all faults are acknowledged, and say what is next.
+    """Read an arm's state, reset its drives if all faults are acknowledged, and list the next steps.
 
     Args:
         config: of the arm.
@@ -73,7 +73,7 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str 
         called: the arm as commands are to name it, its file for example; its name when None.
 
     Raises:
-        UsageError: the file of faults was damaged by somebody.
+        UsageError: the file of faults is damaged.
         MotionRefused: the description has no position limits.
         DriverError: nothing is installed that can reach such an arm.
     """
@@ -111,7 +111,7 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str 
 
 
 def let_go(config: ArmConfig, state: Path, arm: Arm | None = None) -> tuple[str, ...]:
-    """Take the power from drives that hold an arm in quick stop, which a person has said to be supported.
+    """Switch off drives that hold an arm in quick stop, once a person has confirmed that it is supported.
 
     Args:
         config: of the arm.
@@ -138,7 +138,7 @@ def let_go(config: ArmConfig, state: Path, arm: Arm | None = None) -> tuple[str,
 
 
 def _tripped(seen: Watched) -> dict[str, str]:
-    """What drives have latched, in words, by axis."""
+    """Return what drives have latched, in words, by axis."""
     words = {name: AxisStatus(word) & TRIPPED for name, word in zip(seen.joint_names, seen.status, strict=False)}
     return {
         name: " and ".join(str(bit.name).lower().replace("_", " ") for bit in AxisStatus if bit in word)
@@ -148,7 +148,7 @@ def _tripped(seen: Watched) -> dict[str, str]:
 
 
 def _reset(arm: Arm) -> str:
-    """Reset the drives; why they refuse, or empty."""
+    """Reset the drives; return why they refuse, or an empty text."""
     with arm:
         arm.exchange(None)
         try:
@@ -170,7 +170,7 @@ def _before(
     limits: MotionLimits,
     support: str,
 ) -> list[str]:
-    """What must be done before the arm is usable, in order."""
+    """Return what must be done before the arm is usable, in order."""
     steps = [f"`ident ack {name} {one.code}`, when you know why it came: {one.cause}." for one in faults]
     if unreachable:
         steps.append(f"Check power, cables, emergency stop, and that no other program has the arm: {unreachable}.")

@@ -19,7 +19,7 @@ from ident_service.service.registry.runs import run_folder
 
 @dataclass(frozen=True)
 class Expendable:
-    """A recording that the policy lets go.
+    """Recording that the retention policy allows to delete.
 
     Attributes:
         run: id.
@@ -75,7 +75,7 @@ def _busy(db: Database) -> set[str]:
 
 
 def let_go(db: Database, state: Path, newest: int, who: str) -> list[Expendable]:
-    """Delete what `expendable` names; each row is marked first, so that a kill in between is no damage."""
+    """Delete the recordings that `expendable` returns; each row is marked first, so that a kill does no damage."""
     gone = expendable(db, state, newest)
     for one in gone:
         with db.transaction():

@@ -1,7 +1,7 @@
-"""A run on an arm: recorder and motion each in a process of their own, watched from here, everything kept in a folder.
+"""Run a motion on an arm: recorder and motion in processes of their own, supervised, all kept in a folder.
 
-The folder is there from the beginning and keeps what was recorded, whether the run ended well or not; only a run that
-was refused before anything moved leaves none. How it ended is written by the motion process, and from here where that
+The folder exists from the beginning and keeps what was recorded, whether the run ended well or not; only a run that was
+refused before anything moved leaves none. The motion process writes how the run ended, or this process if that one
 could not. A file that cannot be written never hides why a run ended: it becomes a note of that error.
 """
 
@@ -40,11 +40,11 @@ from ident_service.service.watching import watched
 
 @dataclass(frozen=True)
 class Ran:
-    """How a run ended.
+    """Result of a run.
 
     Attributes:
-        folder: with everything that was kept.
-        report: what the motion process said: state, cycles, peaks, timing.
+        folder: of the run, with recording, report and manifest.
+        report: of the motion process: state, cycles, peaks, timing.
     """
 
     folder: Path
@@ -74,16 +74,16 @@ def run_motion(
         motion: made for it; or where one slow way is to lead, home for example.
         folder: the run folder; it must not exist.
         state: the state folder, where the arm's controls and faults are.
-        ticket: of the preflight; the motion process holds it against the open arm.
-        speed: share of the motion's own speed; ways to a destination have theirs.
+        ticket: of the preflight; the motion process compares it with the open arm.
+        speed: share of the motion's own speed; motions to a destination have a fixed speed.
         lease: how long the arm moves on when this process is gone [s].
         log_frames: whether every frame of the fieldbus is kept in `can.log`, too, in candump's format.
-        begin: called when nothing that is known without the arm stands against the run, and its folder exists.
+        begin: called when all checks that do not need the arm have passed, and the folder exists.
         tell: called with each state that is entered.
         stop_requested: asked several times a second.
         asked_ns: when a person asked for the motion, on the machine's monotonic clock [ns]; now when None. A stop that
             was asked for since then keeps it from beginning.
-        until: what is to be known, whereupon the run is finished early; None for one that goes on to its end.
+        until: accuracy target at which the run is finished early; None for one that goes on to its end.
 
     Raises:
         UsageError: the run folder exists or cannot be made, the state folder cannot be written, or the target is none;
@@ -171,8 +171,8 @@ def run_motion(
 
 
 def _missed(folder: Path, until: Target, period: float, tell: Callable[[str], None]) -> list[dict[str, Any]] | None:
-    """Say what a run that went on to its end has not taught; None where its recording cannot be judged."""
-    # Loads the estimator, which nobody waits for while the arm moves.
+    """Return which parameters a completed run did not determine well enough; None if its recording cannot be judged."""
+    # Loads the estimator only now, after the motion.
     from ident_service.service.target_process import missed
 
     try:
@@ -183,10 +183,10 @@ def _missed(folder: Path, until: Target, period: float, tell: Callable[[str], No
 
 
 def _keep(folder: Path, error: BaseException) -> None:
-    """Write down how a run ended, unless the motion process has, and what is in its folder."""
+    """Write how a run ended, unless the motion process has, and the manifest of its folder."""
 
     def ending() -> None:
-        # One that the motion process called good, but whose recording could not be finished, was not.
+        # A run whose recording could not be finished has failed, even if the motion process ended well.
         if isinstance(error, RecordingError) or not (folder / ENDED).exists():
             cause = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or type(error).__name__
             write_ending(folder, {"error": cause})

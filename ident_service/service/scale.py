@@ -1,7 +1,7 @@
-"""Compare positions with angles by which a person has turned each joint by hand, and keep what came of it.
+"""Check position scales: compare drives' positions with angles by which a person has turned each joint by hand.
 
-A loop closes over a wrong gear ratio or encoder scale as if nothing were wrong, and how a joint answers torque tells it
-only where its inertia is known. A hand and a protractor know it.
+A control loop works with a wrong gear ratio or encoder scale as if nothing were wrong, and the response of a joint to
+torque reveals it only where its inertia is known. A turn by hand, measured with a protractor, reveals it directly.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from ident_service.results.files import write_atomically
 from ident_service.service.arm_state import arm_folder, control_path
 
 FILE = "scale.json"  # in the arm's folder
-LEAST = math.radians(20.0)  # or m / 10: a smaller angle is not known well enough by eye
-WRONG, SLACK = 0.1, math.radians(3.0)  # share of the angle, and what a person's eye is off by
+LEAST = math.radians(20.0)  # a tenth of it in m for prismatic joints: less cannot be judged well enough by eye
+WRONG, SLACK = 0.1, math.radians(3.0)  # allowed share of the angle, and error of a person's eye [rad]
 _SAMPLES = 5
 
 
 @dataclass(frozen=True)
 class Turned:
-    """One joint that was turned.
+    """Scale check of one joint that was turned by hand.
 
     Attributes:
         joint: its name.
@@ -48,7 +48,7 @@ class Turned:
 
 
 def check_scale(config: ArmConfig, state: Path, ask: Callable[[str], str], arm: Arm | None = None) -> list[Turned]:
-    """Ask for a turn of each joint, hold it against the drives' positions, and keep the answers in `scale.json`.
+    """Ask for a turn of each joint, compare it with the drives' positions, and keep the answers in `scale.json`.
 
     Args:
         config: of the arm; nothing is energised.
@@ -117,13 +117,13 @@ def _position(arm: Arm, number: int) -> float:
 
 
 def _keep(path: Path, config: ArmConfig, found: list[Turned]) -> None:
-    """Keep what was found, beside what was found earlier of other joints of the same description."""
+    """Write the results, together with earlier ones of other joints of the same description."""
     kept: dict[str, object] = {}
     try:
         before = json.loads(path.read_text(encoding="utf-8"))
         kept = dict(before["joints"]) if before.get("arm_sha256") == config.sha256 else {}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        pass  # none yet, or none that can be read: what was turned now replaces it
+        pass  # no file yet, or an unreadable one, which the present results replace
     when = datetime.now(UTC).isoformat(timespec="seconds")
     kept |= {one.joint: asdict(one) | {"when": when} for one in found}
     write_atomically(path, json.dumps({"arm_sha256": config.sha256, "joints": kept}, indent=1) + "\n")

@@ -1,4 +1,4 @@
-"""How an estimate compares with the truth, where the truth is known: the simulated arm's parameters and torques."""
+"""Compare an estimate with the true parameters and torques of the simulated arm."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _BLOCK = 4096
 
 @dataclass(frozen=True)
 class Score:
-    """Estimate against truth.
+    """Comparison of an estimate with the truth.
 
     Attributes:
         deviations: error of each base parameter in units of its own standard deviation, shape (base,).
@@ -42,7 +42,7 @@ class Score:
 
 
 def true_parameters(config: ArmConfig, model: ArmModel) -> Array | None:
-    """Link parameters of the simulated plant, shape (layout.size,), or None where there is no such plant."""
+    """Return the link parameters of the simulated plant, shape (layout.size,); None without such a plant."""
     if not isinstance(config.driver, SimulatedDriver):
         return None
     if config.driver.truth is None:
@@ -51,7 +51,7 @@ def true_parameters(config: ArmConfig, model: ArmModel) -> Array | None:
 
 
 def score(estimate: Estimate, truth: Array, plant_motion: Sequence[Truth], unseen: Equations) -> Score:
-    """Score an estimate.
+    """Score an estimate against the truth.
 
     Args:
         estimate: what was identified.

@@ -1,4 +1,4 @@
-"""The state folder is its owner's alone, and one daemon's at a time.
+"""Keep the state folder private to its owner, and served by one daemon at a time.
 
 Whoever can enter it can read who did what, and can hold a byte of SQLite's write-ahead log that every write waits for.
 What another user writes into it, root included, its owner's daemon could not open afterwards.
@@ -19,12 +19,12 @@ from ident_service.errors import UsageError
 LOCK: Final = "serve.lock"
 URL_FILE: Final = "serve.url"
 RESTORING: Final = ".restoring"
-"""A folder that is there while a restored state takes the place of another one."""
+"""Name of a folder that exists while a restore replaces the state."""
 _OTHERS_ENTER = 0o011
 
 
 def keep_private(state: Path) -> None:
-    """See that nobody else can enter a state folder, and make what this process writes from now on its owner's.
+    """Check that nobody else can enter a state folder, and let only its owner read files written from now on.
 
     Args:
         state: the folder, there or not yet.
@@ -38,7 +38,7 @@ def keep_private(state: Path) -> None:
     path = state.resolve()
     if not path.is_dir():
         return
-    # Who is kept out above it cannot enter it either.
+    # A parent folder that others cannot enter protects it, too.
     if all(place.stat().st_mode & _OTHERS_ENTER for place in (path, *path.parents)):
         raise UsageError(f"{state}: others can enter it, and read or block what is in it; close it: chmod 700 {path}")
 
@@ -97,10 +97,10 @@ def _sudo_user(number: int) -> str:
 
 
 def require_whole(state: Path) -> None:
-    """Refuse a state folder in which a restore broke off.
+    """Refuse a state folder in which a restore was interrupted.
 
     Raises:
-        UsageError: it did.
+        UsageError: a restore was interrupted.
     """
     if (state / RESTORING).exists():
         raise UsageError(f"{state}: a restore broke off here; run `ident restore` again, it loses nothing")
@@ -108,7 +108,7 @@ def require_whole(state: Path) -> None:
 
 @contextmanager
 def single_instance(state: Path) -> Iterator[None]:
-    """Hold the state folder's lock; it vanishes with this process, however that ends.
+    """Hold the state folder's lock during the block; it vanishes with this process, however that ends.
 
     Raises:
         UsageError: another process holds it, or it cannot be made.

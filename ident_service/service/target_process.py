@@ -1,7 +1,7 @@
-"""Follows a run's recording in a process of its own, at the lowest priority, until its target is reached.
+"""Follow a run's recording in a process of its own, at the lowest priority, until its accuracy target is reached.
 
-It gets one JSON object on its standard input and says one line of JSON, once. It reads what the recorder has flushed
-and touches nothing else: whoever started it keeps the lease and asks for the finish. It ends with its standard input.
+It reads one JSON object from standard input and prints one line of JSON, once. It reads what the recorder has flushed
+and touches nothing else: its parent keeps the lease and asks for the finish. It ends when its standard input ends.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from ident_service.record.open import open_recording
 from ident_service.record.recording import Block
 from ident_service.record.tail import RecordingTail
 
-_LOOK = 0.3  # s between looks
-_IN_A_ROW = 2  # steps in which the target is reached: deviations are estimates, and one that dips is no knowledge
+_LOOK = 0.3  # s between polls
+_IN_A_ROW = 2  # consecutive steps below the target: deviations are estimates, and may dip below it once by chance
 
 
 def main() -> int:
-    """Watch; 0 when the target was reached or the recording ended."""
+    """Follow the recording, and print one line of JSON if the target is reached; return 0."""
     os.nice(19)
     request = json.loads(sys.stdin.readline())
     if said := watch(Path(request["folder"]), Target(request["share"], tuple(request["parameters"])), request["least"]):
@@ -38,7 +38,7 @@ def main() -> int:
 
 
 def watch(folder: Path, target: Target, least: float) -> dict[str, Any] | None:
-    """Wait until the target is reached: seconds of the motion and the largest share then; None where it was not.
+    """Wait until the target is reached; return seconds of the motion and largest share then, None if it was not.
 
     Args:
         folder: of the run.
@@ -70,7 +70,7 @@ def watch(folder: Path, target: Target, least: float) -> dict[str, Any] | None:
 
 
 def missed(folder: Path, target: Target, period: float) -> list[dict[str, Any]]:
-    """Judge by the whole recording of a run which of the chosen parameters are not known as well as was asked.
+    """Return which of the chosen parameters the whole recording of a run does not determine as well as asked.
 
     Args:
         folder: of the run, which is over.
@@ -104,7 +104,7 @@ def missed(folder: Path, target: Target, period: float) -> list[dict[str, Any]]:
 
 
 def _opened(folder: Path) -> RecordingTail | None:
-    """The recording, as soon as there is one; None where nobody waits for it any more."""
+    """Return the recording as soon as there is one; None where nobody waits for it any more."""
     while True:
         for name in ("run.mcap.partial", "run.mcap"):
             try:
@@ -116,7 +116,7 @@ def _opened(folder: Path) -> RecordingTail | None:
 
 
 def _left_alone() -> bool:
-    """Wait a little; whether whoever asked is gone, or has ended the question."""
+    """Wait a little; return whether standard input has ended, or has data, so that nobody waits for the answer."""
     return bool(select.select([sys.stdin.fileno()], [], [], _LOOK)[0])
 
 

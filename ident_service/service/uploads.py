@@ -1,4 +1,4 @@
-"""Take recordings in pieces: resumed where they broke off, and kept only when their hash is right.
+"""Receive recordings in pieces: resumed where they broke off, and kept only if their hash is right.
 
 ```
 STATE/.uploads/ID/upload.json    what was announced
@@ -40,20 +40,20 @@ from ident_service.service.registry.motions import new_id
 from ident_service.service.registry.runs import COLUMNS, RUNS, UPLOAD, index_run
 from ident_service.service.upload_columns import LONGEST_HEADER, first_line, format_of
 
-UPLOADS: Final = ".uploads"  # hidden: backups leave out what is half there
+UPLOADS: Final = ".uploads"  # hidden, so that backups leave out incomplete uploads
 MOST_BYTES: Final = 4 * 2**30  # of a recording
 MOST_OPEN: Final = 16
 MOST_COLUMNS: Final = 2**16
-KEPT_FREE: Final = 2**30  # bytes of the disk that a motion's own recording may need meanwhile
-HALF_SECONDS: Final = 24 * 3600.0  # after its last piece
+KEPT_FREE: Final = 2**30  # bytes left free on the disk for the recording of a motion
+HALF_SECONDS: Final = 24 * 3600.0  # s after its last piece, when an incomplete upload is deleted
 _DATA, _ARM = "data", "arm.json"
 _JUDGED = "judged"  # is there once the header has been found good
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,119}")
-_DOCUMENTS = (".json", ".yaml", ".partial")  # endings of what else may stand in the folder of a run
+_DOCUMENTS = (".json", ".yaml", ".partial")  # endings of other files in the folder of a run
 
 
 class NoRoom(OSError):
-    """The disk has no room for a recording that was announced."""
+    """Error for an announced recording that the disk has no room for."""
 
     def __init__(self, words: str) -> None:
         super().__init__(errno.ENOSPC, words)
@@ -61,7 +61,7 @@ class NoRoom(OSError):
 
 @dataclass(frozen=True)
 class Announced:
-    """A recording that is to come.
+    """Recording that is to be uploaded, as announced.
 
     Attributes:
         arm: whose it is.
@@ -81,17 +81,17 @@ class Announced:
 
     @property
     def id(self) -> str:
-        """Return what names this upload."""
+        """Return the id of this upload."""
         return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:32]
 
 
 @dataclass(frozen=True)
 class Upload:
-    """A recording that arrives, or has.
+    """State of an upload.
 
     Attributes:
         id: which names it.
-        announced: what it is to be.
+        announced: the recording as announced.
         received: bytes that are there; the next piece begins at this offset.
         run: id of the run that it became; None before it is whole.
     """
@@ -103,7 +103,7 @@ class Upload:
 
 
 def begin_upload(db: Database, state: Path, announced: Announced) -> Upload:
-    """Make place for a recording; of one that was announced before, tell how much is there.
+    """Begin or resume an upload; return how much of the recording has arrived.
 
     Args:
         db: the registry.
@@ -171,7 +171,7 @@ def require_header(db: Database, state: Path, upload: str) -> None:
 
 
 def known_upload(state: Path, upload: str) -> Upload:
-    """Return the upload of this id, as far as it is there.
+    """Return the upload of this id, with the bytes received so far.
 
     Raises:
         UnknownId: there is none; it was completed, deleted, or left alone for a day.
@@ -185,7 +185,7 @@ def known_upload(state: Path, upload: str) -> Upload:
 
 
 def uploads(state: Path) -> list[Upload]:
-    """List the uploads that are under way."""
+    """Return the uploads that are under way."""
     found, place = [], state / UPLOADS
     for folder in sorted(place.iterdir()) if place.is_dir() else ():
         with suppress(UnknownId):
@@ -194,10 +194,10 @@ def uploads(state: Path) -> list[Upload]:
 
 
 class Piece:
-    """Write one piece of an upload; what has arrived of a piece that is torn stays."""
+    """Writer of one piece of an upload; the bytes of an interrupted piece that arrived are kept."""
 
     def __init__(self, state: Path, upload: str, offset: int) -> None:
-        """Take the upload for this piece alone.
+        """Lock the upload for this piece.
 
         Args:
             state: the state folder.
@@ -227,7 +227,7 @@ class Piece:
             raise
 
     def write(self, data: bytes) -> None:
-        """Append bytes.
+        """Append bytes to the upload.
 
         Raises:
             UsageError: they are more than were announced; `withdraw` is to follow.
@@ -246,7 +246,7 @@ class Piece:
         self._size = self._begin
 
     def __enter__(self) -> Self:
-        """Nothing more to do."""
+        """Return the writer itself."""
         return self
 
     def __exit__(
@@ -259,7 +259,7 @@ class Piece:
 
 
 def complete_upload(db: Database, state: Path, upload: str, who: str) -> Upload:
-    """Make a run of a recording that has arrived.
+    """Check the hash of a recording that has arrived, and make a run of it.
 
     Args:
         db: the registry.
@@ -275,7 +275,7 @@ def complete_upload(db: Database, state: Path, upload: str, who: str) -> Upload:
     seen = known_upload(state, upload)
     announced, folder = seen.announced, state / UPLOADS / upload
     arm = known_arm(db, state, announced.arm)
-    with Piece(state, upload, seen.received):  # nobody else writes it
+    with Piece(state, upload, seen.received):  # locked, so that nobody else writes it
         if seen.received != announced.bytes:
             raise AlreadyThere(f"{upload}: has {seen.received} of {announced.bytes} bytes; send the rest first")
         run = new_id(arm.name)
@@ -308,7 +308,7 @@ def _unknown(upload: str) -> UnknownId:
 
 @contextmanager
 def _known(upload: str) -> Iterator[None]:
-    """Know an upload no more that is deleted in this moment."""
+    """Raise UnknownId in the block for an upload that is deleted meanwhile."""
     try:
         yield
     except FileNotFoundError:
@@ -326,7 +326,7 @@ def _deleted_if_wrong(folder: Path) -> Iterator[None]:
 
 
 def delete_upload(state: Path, upload: str) -> None:
-    """Forget an upload and what has arrived of it.
+    """Delete an upload and what has arrived of it.
 
     Raises:
         UnknownId: no such upload.
@@ -352,7 +352,7 @@ def delete_half_uploads(state: Path, now: float | None = None) -> list[str]:
 
 
 def _same(db: Database, state: Path, announced: Announced) -> str | None:
-    """Find a run that the same recording has become."""
+    """Return the run that the same recording has become, if any."""
     rows = db.rows(
         "SELECT run FROM recordings JOIN runs ON runs.id = run WHERE sha256 = ? AND name = ? AND arm = ? "
         "AND kind = 'recording' AND deleted IS NULL ORDER BY created DESC",

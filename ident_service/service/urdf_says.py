@@ -1,4 +1,4 @@
-"""What a URDF says beside its mechanism: which part of it is an arm, and the limits of its joints."""
+"""Read from a URDF which part of it is an arm, and the limits of its joints."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _ARM = 3  # joints that make a branch an arm and not a gripper
 
 @dataclass(frozen=True)
 class Said:
-    """What a URDF says of a joint; None where it says nothing that could be meant."""
+    """Limits of a joint in a URDF; None where it has none that is plausible."""
 
     position: tuple[float, float] | None
     velocity: float | None
@@ -23,7 +23,7 @@ class Said:
 
 
 def arm_part(text: str, file: str, base: str | None, tip: str | None) -> dict[str, Any]:
-    """Say which part of a URDF is the arm: from the root along the branch with most joints to its gripper.
+    """Return which part of a URDF is the arm: from the root along the branch with most joints to its gripper.
 
     Args:
         text: of the file, whose elements were counted.
@@ -73,7 +73,7 @@ def arm_part(text: str, file: str, base: str | None, tip: str | None) -> dict[st
             break
         longest = max(ways, key=lambda way: way[0])
         count, onward, joint_name, moves = longest
-        # Where branches part that are no arms, or a joint leads others by mimicry, the gripper begins.
+        # The gripper begins where branches too short for an arm part, or at a joint that others mimic.
         if count < _ARM and (len(ways) > 1 or (moves and joint_name in leaders)):
             branched = True
             break
@@ -83,7 +83,7 @@ def arm_part(text: str, file: str, base: str | None, tip: str | None) -> dict[st
 
 
 def said_of(text: str) -> dict[str, Said]:
-    """Read the limits of every joint of a URDF whose elements were counted, by its name."""
+    """Return the limits of every joint of a URDF whose elements were counted, by its name."""
     found = {}
     for joint in ET.fromstring(text).findall("joint"):  # noqa: S314 - counted before
         limit = joint.find("limit")

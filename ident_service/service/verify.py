@@ -1,4 +1,4 @@
-"""Verification of a parameter file's certificate, against its own conditions or those of an arm."""
+"""Verify a parameter file's certificate, against its own conditions or those of an arm."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ def verify_file(path: Path, arm: str | None = None) -> Verification:
 
 
 def custom_note(name: str) -> str:
-    """Say that an answer about an arm leaves out its `constraints.custom`."""
+    """Return the note that an answer about an arm leaves out its `constraints.custom`."""
     return f"constraints.custom ({name}) of the description is code that only identify and simulate run; left out here"
 
 
 def _arm(arm: str, file: Path) -> tuple[Arm, str | None]:
-    """State the conditions and expressions of a description, and name the custom knowledge that is none of them."""
+    """Return the conditions and expressions of a description, and the name of its custom constraints, if any."""
     # The numerical packages are loaded only where there is a description to make conditions from.
     from ident_service.config.load import arm_from_json, load_arm
     from ident_service.estimation.feasible.feasible_set import feasible_set
@@ -65,7 +65,7 @@ def _arm(arm: str, file: Path) -> tuple[Arm, str | None]:
 
 
 def _sha256(config: ArmConfig, file: Path) -> str:
-    """Hash the description with the sections that the file says it was identified with."""
+    """Return the hash of the description with the sections that the file says it was identified with."""
     from pydantic import ValidationError
 
     from ident_service.config.schema import ArmConfig

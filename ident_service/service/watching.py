@@ -1,9 +1,8 @@
-"""The motion process from its parent's side: started, its lease kept, heard until it ends; and what it said at last.
+"""Supervise the motion process from its parent: start it, keep its lease, read its output until it ends.
 
-What ends this process closes the pipe, and what makes it hang lets the lease lapse; either stops the arm. An interrupt
-while somebody has the arm ends nothing at once: it asks for a controlled stop, and the end of that is waited for. An
-arm without brakes may then be held until a person confirms that it is supported; whoever holds it is waited for, and
-never killed.
+If this process dies, the pipe closes; if it hangs, the lease lapses; either stops the arm. An interrupt while a process
+has the arm ends nothing at once: it asks for a controlled stop and waits for its end. An arm without brakes may then be
+held until a person confirms that it is supported; the process that holds it is waited for, and never killed.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from ident_service.motion.control_file import ControlFile
 from ident_service.motion.fault_file import CONTROLS, UNFINISHED, FaultFile
 
 _RENEW_SHARE = 0.25  # of the lease
-_LAST_WORDS = 30.0  # s for a process that was told to stop
+_LAST_WORDS = 30.0  # s to wait for the result of a process that was told to stop
 _KINDS: dict[str, type[IdentError]] = {
     kind.__name__: kind for kind in (MotionRefused, PositionUnknown, DriverError, UsageError, ArmError)
 }
@@ -42,7 +41,7 @@ _KINDS: dict[str, type[IdentError]] = {
 
 @dataclass
 class Ending:
-    """What the motion process said at last.
+    """Result that the motion process reported last.
 
     Attributes:
         report: of a run that was done or stopped, else empty.
@@ -56,11 +55,11 @@ class Ending:
 
     @property
     def heard(self) -> bool:
-        """Whether it had a last word."""
+        """Return whether the motion process reported a result."""
         return bool(self.report or self.error)
 
     def raise_for(self, faults: FaultFile) -> None:
-        """Turn what went wrong into the error that it was; faults that followed the first one are its notes.
+        """Raise the error that the motion process reported; faults that followed the first are added as notes.
 
         Raises:
             ArmFault: the fault that was latched first, which is the cause of the others.
@@ -75,7 +74,7 @@ class Ending:
         error: IdentError
         if kind == ArmFault.__name__:
             code = self.error["code"]
-            # A fault that could not be latched, because that disk is full too, is still the fault.
+            # A fault that could not be latched, for example because the disk is full, is still reported.
             first, cause = next(iter(latched.items()), (code, message.removeprefix(f"{code}: ")))
             error = ArmFault(first, cause)
             latched.pop(first, None)
@@ -107,7 +106,7 @@ def watched(
     stop_requested: Callable[[], bool],
     finish_requested: Callable[[], bool] = lambda: False,
 ) -> Ending:
-    """Start the motion process, keep its lease, hear what it says until it ends.
+    """Start the motion process, keep its lease, and read its output until it ends.
 
     Args:
         request: what it is to do (`motion/process.py`).
@@ -123,10 +122,10 @@ def watched(
     paths = os.pathsep.join(path or str(Path.cwd()) for path in sys.path)
     environment = {**os.environ, "PYTHONPATH": paths, "OPENBLAS_NUM_THREADS": "1"}
     command = [sys.executable, "-P", "-m", "ident_service.motion.process"]
-    # Another session, so that what a terminal or a service manager sends to our group does not reach it.
+    # A session of its own, so that signals to this process group do not reach it.
     with subprocess.Popen(  # noqa: S603 - our own interpreter and module
         command,
-        bufsize=0,  # a line that waits in a buffer is one that select does not see
+        bufsize=0,  # select does not see a line that waits in a buffer
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         pass_fds=ends,
@@ -146,11 +145,11 @@ def watched(
                 if not watch.hear_the_end():
                     raise
         except BaseException:
-            process.stdin.close()  # nobody asks for this motion any more
+            process.stdin.close()  # ends the motion process's input: the motion has no owner any more
             watch.ask_stop()
             while process.poll() is None and not watch.hear(time.monotonic() + _LAST_WORDS):
                 if not watch.holding:
-                    process.kill()  # it hangs, and the drives have heard nothing for as long
+                    process.kill()  # it hangs, and has sent nothing to the drives for as long
             raise
         finally:
             watch.close()
@@ -159,7 +158,7 @@ def watched(
 
 
 class _Watch:
-    """Hears one motion process.
+    """Reader of one motion process's output, which also keeps its lease.
 
     Attributes:
         holding: whether the arm would fall without it.
@@ -183,7 +182,7 @@ class _Watch:
         self.holding = False
 
     def hear(self, until: float = float("inf")) -> bool:
-        """Hear it, and renew its lease, until it ends or the time has come [s]; whether it ended."""
+        """Read the output and renew the lease until the process ends or `until` [s]; return whether it ended."""
         stdout = self._process.stdout
         assert stdout is not None  # noqa: S101 - asked for by `watched`
         while time.monotonic() < until:
@@ -198,16 +197,16 @@ class _Watch:
             if not ready:
                 continue
             line = stdout.readline()
-            if not line.endswith(b"\n"):  # the end, or what was killed in the middle of a word
+            if not line.endswith(b"\n"):  # end of the output, or a line cut off by a kill
                 return True
-            with suppress(ValueError):  # the rest of a line whose beginning went with an interrupt
+            with suppress(ValueError):  # the rest of a line whose beginning was lost in an interrupt
                 self._take(json.loads(line))
         return False
 
     def hear_the_end(self) -> bool:
-        """After an interrupt: wait, but not for ever, for the end of the stop; whether it was heard."""
+        """After an interrupt, wait up to a bound for the end of the stop; return whether a result was reported."""
         if self._controls is None:
-            return False  # nobody has the arm yet
+            return False  # the motion process has not taken the arm yet
         with _deaf():
             self.ask_stop()
             self._tell(f"interrupted: the arm is being stopped under control; waiting {_LAST_WORDS:g} s at most")
@@ -217,19 +216,19 @@ class _Watch:
             return ended and self.ending.heard
 
     def ask_stop(self) -> None:
-        """Ask for a controlled stop, where somebody has the arm."""
+        """Ask for a controlled stop, if a process has the arm."""
         if self._controls is not None:
             self._asked = True
             self._controls.ask_stop()
 
     def close(self) -> None:
-        """Let the controls go."""
+        """Close the control file."""
         if self._controls is not None:
             self._controls.close()
 
     def _take(self, said: dict[str, Any]) -> None:
         if "pid" in said:
-            with suppress(UsageError):  # it died at once, which is heard next
+            with suppress(UsageError):  # it died at once, as the next read will show
                 self._controls = ControlFile.reach(self._path)
         self.ending.report = said.get("report", self.ending.report)
         self.ending.error = said.get("error", self.ending.error)
@@ -253,7 +252,7 @@ class _Watch:
 
 @contextmanager
 def _deaf() -> Iterator[None]:
-    """Without Ctrl-C, which has been understood; it was heard, so this is the main thread."""
+    """Ignore SIGINT in the block, after an interrupt was received; the main thread only."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         yield

@@ -1,8 +1,7 @@
-"""Zeroing an arm whose encoders count from where they were when power came: a person says that it stands at its home.
+"""Zero an arm with incremental encoders: a person confirms that the arm stands at its home posture.
 
-What a person must do is lead the arm there and compare it with the posture that is told; nobody else can. Everything
-that a program can tell stands against it first: whoever moves the arm, another host, powered drives, an arm that moves.
-Boundary: nothing here moves or energises an arm; what drives keep is the driver's (`Arm.zero`).
+A person must move the arm to its home and compare it with the displayed posture. Everything that a program can check is
+checked first: another process that moves the arm, another host, powered drives, an arm that moves.
 """
 
 from __future__ import annotations
@@ -26,27 +25,27 @@ from ident_service.service.arm_state import control_path, fault_file, ticket_pat
 
 @dataclass(frozen=True)
 class JointPosture:
-    """One joint of the posture: its name, position [rad or m], and the unit of that."""
+    """One joint of a posture: its name, position [rad or m], and the unit of that."""
 
     joint: str
     position: float
     unit: str
 
     def __str__(self) -> str:
-        """For people."""
+        """Format the joint's position, for a revolute joint in degrees too."""
         turned = f" ({degrees(self.position):.1f} degrees)" if self.unit == "rad" else ""
         return f"{self.joint} at {self.position:g} {self.unit}{turned}"
 
 
 @dataclass(frozen=True)
 class Zeroed:
-    """What was done.
+    """Result of zeroing an arm.
 
     Attributes:
         arm: name.
         posture: that the arm stands in, of all joints.
-        drives: what each says of itself.
-        faults: that nobody has acknowledged; zeroing neither needs that nor changes it.
+        drives: message of each drive about its zero.
+        faults: that nobody has acknowledged; zeroing is possible with them and leaves them as they are.
         ticket_removed: whether there was a preflight ticket, which was about another zero.
     """
 
@@ -58,7 +57,7 @@ class Zeroed:
 
 
 def home_posture(config: ArmConfig) -> tuple[JointPosture, ...]:
-    """The posture in which an arm is zeroed.
+    """Return the posture in which an arm is zeroed.
 
     Raises:
         UsageError: its description does not say `zero: at_home`, or has no home of every joint.
@@ -79,7 +78,7 @@ def home_posture(config: ArmConfig) -> tuple[JointPosture, ...]:
 
 
 def take_home(config: ArmConfig, state: Path, confirm: Callable[[str], str], arm: Arm | None = None) -> Zeroed:
-    """Have an arm's drives keep where they stand as its home, when a person has said so.
+    """Set an arm's present position as its home in the drives, once a person has confirmed the posture.
 
     Args:
         config: of the arm.
@@ -99,7 +98,7 @@ def take_home(config: ArmConfig, state: Path, confirm: Callable[[str], str], arm
         typed = confirm(f"type the arm's name, {config.name}, if it stands in this posture and at rest:")
         if typed.strip() != config.name:
             raise MotionRefused(f"{config.name}: not zeroed: the arm's name was not typed; nothing has changed")
-        # Before: one that outlived this would be for another zero, and name the same counts after a loss of power.
+        # Removed before zeroing: a ticket that outlived it would be for another zero.
         existed = ticket.exists()
         ticket.unlink(missing_ok=True)
         drives = (make_arm(config) if arm is None else arm).zero()

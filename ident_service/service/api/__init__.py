@@ -1,1 +1,1 @@
-"""The HTTP API: everything that the command does, by ids; `app.create_app` is the door."""
+"""Serve the HTTP API: everything that the command line does, by ids; `app.create_app` builds the application."""

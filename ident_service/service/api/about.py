@@ -1,4 +1,4 @@
-"""Routes about the service itself: its health, its figures, who asks, sessions of the page, the audit trail."""
+"""Serve the routes about the service itself: health, metrics, identity, sessions of the page, audit trail."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from ident_service.service.maintenance.schedules import dues
 from ident_service.service.registry.audit import trail
 
 router = APIRouter(tags=["service"], responses=failures())
-AUDIT_SECONDS = 1.0  # that a reader of the trail waits for lines that are to be entered
+AUDIT_SECONDS = 1.0  # s that a reader of the trail waits for queued lines
 
 
 class Login(BaseModel):
-    """A token, to be exchanged for a session of the page."""
+    """Token to be exchanged for a session of the page."""
 
     model_config = ConfigDict(extra="forbid")
     token: Annotated[str, Field(min_length=1, max_length=200)]
@@ -36,7 +36,7 @@ class Login(BaseModel):
     "/healthz", responses={503: {"model": HealthAnswer, "description": "Queue or schedule is not looked after."}}
 )
 def healthz(service: Serving, response: Response) -> HealthAnswer:
-    """Tell whether the service looks after its queue and its schedule; asks for no token."""
+    """Return whether the service looks after its queue and its schedule; asks for no token."""
     healthy = service.engine.healthy and service.keeper.healthy and not service.engine.closing
     response.status_code = 200 if healthy else 503
     return HealthAnswer(healthy=healthy, version=__version__)
@@ -44,14 +44,14 @@ def healthz(service: Serving, response: Response) -> HealthAnswer:
 
 @router.get("/metrics", response_class=PlainTextResponse, responses=failures_of_files())
 def metrics(service: Serving, _: Viewer) -> PlainTextResponse:
-    """Read the figures of the service in Prometheus' text format."""
+    """Return the metrics of the service in Prometheus' text format."""
     rows = service.db.rows("SELECT kind, state, COUNT(*) AS number FROM jobs GROUP BY kind, state")
     faults, place = dict[str, int](), service.state / "arms"
     for folder in place.iterdir() if place.is_dir() else ():
         try:
             faults[folder.name] = len(fault_file(service.state, folder.name).latched())
         except IdentError:
-            faults[folder.name] = 1  # a file that somebody damaged stands in the way like one
+            faults[folder.name] = 1  # a damaged file prevents motion like a fault
     jobs = {(row["kind"], row["state"]): row["number"] for row in rows}
     due = Counter[str](row["arm"] for row in dues(service.db))
     drifted = Counter[str](row["arm"] for row in alarms(service.db, most=10_000))
@@ -61,7 +61,7 @@ def metrics(service: Serving, _: Viewer) -> PlainTextResponse:
 
 @router.get("/api/v1/whoami")
 def whoami(who: Viewer) -> WhoAnswer:
-    """Tell whose token or session asks."""
+    """Return name and role of the token or session that asks."""
     return WhoAnswer(name=who.name, role=who.role)
 
 
@@ -96,6 +96,6 @@ def logout(service: Serving, response: Response, cookie: Cookie = None) -> None:
 
 @router.get("/api/v1/audit", responses=PAGES)
 def audit(page: Page, service: Serving, _: Viewer, before: BeforeNumber = None, most: Most = 100) -> list[AuditLine]:
-    """List who did what, the newest first."""
+    """List the lines of the audit trail, the newest first."""
     service.engine.audit.flush(AUDIT_SECONDS)
     return [AuditLine(**row) for row in page(most, lambda n: trail(service.db, before=before, most=n))]

@@ -1,7 +1,8 @@
-"""Routes about tokens: who may talk to the service, and that one may no more.
+"""Serve the routes about access tokens: list them, revoke one.
 
-A token is not made over HTTP: whoever got hold of an operator's could make others, which would outlive its being
-revoked. That is an act at the state folder (`ident token add`). Revoking over HTTP harms nobody who sits there.
+Tokens are not made over HTTP: whoever got hold of an operator's token could make others, which would outlive its
+revocation. Making one is an act at the state folder (`ident token add`). Revoking over HTTP is safe: it cannot lock out
+a person at the state folder.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ TokenName = Annotated[str, Path(pattern=r"^[a-z0-9][a-z0-9_.-]{0,39}$")]
 
 
 class TokenLine(BaseModel):
-    """A token; `revoked` is when, null while it counts. The token itself is kept nowhere."""
+    """Access token; `revoked` is when it was revoked, null while it is valid. The token itself is stored nowhere."""
 
     name: str
     role: Literal["viewer", "operator"]
@@ -30,7 +31,7 @@ class TokenLine(BaseModel):
 
 @router.get("/tokens")
 def list_tokens(service: Serving, _: Operator) -> list[TokenLine]:
-    """List all tokens that ever were, the earliest first."""
+    """List all tokens that were ever made, the earliest first."""
     return [TokenLine(**row) for row in tokens(service.db)]
 
 

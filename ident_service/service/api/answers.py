@@ -1,4 +1,4 @@
-"""What the API answers with: the shape of every answer, one shape for all that goes wrong.
+"""Define the models of the API's answers, and the one model of all failures.
 
 Times are seconds since 1970 in UTC, durations seconds.
 """
@@ -11,7 +11,7 @@ from pydantic import BaseModel
 
 
 class DependentAnswer(BaseModel):
-    """Something that refers to what is to be deleted, and what becomes of it then."""
+    """Entry that refers to what is to be deleted, and what becomes of it then."""
 
     kind: str
     id: str
@@ -19,14 +19,14 @@ class DependentAnswer(BaseModel):
 
 
 class DeletionAnswer(BaseModel):
-    """Name what was deleted, and what referred to it."""
+    """Deleted entry, and the entries that referred to it."""
 
     deleted: str
     dependents: list[DependentAnswer]
 
 
 class Mistake(BaseModel):
-    """What went wrong: the name of an error, and words for a person; for `InUse` what refers to it, too."""
+    """Error of a failed request: its kind, a message for a person, and for `InUse` the entries that refer to it."""
 
     kind: str
     message: str
@@ -34,13 +34,13 @@ class Mistake(BaseModel):
 
 
 class Failure(BaseModel):
-    """Every answer that is not a success."""
+    """Answer of every request that fails."""
 
     error: Mistake
 
 
 class ArmLine(BaseModel):
-    """An arm in the list."""
+    """One arm in the list of arms."""
 
     name: str
     source: Literal["shipped", "uploaded"]
@@ -48,7 +48,7 @@ class ArmLine(BaseModel):
 
 
 class FaultAnswer(BaseModel):
-    """A fault that nobody has acknowledged."""
+    """Fault that nobody has acknowledged."""
 
     code: str
     cause: str
@@ -56,7 +56,7 @@ class FaultAnswer(BaseModel):
 
 
 class AcceptanceAnswer(BaseModel):
-    """A set that was accepted."""
+    """Accepted set of parameters."""
 
     arm: str
     number: int
@@ -69,9 +69,9 @@ class AcceptanceAnswer(BaseModel):
 
 
 class ArmAnswer(ArmLine):
-    """An arm.
+    """Arm with its state.
 
-    `moved_by` is the process that moves it, `resources` what a motion of it has for itself, `simulated` whether it can
+    `moved_by` is the process that moves it, `resources` what a motion of it reserves, `simulated` whether it can
     be commissioned by `simulate`, `unattended_motion` whether what is due may begin by itself.
     """
 
@@ -86,7 +86,7 @@ class ArmAnswer(ArmLine):
 
 
 class ChallengeAnswer(BaseModel):
-    """A word that confirms one motion, once."""
+    """Challenge that confirms one motion, once."""
 
     arm: str
     challenge: str
@@ -94,7 +94,7 @@ class ChallengeAnswer(BaseModel):
 
 
 class MotionAnswer(BaseModel):
-    """A motion that was designed or uploaded."""
+    """Motion that was designed or uploaded."""
 
     id: str
     arm: str
@@ -106,7 +106,7 @@ class MotionAnswer(BaseModel):
 
 
 class ProgressAnswer(BaseModel):
-    """How far a job that runs is; what nobody can know is null."""
+    """Progress of a running job; what cannot be known is null."""
 
     phase: str
     fraction: float | None
@@ -139,28 +139,28 @@ class JobAnswer(BaseModel):
 
 
 class JobResult(BaseModel):
-    """What the command of a job answered: its one JSON object, empty before it has."""
+    """Answer of a job's command: its one JSON object, empty before there is one."""
 
     job: str
     answer: dict[str, Any]
 
 
 class LeaseAnswer(BaseModel):
-    """A lease that was renewed, and how long it lasts."""
+    """Renewed lease, and how long it lasts [s]."""
 
     job: str
     seconds: float
 
 
 class StopAnswer(BaseModel):
-    """Arms whose movers were asked to stop, and jobs that were ended with that."""
+    """Arms whose motion processes were asked to stop, and jobs that were ended with that."""
 
     arms: list[str]
     jobs: list[str]
 
 
 class AskedAnswer(BaseModel):
-    """Whether anybody moves the arm, and so was asked."""
+    """Request to the process that moves the arm, and whether there was one."""
 
     arm: str
     asked: str
@@ -168,7 +168,7 @@ class AskedAnswer(BaseModel):
 
 
 class RecordingAnswer(BaseModel):
-    """A recording of a run."""
+    """Recording of a run."""
 
     name: str
     sha256: str
@@ -177,7 +177,7 @@ class RecordingAnswer(BaseModel):
 
 
 class ParametersAnswer(BaseModel):
-    """The parameters that a run holds."""
+    """Parameters that a run holds."""
 
     sha256: str
     method: str
@@ -186,7 +186,7 @@ class ParametersAnswer(BaseModel):
 
 
 class RunLine(BaseModel):
-    """A run in the list."""
+    """One run in the list of runs."""
 
     id: str
     kind: str
@@ -196,7 +196,7 @@ class RunLine(BaseModel):
 
 
 class RunAnswer(RunLine):
-    """A run: files are those of its manifest, each with its SHA-256."""
+    """Run; files are those of its manifest, each with its SHA-256."""
 
     arm_sha256: str | None
     manifest_sha256: str | None
@@ -206,7 +206,7 @@ class RunAnswer(RunLine):
 
 
 class AuditLine(BaseModel):
-    """Who did what."""
+    """One line of the audit trail: who did what, when, and about which object."""
 
     id: int
     at: float
@@ -217,14 +217,14 @@ class AuditLine(BaseModel):
 
 
 class WhoAnswer(BaseModel):
-    """Tell whose token or session asks."""
+    """Name and role of the token or session that asks."""
 
     name: str
     role: Literal["viewer", "operator"]
 
 
 class HealthAnswer(BaseModel):
-    """Whether the service looks after its queue, and its version."""
+    """Health of the service (its queue and schedule are looked after), and its version."""
 
     healthy: bool
     version: str

@@ -1,4 +1,4 @@
-"""The application: everything put together, and nothing done before it starts."""
+"""Put the parts of the service together as one application; nothing is done before it starts."""
 
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ from ident_service.service.registry.runs import rebuild_runs
 from ident_service.service.registry.tokens import first_token
 from ident_service.service.uploads import delete_half_uploads
 
-_REFRESH = 1.0  # s between looks for tokens that were made or revoked at a terminal
-_CLEAN = 600.0  # s between looks for uploads that nobody goes on with
+_REFRESH = 1.0  # s between reads of tokens that were made or revoked at a terminal
+_CLEAN = 600.0  # s between searches for abandoned uploads
 _LOG = logging.getLogger("ident.serve")
 ROUTERS = (
     *(
@@ -69,11 +69,11 @@ ROUTERS = (
     ),
     *(exports.router, uploads.router, events.router, deletion.router, maintenance.router, *PAGES),
 )
-"""In this order."""
+"""Routers of the application, in the order in which they are included."""
 
 
 def create_app(settings: Settings, connections: Connections | None = None) -> FastAPI:
-    """The service as an ASGI application; its database is opened now, its queue runs while its lifespan does.
+    """Create the service as an ASGI application; its database is opened now, its queue runs during its lifespan.
 
     Args:
         settings: how it runs.
@@ -158,5 +158,5 @@ def _webhook(settings: Settings, db: Database) -> Webhook | None:
 
 
 def _operation(route: APIRoute) -> str:
-    """The name of an operation is that of its function, for clients that are generated."""
+    """Return the function's name as the operation id of a route, for generated clients."""
     return route.name

@@ -1,4 +1,4 @@
-"""Routes about arms: the list, a description that is uploaded, its faults, what was accepted, a motion's challenge."""
+"""Serve the routes about arms: list, description, faults, acceptances, pause and resume, challenge, motions."""
 
 from __future__ import annotations
 
@@ -45,20 +45,20 @@ class _Body(BaseModel):
 
 
 class Description(_Body):
-    """An arm's description, as YAML, and the files that it names by name."""
+    """Description of an arm as YAML, and the files that it names, by name."""
 
     description: Annotated[str, Field(max_length=MOST_BYTES)]
     files: Annotated[dict[FileName, Text], Field(max_length=16)] = {}
 
 
 class Support(_Body):
-    """The arm's name, as a person types it who sees the arm supported or home."""
+    """Confirmation that the arm is supported or home: its name, typed by a person who sees it."""
 
     confirm: Annotated[str, Field(max_length=200)]
 
 
 class NewArm(Description):
-    """A description that is to be kept.
+    """Description of an arm to be stored.
 
     `replace` says that it may take the place of another one of its name; without it that is answered 409.
     """
@@ -67,21 +67,21 @@ class NewArm(Description):
 
 
 class MotionUpload(_Body):
-    """A motion made for an arm: the content of a `motion.json`."""
+    """Motion for an arm: the content of a `motion.json`."""
 
     arm: ArmName
     motion: Annotated[str, Field(max_length=4 * 2**20)]
 
 
 class Acceptance(_Body):
-    """A person's word that the parameters of a run are the arm's."""
+    """Decision of a person that the parameters of a run are the arm's."""
 
     run: Id
     note: Note
 
 
 class Rollback(_Body):
-    """A person's word that an earlier set is the arm's again; the one before the current set if `to` is left out."""
+    """Decision of a person to return to an earlier set; the one before the current set if `to` is left out."""
 
     note: Note
     to: Annotated[int, Field(ge=1, lt=10_000)] | None = None
@@ -112,7 +112,7 @@ def get_arm(service: Serving, _: Viewer, arm: ArmName) -> ArmAnswer:
 
 @router.post("/arms/{arm}/challenge", status_code=201)
 def challenge(service: Serving, who: Operator, arm: ArmName) -> ChallengeAnswer:
-    """Make a challenge, which with the typed name confirms one motion; a request that comes twice moves it once."""
+    """Make a challenge, which with the typed name confirms one motion; a repeated request moves the arm once."""
     name = known.known_arm(service.db, service.state, arm).name
     return ChallengeAnswer(arm=name, challenge=service.gate.challenge(name, who.name), seconds=CHALLENGE_SECONDS)
 

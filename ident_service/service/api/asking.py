@@ -1,7 +1,8 @@
-"""Who asks a request, and may they: what a route depends on.
+"""Authenticate requests and provide the routes' dependencies: the service, and the caller's name and role.
 
-A token comes as `Authorization: Bearer`, or a session of the page as a cookie. A cookie comes by itself, so what
-changes anything with one must say which page it came from, too (`doors.py` has seen that it is ours).
+A token comes as `Authorization: Bearer`, or a session of the page as a cookie. Browsers send cookies by themselves, so
+a request with a cookie that changes anything must also have an Origin header (`doors.py` has checked that it is this
+service's).
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ WhileKnown = Callable[[AsyncIterator[str]], AsyncIterator[str]]
 
 @dataclass(frozen=True)
 class Service:
-    """What the routes work on: `app.state.service`."""
+    """Components that the routes work with, as `app.state.service`."""
 
     settings: Settings
     db: Database
@@ -47,19 +48,19 @@ class Service:
 
     @property
     def state(self) -> Path:
-        """The state folder."""
+        """Return the state folder."""
         return self.settings.state
 
 
 def service_of(request: Request) -> Service:
-    """The service that this request reached."""
+    """Return the service that this request reached."""
     service = request.app.state.service
     assert isinstance(service, Service)  # noqa: S101 - `create_app` put it there
     return service
 
 
 async def serving(request: Request) -> Service:
-    """Find the service for a route; were this no coroutine, a stop would wait for a thread that others share."""
+    """Return the service, as a dependency; a coroutine, so that a stop does not wait for a shared worker thread."""
     return service_of(request)
 
 
@@ -70,16 +71,16 @@ Cookie = Annotated[str | None, Depends(_cookie)]
 
 
 def address_of(request: Request) -> str:
-    """Where a request comes from."""
+    """Return the client address of a request; empty where it is not known."""
     return request.client.host if request.client else ""
 
 
 async def access_of(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> Access | None:
-    """Who asks; None where nobody says so.
+    """Return name and role of the caller by token or session; None without a valid session and without a token.
 
     Raises:
-        HTTPException: 401 for a token that is nobody's, 429 after too many of them, 403 for a session that is used from
-            nowhere.
+        HTTPException: 401 for an unknown token, 429 after too many failed attempts, 403 for a changing request with a
+            session and without an Origin header.
     """
     service, found = service_of(request), None
     if bearer is not None:
@@ -104,21 +105,21 @@ def _require_page(request: Request) -> None:
 
 
 async def viewer(found: Annotated[Access | None, Depends(access_of)]) -> Access:
-    """Anybody with a token or a session; raises 401 for others."""
+    """Return the caller, who needs a token or a session; raises 401 for others."""
     if found is None:
         raise unknown()
     return found
 
 
 async def operator(found: Annotated[Access, Depends(viewer)]) -> Access:
-    """An operator; raises 403 for others."""
+    """Return the caller, who needs the role operator; raises 403 for others."""
     if found.role != "operator":
         raise HTTPException(403, f"the token {found.name!r} may look only; this needs the role operator")
     return found
 
 
 async def anybody_near(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> str:
-    """Whose stop this is: any token or session, and on this machine anybody at all.
+    """Return the name of the caller of a stop: any token or session, and on this machine anybody at all.
 
     A stop does no harm, and whoever needs it may have no token at hand, or one that is out of date, or be throttled.
     From another machine it takes a token of any role, so that strangers on a network cannot keep an arm from working.
@@ -137,7 +138,7 @@ async def anybody_near(request: Request, bearer: Bearer = None, cookie: Cookie =
 
 
 async def lease_keeper(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> Access:
-    """Find who renews a lease, as `operator` but by memory: a lease does not last as long as a registry may wait.
+    """Return the caller who renews a lease, as `operator`, but from memory without waiting for the registry.
 
     Raises:
         HTTPException: as `operator`.
@@ -153,7 +154,7 @@ async def lease_keeper(request: Request, bearer: Bearer = None, cookie: Cookie =
 
 
 async def while_known(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> WhileKnown:
-    """Let a stream end when the token or session with which it was asked for counts no more."""
+    """Return a filter that ends an event stream when its token or session is no longer valid."""
     gate, secret = service_of(request).gate, None if bearer is None else bearer.credentials
 
     async def told(events: AsyncIterator[str]) -> AsyncIterator[str]:
@@ -166,14 +167,14 @@ async def while_known(request: Request, bearer: Bearer = None, cookie: Cookie = 
 
 
 def unknown() -> HTTPException:
-    """Nobody that we know."""
+    """Return the error for a caller without a valid token or session (401)."""
     return HTTPException(
         401, "give a token that counts: Authorization: Bearer TOKEN", headers={"WWW-Authenticate": "Bearer"}
     )
 
 
 def throttled(error: Throttled) -> HTTPException:
-    """Too many failed attempts."""
+    """Return the error for too many failed attempts (429)."""
     return HTTPException(429, str(error), headers={"Retry-After": str(math.ceil(error.seconds))})
 
 
@@ -190,4 +191,4 @@ LeaseKeeper = Annotated[Access, Depends(lease_keeper)]
 Viewer = Annotated[Access, Depends(viewer)]
 Told = Annotated[WhileKnown, Depends(while_known)]
 Operator = Annotated[Access, Depends(operator)]
-"""What routes ask for."""
+"""Dependencies that routes declare."""

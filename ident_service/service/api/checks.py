@@ -1,4 +1,4 @@
-"""How many descriptions are read and judged at a time: few, so that they keep no other request waiting."""
+"""Limit how many descriptions are checked at the same time, so that they delay no other request."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ MOST_CHECKS: Final = 2
 
 
 class Checks:
-    """Places for descriptions that are being read."""
+    """Limited number of slots for descriptions that are being checked."""
 
     def __init__(self) -> None:
         self._places = threading.BoundedSemaphore(MOST_CHECKS)
 
     @contextmanager
     def place(self) -> Iterator[None]:
-        """Have a place for as long as the block lasts.
+        """Hold one slot for as long as the block lasts.
 
         Raises:
             HTTPException: 503 where all are taken; waiting would keep a thread from other requests.

@@ -1,13 +1,12 @@
-"""The listener of the service: how many connections there are, and how long one may keep its place without a request.
+"""Count the connections of the service's listener, and close those that wait too long without a request.
 
-A newcomer is always let in. Where there are too many, of one address or of all, the connection goes that has waited
-longest without a whole request: half a request, a TLS handshake that does not go on, an idle line. So a stop finds a
-place, whoever keeps lines open. What is being answered stays; there is less of it than there are places, of one
-address and of all, because the doors refuse more (`busy`), a stop and a lease excepted. Who does not read its answer is
-let go, too.
+A new connection is always admitted. Where there are too many, of one address or of all, the connection is closed that
+has waited longest without a complete request: half a request, a TLS handshake that does not go on, an idle connection.
+So a stop always finds a place, whoever keeps connections open. Requests that are being answered keep theirs; they are
+fewer than the places, of one address and of all, because the middleware refuses more (`busy`), a stop and a lease
+excepted. A client that does not read its answer is closed, too.
 
-uvicorn's own `limit_concurrency` counts idle lines and would refuse the stop, and it has no deadline for a request.
-Boundary: sockets of the event loop's thread; requests and answers are `doors.py`.
+uvicorn's own `limit_concurrency` counts idle connections and would refuse the stop; it has no deadline for a request.
 """
 
 from __future__ import annotations
@@ -22,17 +21,17 @@ from typing import Any, Final, Self
 
 HEADER_SECONDS: Final = 10.0  # for a handshake and the headers of a request
 BODY_SECONDS: Final = 60.0  # for 16 MiB over 2.2 Mbit/s
-ANSWER_SECONDS: Final = 60.0  # for the next piece of an answer that the other end does not read
+ANSWER_SECONDS: Final = 60.0  # s for a client to read the next piece of an answer
 _MOST, _FEWEST = 512, 16
-_DESCRIPTORS = 4096  # that are asked for, where the limit of the process may be raised so far
-_RESERVE = 256  # descriptors for files, pipes of jobs, and connections that are about to go
+_DESCRIPTORS = 4096  # descriptors that are asked for, if the hard limit of the process allows it
+_RESERVE = 256  # descriptors for files, pipes of jobs, and connections that are being closed
 _LEAVING = 64
-_AT_ONCE = 16  # accepted before the loop looks at what else there is
+_AT_ONCE = 16  # connections accepted before the event loop turns to other work
 Peer = tuple[str, int]
 
 
 def most_connections() -> int:
-    """Raise the limit of open files as far as it may be, and tell how many connections it leaves room for."""
+    """Raise the limit of open files as far as allowed, and return how many connections it leaves room for."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = _DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, _DESCRIPTORS)
     if soft != resource.RLIM_INFINITY and soft < wanted:
@@ -42,10 +41,10 @@ def most_connections() -> int:
 
 
 class Connections:
-    """Knows the connections that are open, and which of them wait."""
+    """Table of the open connections and of their deadlines."""
 
     def __init__(self, most: int = _MOST, now: Callable[[], float] = time.monotonic) -> None:
-        """Begin with none.
+        """Begin without connections.
 
         Args:
             most: how many there may be; half as many of one address.
@@ -53,18 +52,18 @@ class Connections:
         """
         self._most, self._most_of_one, self._now = most, max(most // 2, 1), now
         self._open: dict[Peer, Connection] = {}
-        self._waiting: dict[Peer, float] = {}  # to the deadline, the longest waiting first
+        self._waiting: dict[Peer, float] = {}  # peer to deadline, the longest waiting first
         self._sending: dict[Peer, float] = {}  # to the deadline
         self._of_one, self._requests = Counter[str](), Counter[Peer]()
         self._leaving = 0
 
     @property
     def full(self) -> bool:
-        """Tell whether even those that are about to go have not gone yet."""
+        """Return whether even the connections that are being closed have not been closed yet."""
         return len(self._open) + self._leaving >= self._most + _LEAVING
 
     def busy(self, peer: Peer | None) -> bool:
-        """Tell whether as many requests are being answered as may be, of all or of this one's address."""
+        """Return whether as many requests are being answered as may be, of all addresses or of this peer's."""
         if len(self._open) - len(self._waiting) >= 3 * self._most // 4:
             return True
         most, host = 3 * self._most_of_one // 4, None if peer is None else peer[0]
@@ -74,11 +73,11 @@ class Connections:
 
     @property
     def count(self) -> int:
-        """Count those that are open."""
+        """Return the number of open connections."""
         return len(self._open)
 
     def admit(self, connection: Connection) -> bool:
-        """Let a newcomer in, another one go if necessary; False where nobody can go."""
+        """Admit a new connection, closing the longest waiting one if necessary; False where none can be closed."""
         host = connection.peer[0]
         if self._of_one[host] >= self._most_of_one:
             longest = next((peer for peer in self._waiting if peer[0] == host), None)
@@ -96,31 +95,31 @@ class Connections:
         return True
 
     def headers_came(self, peer: Peer | None, *, body: bool) -> None:
-        """Know that the headers of a request are whole; with a body it has time for that, else it is answered."""
+        """Note that a request's headers are complete; with a body its deadline begins, else it is being answered."""
         if peer in self._open:
-            # The next request of a line may come before the end of this one is told.
+            # The next request of a connection may arrive before the end of this one is noted.
             self._requests[peer] += 1
             self._waiting.pop(peer, None)
             if body:
                 self._waiting[peer] = self._now() + BODY_SECONDS
 
     def request_came(self, peer: Peer | None) -> None:
-        """Know that a request is whole."""
+        """Note that a request is complete."""
         if peer is not None:
             self._waiting.pop(peer, None)
 
     def sending(self, peer: Peer | None) -> None:
-        """Know that a piece of an answer is on its way; the other end has time to read it."""
+        """Note that a piece of an answer is being sent; the client's deadline to read it begins."""
         if peer in self._open:
             self._sending[peer] = self._now() + ANSWER_SECONDS
 
     def sent(self, peer: Peer | None) -> None:
-        """Know that it has been taken."""
+        """Note that the client's end has taken the piece of the answer."""
         if peer is not None:
             self._sending.pop(peer, None)
 
     def answered(self, peer: Peer | None) -> None:
-        """Know that it is answered; the line waits for another one."""
+        """Note that a request is answered; the connection's deadline for the next one begins."""
         if peer in self._open:
             self._requests[peer] -= 1
             if self._requests[peer] <= 0:
@@ -128,14 +127,14 @@ class Connections:
                 self._waiting[peer] = self._now() + HEADER_SECONDS
 
     def closed(self, connection: Connection) -> None:
-        """Forget one that is closed."""
+        """Remove a connection that is closed."""
         if self._open.get(connection.peer) is connection:
             self._forget(connection.peer)
         elif connection.leaving:
             self._leaving -= 1
 
     def sweep(self) -> None:
-        """Let those go whose time is over."""
+        """Close the connections whose deadline has passed."""
         now = self._now()
         for table in (self._waiting, self._sending):
             for peer in [peer for peer, deadline in table.items() if deadline < now]:
@@ -145,7 +144,7 @@ class Connections:
         connection = self._forget(peer)
         connection.leaving = True
         self._leaving += 1
-        # The event loop reads the end of it, during a TLS handshake too, and closes it.
+        # The event loop then reads the end of the stream, during a TLS handshake too, and closes the socket.
         with suppress(OSError):
             connection.shutdown(socket.SHUT_RDWR)
 
@@ -161,7 +160,7 @@ class Connections:
 
 
 class Connection(socket.socket):
-    """Tells its book when it is closed."""
+    """Accepted socket that tells the table of connections when it is closed."""
 
     peer: Peer
     leaving = False
@@ -169,13 +168,13 @@ class Connection(socket.socket):
 
     @classmethod
     def of(cls, accepted: socket.socket, peer: Peer, book: Connections) -> Self:
-        """Take over an accepted socket."""
+        """Make a connection of an accepted socket."""
         made = cls(accepted.family, accepted.type, accepted.proto, fileno=accepted.detach())
         made.peer, made.book = peer, book
         return made
 
     def close(self) -> None:
-        """Close, and say so once."""
+        """Close the socket, and tell the table once."""
         gone = self.fileno() < 0
         super().close()
         if not gone:
@@ -183,10 +182,10 @@ class Connection(socket.socket):
 
 
 class Listener(socket.socket):
-    """Counts its connections before anything is read from them."""
+    """Listening socket that counts its connections before anything is read from them."""
 
     def __init__(self, family: int, book: Connections) -> None:
-        """Make it; it is not bound yet.
+        """Create the listening socket; it is not bound yet.
 
         Args:
             family: of addresses.
@@ -196,7 +195,7 @@ class Listener(socket.socket):
         self._book, self._accepted = book, 0
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """Accept the next connection that is let in.
+        """Accept the next connection that is admitted.
 
         Raises:
             BlockingIOError: nobody waits, or it is somebody else's turn in the event loop.

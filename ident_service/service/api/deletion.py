@@ -1,4 +1,4 @@
-"""Routes that delete runs, motions and arms: what refers to one is named, and it goes only when that is said."""
+"""Serve the routes that delete runs, motions and arms; entries in use are deleted only with `anyway`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The OpenAPI description as people read it: a summary, an example of each request, and one of each failure.
-
-Boundary: words about routes; their shapes are those of the models.
-"""
+"""Complete the OpenAPI description: summaries, an example of each request and of each failure."""
 
 from __future__ import annotations
 
@@ -59,7 +56,7 @@ EXAMPLES: Final[dict[str, dict[str, Any]]] = {
     "Support": {"By a person who sees it": {"confirm": "wam7_sim"}},
     "Rollback": {"The set before": {"note": "the new one oscillates"}, "The second": {"note": "the best", "to": 2}},
 }
-"""By the name of a request's model: title and value of its examples."""
+"""Examples (title and value) by the name of a request's model."""
 
 FAILURES: Final[dict[int, tuple[str, str]]] = {
     400: ("UsageError", "a description comes with 16 files at most"),
@@ -74,17 +71,17 @@ FAILURES: Final[dict[int, tuple[str, str]]] = {
     503: ("RegistryBusy", "another process keeps the registry; ask again"),
     507: ("DiskFull", "the disk of the state folder is full; make room, then ask again"),
 }
-"""By status: kind and message of one failure that has it."""
+"""Example of a failure (kind and message) by HTTP status."""
 
 
 def describe(app: FastAPI) -> None:
-    """Have an application describe itself with all of this."""
+    """Add summaries and examples to an application's OpenAPI description."""
     plain = app.openapi
 
     def described() -> dict[str, Any]:
         if app.openapi_schema is None:
             _complete(plain())
-        return plain()  # which is kept from the first time
+        return plain()  # FastAPI keeps it from the first time
 
     app.openapi = described  # type: ignore[method-assign]
 

@@ -1,6 +1,6 @@
-"""Routes about descriptions: one that is not the service's yet is judged (of others: a job `config_check`); the home.
+"""Serve the routes that check a description without storing it, and show an arm's home posture.
 
-What computes with mechanisms is loaded when it is asked for: the service starts without.
+Modules that compute with mechanisms are imported only in the request, so that the service starts without them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ router = APIRouter(prefix="/api/v1", tags=["arms"], responses=failures(404))
 
 
 class DescriptionAnswer(BaseModel):
-    """A description without mistakes.
+    """Description without mistakes.
 
     `stable` is null for an arm that can be identified but not moved; `objections` say what is wrong with the gains,
     `text` is all of it for a person.
@@ -48,7 +48,7 @@ class HomeJoint(BaseModel):
 def check(service: Serving, _: Operator, body: Description) -> DescriptionAnswer:
     """Check a description without keeping it; its mistakes are answered with line and column."""
     with service.checks.place(), uploaded(service.state, body.description, body.files) as path:
-        load_arm(path, upload=True)  # most have mistakes that are found here, without a process
+        load_arm(path, upload=True)  # finds most mistakes, without a process
         return DescriptionAnswer(**judge_apart(path))
 
 

@@ -1,4 +1,4 @@
-"""Check Host, Origin, size and number of requests before any route sees them.
+"""Check Host, Origin, size and number of requests before any route sees them; add security headers.
 
 Every answer gets its security headers here.
 
@@ -52,21 +52,21 @@ _HEADERS: Final = (
 
 
 class _TooLarge(HTTPException):
-    """The body has more bytes than it may."""
+    """Error for a body that has more bytes than allowed."""
 
     def __init__(self, most: int) -> None:
         super().__init__(413, f"a request has {most} bytes at most")
 
 
 class _Busy(HTTPException):
-    """As many requests are being answered as may be."""
+    """Error for a request while as many are being answered as may be."""
 
     def __init__(self) -> None:
         super().__init__(503, "too many requests are being answered; ask again", {"Retry-After": "1"})
 
 
 class Doors:
-    """Wraps the application."""
+    """ASGI middleware: check Host, Origin, body size and load; add security headers; count and log requests."""
 
     def __init__(self, app: App, settings: Settings, metrics: Metrics, connections: Connections) -> None:
         self._app, self._metrics, self._connections = app, metrics, connections
@@ -75,12 +75,12 @@ class Doors:
         self._headers = (*_HEADERS, *hsts)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request."""
+        """Handle one request."""
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
         if scope["type"] != "http":
-            return  # there is nothing else here
+            return  # the service has no other protocols
         began, status, started = time.perf_counter(), 500, False
         peer: Peer | None = scope.get("client")
         urgent = scope["path"].endswith(_URGENT)
@@ -129,7 +129,7 @@ class Doors:
             )
 
     def _refusal(self, scope: Scope) -> tuple[int, str, str] | None:
-        """Why this request is not for us: status, kind and words; None if it is."""
+        """Return status, kind and message with which a request for another host or origin is refused, else None."""
         headers = scope["headers"]
         hosts = [value for name, value in headers if name == b"host"]
         host = hosts[0].decode("latin-1") if len(hosts) == 1 else ""
@@ -156,7 +156,7 @@ class Doors:
                     raise _TooLarge(most)
                 if not whole and not message.get("more_body", False):
                     whole = True
-                    # While the body came, others may have taken the places of those that are answered.
+                    # While the body arrived, other requests may have used up the places.
                     if not urgent and self._connections.busy(peer):
                         raise _Busy
                     self._connections.request_came(peer)
@@ -179,7 +179,7 @@ def _has_body(scope: Scope) -> bool:
 
 
 def _name(host: str) -> str:
-    """The name in a Host header, without port and brackets; empty where it is not one."""
+    """Return the name in a Host header, without port and brackets; empty where it is not one."""
     with suppress(ValueError):
         parts = urlsplit(f"//{host}")
         if not (parts.path or parts.query or parts.fragment or parts.username or parts.password):
@@ -191,7 +191,7 @@ def _name(host: str) -> str:
 async def _refuse(send: Send, status: int, kind: str, words: str) -> None:
     body = json.dumps({"error": {"kind": kind, "message": words}}).encode()
     length = str(len(body)).encode()
-    # What is left of the body is not read: the connection ends with the answer.
+    # The rest of the body is not read: the connection ends with the answer.
     headers = [(b"content-type", b"application/json"), (b"content-length", length), (b"connection", b"close")]
     if status == HTTPStatus.SERVICE_UNAVAILABLE:
         headers.append((b"retry-after", b"1"))

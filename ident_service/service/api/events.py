@@ -1,4 +1,4 @@
-"""The route of the one stream: what happens to all arms and jobs, and what runs that are recorded show."""
+"""Serve the event stream of all arms and jobs, and of the samples of runs that are being recorded."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from ident_service.service.registry.runs import RUNS
 
 router = APIRouter(prefix="/api/v1", tags=["events"], responses=failures())
 _LOOK = 0.1  # s between news
-_STATE = 0.5  # s between looks for runs that are recorded
-_BREATH = 10.0  # s without news, after which a comment shows that the line is up
-_AGAIN = 1000  # ms after which a browser comes again
+_STATE = 0.5  # s between queries for runs that are being recorded
+_BREATH = 10.0  # s without news, after which a comment shows that the connection is up
+_AGAIN = 1000  # ms after which a browser reconnects
 _STREAM: dict[int | str, dict[str, Any]] = {
     200: {"content": {"text/event-stream": {}}, "description": "Events."},
     **failures_of_files(),
@@ -66,7 +66,7 @@ async def watch_all(
 
 
 async def _events(service: Service, watch: Watch, seen: Seen, live: LiveRuns | None) -> AsyncIterator[str]:
-    # A number without data: whoever comes again before anything has happened is told what has meanwhile.
+    # A number without data: a client that reconnects before the first event resumes from here.
     yield f"retry: {_AGAIN}\nid: {seen.line}\n\n"
     silent, recorded = 0.0, _Recorded(service, live)
     while not service.engine.closing:
@@ -88,14 +88,14 @@ async def _events(service: Service, watch: Watch, seen: Seen, live: LiveRuns | N
 
 
 class _Recorded:
-    """Follow the runs that are recorded, for one viewer."""
+    """Follower of the runs that are being recorded, for one viewer."""
 
     def __init__(self, service: Service, live: LiveRuns | None) -> None:
         self._service, self._live = service, live
         self._jobs, self._looked = dict[str, tuple[str, int]](), 0.0
 
     def news(self) -> list[str]:
-        """Read on in the file of each run; by one viewer for all."""
+        """Return new samples of each run as events; one file is read once for all viewers."""
         assert self._live is not None  # noqa: S101 - asked for with samples only
         now = time.monotonic()
         if now - self._looked >= _STATE:

@@ -1,4 +1,4 @@
-"""Routes about exports: the files that jobs of the kinds export, figures, payload and correct made, to be fetched."""
+"""Serve the routes about exports: the files that jobs of the kinds export, figures, payload and correct made."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _BINARY: dict[int | str, dict[str, Any]] = {
 
 
 class ExportAnswer(BaseModel):
-    """An export: the job that made it, and the bytes of each file."""
+    """Export: the job that made it, and the size of each file [bytes]."""
 
     id: str
     kind: str

@@ -1,8 +1,7 @@
-"""Who asks, and may they: tokens, sessions of the page, and the throttle of failed attempts.
+"""Authenticate callers by tokens and sessions of the page, and throttle failed attempts.
 
 Tokens and sessions are in the registry, where each request but two looks them up. A stop and the renewal of a lease ask
 a copy in memory, and so wait for nobody (`known`).
-Boundary: no HTTP here; `asking.py` takes tokens out of requests.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ Value = TypeVar("Value")
 
 
 class Throttled(Exception):
-    """Too many failed attempts; `seconds` until the next one counts."""
+    """Error after too many failed attempts; the next attempt counts after `seconds` [s]."""
 
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
@@ -38,9 +37,9 @@ class Throttled(Exception):
 
 
 class Throttle:
-    """Counts failed attempts, per address and per token.
+    """Counter of failed attempts, per address and per token.
 
-    Nothing is counted of all together: nobody guesses 256 bits, and whoever fails elsewhere must lock out no one here.
+    There is no total over all callers: nobody guesses 256 bits, and failures elsewhere must lock out nobody here.
     """
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
@@ -48,12 +47,12 @@ class Throttle:
         self._failures: OrderedDict[str, deque[float]] = OrderedDict()
 
     def require(self, *keys: str) -> None:
-        """Raise Throttled where an attempt with one of these, an address or the digest of a token, does not count."""
+        """Raise Throttled if one of these keys, an address or a token's digest, has failed too often."""
         if (wait := max(self._wait(self._failures.get(key, deque())) for key in keys)) > 0.0:
             raise Throttled(wait)
 
     def failed(self, *keys: str) -> None:
-        """Count one failure of each."""
+        """Count one failed attempt for each key."""
         for key in keys:
             _remember(self._failures, key, self._failures.get(key, deque(maxlen=_FAILURES)), _MOST_ADDRESSES)
             self._failures[key].append(self._now())
@@ -71,7 +70,7 @@ class _Challenge:
 
 
 class Gate:
-    """Knows who asks."""
+    """Authenticator of callers by tokens, sessions and challenges."""
 
     def __init__(self, db: Database, now: Callable[[], float] = time.monotonic) -> None:
         """Begin with the tokens and sessions that the registry knows.
@@ -93,7 +92,7 @@ class Gate:
         self._tokens, self._sessions = digests(self._db), sessions(self._db)
 
     def known(self, secret: str | None, session: str | None) -> Access | None:
-        """Tell whose token or session this is by the copy in memory; whatever failed before, and waiting for nobody.
+        """Return whose token or session this is from the copy in memory, without throttle and without waiting.
 
         A token that was revoked at a terminal counts here until the next `refresh`, which each request brings about.
         """
@@ -104,7 +103,7 @@ class Gate:
         return None if key is None else self._tokens.get(key)
 
     def by_token(self, secret: str, address: str) -> Access | None:
-        """Whose token this is; None if nobody's.
+        """Return whose token this is; None if nobody's.
 
         Raises:
             Throttled: too many failed attempts; a token that was good from this address before is still heard.
@@ -124,7 +123,7 @@ class Gate:
         return found
 
     def log_in(self, secret: str, address: str) -> tuple[str, Access] | None:
-        """Exchange a token for a session; None if it is nobody's. Raises as `by_token`."""
+        """Exchange a token for a session; return None for an unknown token. Raises as `by_token`."""
         found = self.by_token(secret, address)
         if found is None:
             return None
@@ -134,7 +133,7 @@ class Gate:
         return session, found
 
     def by_session(self, session: str) -> Access | None:
-        """Whose session this is; None if nobody's, or if its time is over."""
+        """Return whose session this is; None if nobody's, or if it has expired."""
         self.refresh()
         return self.known(None, session)
 
@@ -144,7 +143,7 @@ class Gate:
         self.refresh()
 
     def challenge(self, arm: str, who: str) -> str:
-        """A word that confirms one motion of an arm, once, together with the arm's typed name."""
+        """Return a challenge that confirms one motion of an arm, once, together with the arm's typed name."""
         word = secrets.token_urlsafe(16)
         with self._lock:
             entry = _Challenge(arm, who, self._now() + CHALLENGE_SECONDS)
@@ -152,14 +151,14 @@ class Gate:
         return word
 
     def confirm(self, word: str, arm: str, who: str) -> bool:
-        """Whether the word was given to the same one for the same arm, not too long ago; asking uses it up."""
+        """Return whether the challenge was given to this caller for this arm and has not expired; it is used up."""
         with self._lock:
             entry = self._challenges.pop(word, None)
         return entry is not None and (entry.arm, entry.who) == (arm, who) and entry.until >= self._now()
 
 
 def _remember(table: OrderedDict[Key, Value], key: Key, value: Value, most: int) -> None:
-    """Enter the newest, and forget the oldest where there are too many."""
+    """Add an entry as the newest, and drop the oldest ones where there are too many."""
     table[key] = value
     table.move_to_end(key)
     while len(table) > most:

@@ -1,4 +1,4 @@
-"""Routes about jobs: asked for, watched, cancelled, their lease renewed; and stop, which asks for nothing."""
+"""Serve the routes about jobs (create, watch, cancel, renew the lease) and the stop, which needs no role."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ State = Literal["queued", "running", "done", "refused", "failed", "faulted", "ca
 
 
 class Confirmation(BaseModel):
-    """A person's word for one motion: the arm's name, typed, and the challenge that was given for it."""
+    """Confirmation of one motion by a person: the arm's name, typed, and the challenge that was given for it."""
 
     model_config = ConfigDict(extra="forbid")
     name: Annotated[str, Field(max_length=64)]
@@ -69,7 +69,7 @@ class Confirmation(BaseModel):
 
 
 class JobRequest(BaseModel):
-    """A job; one that may move an arm needs the confirmation, and its lease renewed from now on."""
+    """Job to be done; one that may move an arm needs the confirmation, and its lease renewed from now on."""
 
     model_config = ConfigDict(extra="forbid")
     job: Asked
@@ -95,7 +95,7 @@ def require_confirmed(service: Service, arm: str, confirm: Confirmation | None, 
 def create_job(
     service: Serving, who: Operator, body: JobRequest, response: Response, idempotency_key: Key = None
 ) -> JobAnswer:
-    """Begin or queue a job; a computation that is asked for again with the same `Idempotency-Key` is the same job."""
+    """Begin or queue a job; a computation repeated with the same `Idempotency-Key` is the same job."""
     if idempotency_key is None:
         return begin_job(service, who, body)
     if body.job.kind in MOVES:
@@ -108,7 +108,7 @@ def create_job(
 
         try:
             return answer_of(service, service.engine.create(body.job, who.name, entering=enter))
-        except sqlite3.IntegrityError:  # the same request came twice at a time, and the other one was the first
+        except sqlite3.IntegrityError:  # the same request came twice at once, and the other one was entered first
             row = rows.job_of_key(service.db, who.name, idempotency_key, asked)
             if row is None:
                 raise
@@ -117,7 +117,7 @@ def create_job(
 
 
 def begin_job(service: Service, who: Access, body: JobRequest) -> JobAnswer:
-    """Queue what is asked for, in a request to the API or on a page.
+    """Queue the job of a request to the API or of a page.
 
     Raises:
         MotionRefused: a motion that no person has confirmed.
@@ -152,14 +152,14 @@ def get_job(service: Serving, _: Viewer, job: Id) -> JobAnswer:
 
 @router.get("/jobs/{job}/log", response_class=PlainTextResponse, responses=failures_of_files(404, 409))
 def get_log(service: Serving, _: Viewer, job: Id) -> PlainTextResponse:
-    """Read the end of the log of a job."""
+    """Return the end of the log of a job."""
     row = rows.known_job(service.db, job)
     return PlainTextResponse(said(service.state / JOBS / row["id"], MOST_LOG).log)
 
 
 @router.get("/jobs/{job}/result")
 def get_result(service: Serving, _: Viewer, job: Id) -> JobResult:
-    """Read what the command of a job answered."""
+    """Return what the command of a job answered."""
     row = rows.known_job(service.db, job)
     answer = said(service.state / JOBS / row["id"]).answer
     return JobResult(job=row["id"], answer=_named(answer, service, row))
@@ -181,7 +181,7 @@ def cancel_job(service: Serving, who: Operator, job: Id) -> JobAnswer:
 
 @router.post("/jobs/{job}/lease")
 async def renew_lease(service: Serving, who: LeaseKeeper, job: Id) -> LeaseAnswer:
-    """Renew the lease of a motion; only whoever asked for it can."""
+    """Renew the lease of a motion; only the caller who asked for the motion can."""
     holder = service.engine.live.lease_holder(job)
     if holder is not None and holder != who.name:
         raise HTTPException(403, "the lease of a motion is renewed by whoever asked for it")
@@ -199,7 +199,7 @@ async def stop_all(service: Serving, who: Near) -> StopAnswer:
 
 @router.post("/arms/{arm}/stop")
 async def stop_arm(service: Serving, who: Near, arm: ArmName) -> StopAnswer:
-    """Stop an arm, under control; as for all arms; one that nobody moves is no mistake."""
+    """Stop an arm, under control; as for all arms; it is no error if no process moves it."""
     return await _stop(service, arm, who)
 
 
@@ -209,7 +209,7 @@ async def _stop(service: Service, arm: str | None, who: str) -> StopAnswer:
 
 
 def answer_of(service: Service, row: Row) -> JobAnswer:
-    """A job as it is answered: without the words of its command, which name places of this machine."""
+    """Return a job as the API answers it, without its command's own text, which names paths of this machine."""
     found = service.engine.progress(row)
     shown = {key: value for key, value in row.items() if key in JobAnswer.model_fields}
     shown["detail"] = _named(row["detail"], service, row)

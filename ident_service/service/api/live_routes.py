@@ -1,4 +1,4 @@
-"""The route of what a job shows while it runs."""
+"""Serve the live event stream of one job."""
 
 from __future__ import annotations
 

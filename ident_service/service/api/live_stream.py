@@ -1,7 +1,4 @@
-"""A job while it runs, as server-sent events: its state and log, and what a run that is recorded shows.
-
-Boundary: what is shown of a run is `service/live.py`.
-"""
+"""Stream a running job as server-sent events: its state and log, and samples of the run that it records."""
 
 from __future__ import annotations
 
@@ -23,13 +20,13 @@ from ident_service.service.registry.runs import RUNS
 
 RECORDED: Final = frozenset({"run", "rehearse", "home"})
 _LOOK = 0.1  # s between news
-_STATE = 0.5  # s between looks at the job itself
-_BREATH = 10.0  # s without news, after which a comment shows that the line is up
+_STATE = 0.5  # s between reads of the job itself
+_BREATH = 10.0  # s without news, after which a comment shows that the connection is up
 _LOG_BYTES = 64 * 1024
 
 
 def log_of(service: Service, row: Row) -> str:
-    """The last of what the process of a job said."""
+    """Return the end of what the process of a job has printed."""
     log: str = jobs.without_paths(said(service.state / JOBS / row["id"], _LOG_BYTES).log, str(service.state))
     return log
 

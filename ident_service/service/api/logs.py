@@ -1,7 +1,7 @@
-"""Logs as lines of JSON on standard error: when, how bad, where, what, and the facts with their names.
+"""Write logs as lines of JSON on standard error: time, level, logger, message, and named facts.
 
-A thread of its own writes them: a reader of standard error that stands still keeps nobody else, a stop least of all.
-Lines that nobody takes are left out, and so are those that say the same thing again and again.
+A thread of its own writes them, so that a reader of standard error that does not read delays no request, least of all a
+stop. Lines that do not fit the queue are dropped, and so are lines that are repeated too often.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from datetime import UTC, datetime
 from typing import Final, TextIO
 
 _OURS: Final = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "taskName", "color_message"}
-_MOST_WAITING: Final = 1000  # lines for a reader that stands still
+_MOST_WAITING: Final = 1000  # lines that are queued while the reader does not read
 _MOST_ALIKE, _WINDOW = 100, 10.0  # lines in so many seconds
 _MOST_KINDS: Final = 1000
-_LAST_LINES = 1.0  # s for what waits when the process ends
+_LAST_LINES = 1.0  # s for the queued lines when the process ends
 
 
 class JsonLines(logging.Formatter):
-    """One record, one line."""
+    """Formatter that writes one record as one line of JSON."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record as a JSON object; what is no JSON value is told in words."""
+        """Return the record as a JSON object; a value that is not JSON is written as its text."""
         line = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),
@@ -43,7 +43,7 @@ class JsonLines(logging.Formatter):
 
 
 class NotTooOften(logging.Filter):
-    """Leaves lines out that say the same thing too often; the next one that is let through says how many."""
+    """Filter that drops lines repeated too often; the next one that passes has the number of dropped ones."""
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
@@ -51,7 +51,7 @@ class NotTooOften(logging.Filter):
         self._kinds: dict[tuple[str, str, object], tuple[float, int]] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Tell whether a line is written; alike are those of one logger, template and status."""
+        """Return whether a line is written; lines of one logger, template and status count as the same."""
         kind = (record.name, str(record.msg)[:80], getattr(record, "status", None))
         with self._lock:
             if len(self._kinds) > _MOST_KINDS:
@@ -66,22 +66,22 @@ class NotTooOften(logging.Filter):
 
 
 class AsideHandler(logging.Handler):
-    """Hands lines to a thread that writes them; never waits for it."""
+    """Handler that passes lines to a thread of its own, which writes them; it never waits for that thread."""
 
     def __init__(self, stream: TextIO) -> None:
-        """Begin the thread; `stream` is written by it alone."""
+        """Start the writing thread, the only one that writes to `stream`."""
         super().__init__()
         self._stream, self._lines = stream, queue.Queue[str | None](_MOST_WAITING)
         self._thread = threading.Thread(target=self._work, name="log", daemon=True)
         self._thread.start()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Hand over one line, or leave it out."""
+        """Pass one line to the writing thread, or drop it if the queue is full."""
         with suppress(queue.Full):
             self._lines.put_nowait(self.format(record))
 
     def close(self) -> None:
-        """Have written what waits, as far as it is read soon."""
+        """Let the thread write the queued lines, for about a second at most."""
         with suppress(queue.Full):
             self._lines.put(None, timeout=_LAST_LINES)
             self._thread.join(_LAST_LINES)
@@ -89,14 +89,14 @@ class AsideHandler(logging.Handler):
 
     def _work(self) -> None:
         while (line := self._lines.get()) is not None:
-            with suppress(OSError, ValueError):  # nobody is left to tell
+            with suppress(OSError, ValueError):  # standard error is gone, so that nothing can be reported
                 self._stream.write(line + "\n")
                 if self._lines.empty():
                     self._stream.flush()
 
 
 def log_as_json(level: int = logging.INFO) -> None:
-    """From now on, all logs of this process."""
+    """Write all logs of this process as lines of JSON from now on."""
     handler = AsideHandler(sys.stderr)
     handler.setFormatter(JsonLines())
     handler.addFilter(NotTooOften())

@@ -1,4 +1,4 @@
-"""Routes about what is checked again: schedules, maintenance, what is due, re-identifications, drift alarms."""
+"""Serve the routes about schedules, maintenance, due re-identifications, re-identifications and drift alarms."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class _Body(BaseModel):
 
 
 class NewSchedule(_Body):
-    """When an arm is to be re-identified: exactly one of cron (UTC), operating hours, maintenance."""
+    """Schedule of an arm's re-identification: exactly one of cron (UTC), operating hours, maintenance."""
 
     arm: ArmName
     cron: Annotated[str, Field(max_length=200)] | None = None
@@ -51,7 +51,7 @@ class NewSchedule(_Body):
 
 
 class Enabled(_Body):
-    """Whether a schedule counts."""
+    """State of a schedule: enabled or disabled."""
 
     enabled: bool
 
@@ -64,13 +64,13 @@ class Event(_Body):
 
 
 class Remark(_Body):
-    """A person's word, with a reason."""
+    """Decision of a person, with a reason."""
 
     note: Words
 
 
 class NewReidentification(_Body):
-    """A person's word that an arm is re-identified now; it moves twice, for the preflight and for the run."""
+    """Request to re-identify an arm now; it moves twice, for the preflight and for the run."""
 
     arm: ArmName
     motion: Id | None = None
@@ -132,7 +132,7 @@ def list_due(service: Serving, _: Viewer, arm: ArmName | None = None) -> list[Du
 
 @router.post("/due/{number}/dismiss", status_code=204)
 def dismiss_due(service: Serving, who: Operator, number: Number, body: Remark) -> None:
-    """Dismiss what is due, by a person's word."""
+    """Dismiss a due re-identification, on a person's decision."""
     planned.dismiss(service.db, number, body.note, who.name, time.time())
 
 
@@ -193,7 +193,7 @@ def list_alarms(
 
 @router.post("/alarms/{number}/ack")
 def acknowledge_alarm(service: Serving, who: Operator, number: Number, body: Remark) -> AlarmAnswer:
-    """Acknowledge a drift alarm, by a person's word; the accepted set stays as it is."""
+    """Acknowledge a drift alarm, on a person's decision; the accepted set stays as it is."""
     return AlarmAnswer(**raised.acknowledge_alarm(service.db, number, body.note, who.name, time.time()))
 
 

@@ -1,4 +1,4 @@
-"""What the routes about schedules, maintenance and re-identification answer with; times as in `answers.py`."""
+"""Define the answers about schedules, maintenance and re-identification; times as in `answers.py`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pydantic import BaseModel
 
 
 class ScheduleAnswer(BaseModel):
-    """A schedule.
+    """Schedule of re-identifications.
 
     One of `cron` (five fields, UTC) and `trigger` (`hours:NUMBER` or `maintenance`) is set. `next` is when it is due
     by cron; `motion` null is the description's own.
@@ -27,9 +27,9 @@ class ScheduleAnswer(BaseModel):
 
 
 class DeliveryAnswer(BaseModel):
-    """A notice to the webhook.
+    """Notice to the webhook.
 
-    `next` is when it is tried; without it and without `delivered` it was given up. `why` says what the last try met.
+    `next` is when it is tried; without it and without `delivered` it was given up. `why` is the last error.
     """
 
     number: int
@@ -54,7 +54,7 @@ class EventAnswer(BaseModel):
 
 
 class DueAnswer(BaseModel):
-    """A re-identification that is due; it asks for a person unless it has begun by itself."""
+    """Re-identification that is due; it waits for a person unless it has begun by itself."""
 
     id: int
     arm: str
@@ -64,7 +64,7 @@ class DueAnswer(BaseModel):
 
 
 class ReidentificationAnswer(BaseModel):
-    """A re-identification.
+    """Re-identification and its outcome.
 
     `against` is the number of the acceptance; `job` that of the step; `recorded` the run with the recording and `run`
     the one with the parameters and the comparison. `detail` says what has changed, or why there is no verdict.
@@ -89,7 +89,7 @@ class ReidentificationAnswer(BaseModel):
 
 
 class AlarmAnswer(BaseModel):
-    """A drift alarm: what has changed, in words; it stands while `closed` is null, `how` says how it ended."""
+    """Drift alarm: what has changed, in words; it stands while `closed` is null, `how` says how it ended."""
 
     id: int
     arm: str

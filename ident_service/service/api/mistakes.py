@@ -1,4 +1,4 @@
-"""What goes wrong, as one shape of answer with the status that fits."""
+"""Turn errors into one model of failure with the fitting HTTP status."""
 
 from __future__ import annotations
 
@@ -65,13 +65,13 @@ _WORDS: Final = {
 
 
 def failures(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """For a route: the statuses of its failures, besides those that any route may have."""
+    """Return the `responses` of a route: its own failure statuses, besides those that any route may have."""
     every = {400, 401, 403, 413, 421, 422, 429, 503, 507, *statuses}
     return {status: {"model": Failure, "description": _WORDS[status]} for status in sorted(every)}
 
 
 def failures_of_files(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """The same for a route whose good answers are not JSON: its failures are."""
+    """Return the failure `responses` of a route whose successful answers are not JSON."""
     content = {"application/json": {"schema": {"$ref": "#/components/schemas/Failure"}}}
     return {
         status: {"description": said["description"], "content": content} for status, said in failures(*statuses).items()
@@ -79,12 +79,12 @@ def failures_of_files(*statuses: int) -> dict[int | str, dict[str, Any]]:
 
 
 def status_of(error: IdentError) -> int:
-    """The status of an answer that this error becomes."""
+    """Return the HTTP status for an error."""
     return next((status for kind, status in _STATUS if isinstance(error, kind)), 500)
 
 
 def answer_mistakes(app: FastAPI) -> None:
-    """Turn every error into that shape."""
+    """Install the exception handlers that turn every error into a `Failure`."""
 
     async def _resources(request: Request, error: Exception) -> JSONResponse:
         if (short := _short_of(request, error)) is None:
@@ -138,6 +138,6 @@ def _short_of(request: Request, error: Exception) -> tuple[int, str, str, dict[s
 def _answer(
     status: int, kind: str, message: str, headers: dict[str, str] | None = None, more: dict[str, Any] | None = None
 ) -> JSONResponse:
-    # What was sent may hold what is no text; it must not keep us from answering.
+    # The request may hold characters that cannot be encoded; they must not prevent an answer.
     message = message.encode("utf-8", "replace").decode("utf-8")
     return JSONResponse({"error": {"kind": kind, "message": message, **(more or {})}}, status, headers=headers)

@@ -1,4 +1,4 @@
-"""What a service manager wants to hear (`sd_notify(3)`): ready, alive, stopping. Without one, nothing is said.
+"""Notify the service manager (`sd_notify(3)`) of ready, alive, stopping; without one, nothing is sent.
 
 The protocol is a datagram of lines to the socket that `$NOTIFY_SOCKET` names.
 """
@@ -30,7 +30,7 @@ def tell_manager(line: str) -> bool:
 
 
 def watchdog_seconds() -> float | None:
-    """How often the manager wants to hear that we live [s]: half of what it waits; None if it does not."""
+    """Return the period of watchdog notices [s], half of the manager's timeout; None if it has no watchdog."""
     try:
         length, pid = int(os.environ.get("WATCHDOG_USEC", "")), int(os.environ.get("WATCHDOG_PID", os.getpid()))
     except ValueError:

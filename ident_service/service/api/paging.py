@@ -1,4 +1,4 @@
-"""Lists in pages, the newest first: `before` names the last line of one page, `Link` the page after it (RFC 8288)."""
+"""Serve lists in pages, the newest first: `before` names the last line of one page, `Link` the next page (RFC 8288)."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ PAGES: Final[dict[int | str, dict[str, Any]]] = {
         }
     }
 }
-"""For `responses` of a route."""
+"""Description of the `Link` header, for `responses` of a route."""
 
 
 class Pager:
-    """Reads one page of a list for a request."""
+    """Reader of one page of a list for a request."""
 
     def __init__(self, request: Request, response: Response) -> None:
-        """Take the request, which names the page, and the answer, which gets the header."""
+        """Take the request, which names the page, and the response, which gets the `Link` header."""
         self._request, self._response = request, response
 
     def __call__(self, most: int, read: Callable[[int], Sequence[Row]], key: str = "id") -> list[Row]:
-        """Read one page and name the next.
+        """Return the lines of one page, and name the next page in the header.
 
         Args:
             most: lines of a page.

@@ -1,4 +1,4 @@
-"""The route that lets recordings go: named first, deleted only when that is said."""
+"""Serve the route that deletes old recordings: they are listed first, and deleted only with `yes`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ router = APIRouter(prefix="/api/v1", tags=["runs"], responses=failures())
 
 
 class Pruning(BaseModel):
-    """How many of each arm's newest runs keep their recordings; nothing is deleted without `yes`."""
+    """Number of each arm's newest runs whose recordings are kept; nothing is deleted without `yes`."""
 
     model_config = ConfigDict(extra="forbid")
     keep: Annotated[int, Field(ge=1, le=1_000_000)]
@@ -25,7 +25,7 @@ class Pruning(BaseModel):
 
 
 class PrunedRecording(BaseModel):
-    """A recording that may go, or went."""
+    """Recording that may be deleted, or was."""
 
     run: str
     name: str
@@ -33,7 +33,7 @@ class PrunedRecording(BaseModel):
 
 
 class PruningAnswer(BaseModel):
-    """What was deleted, or would be; `left_alone` says which folders could not be read, and why."""
+    """Recordings that were deleted, or would be; `left_alone` says which folders could not be read, and why."""
 
     deleted: bool
     bytes: int

@@ -1,4 +1,4 @@
-"""Routes about runs: what was recorded and identified, and the files of their manifests."""
+"""Serve the routes about runs: their records, recordings, parameters, files and reports."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _BINARY: dict[int | str, dict[str, Any]] = {
     200: {"content": {"application/octet-stream": {}}, "description": "The file."},
     **failures_of_files(404),
 }
-# Of a page without network, whose own style and script stand in it; it can reach nothing of ours.
+# Content security policy of the report: its inline style and script run in a sandbox and can reach nothing.
 _POLICY = (
     "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:; frame-ancestors 'self'; "
     "sandbox allow-scripts allow-downloads"
@@ -62,7 +62,7 @@ def get_file(service: Serving, _: Viewer, run: Id, name: FileName) -> FileRespon
 
 @router.get("/runs/{run}/report.html", response_class=FileResponse, responses=_PAGE)
 def get_report(service: Serving, _: Viewer, run: Id) -> FileResponse:
-    """Show the report of a run; the one that a job of the kind `report` has made since, or its own."""
+    """Show the report of a run: the newest that a job of the kind `report` has made, else the run's own."""
     path = service.state / REPORTS / f"{runs.known_run(service.db, run)['id']}.html"
     if not path.is_file() and _REPORT in runs.run_files(service.db, service.state, run):
         path = runs.run_file(service.db, service.state, run, _REPORT)

@@ -1,4 +1,4 @@
-"""The daemon: one per state folder, listening until it is told to end; arms come to rest first."""
+"""Run the daemon: one per state folder, listening until a signal ends it; arms come to rest first."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from ident_service.service.state_folder import URL_FILE, keep_private, single_in
 _MOST_HEADERS = 32 * 1024  # bytes
 _SWITCH = 0.0005  # s
 _LAST_ANSWERS = 5  # s for requests that are being answered when the service ends
-_READY_AGAIN = 0.1  # s until a manager whose queue was full is told again that we are ready
+_READY_AGAIN = 0.1  # s until READY=1 is sent again to a manager whose queue was full
 _LOG = logging.getLogger("ident.serve")
 
 
 def serve(settings: Settings, tell: Callable[[str], None] = lambda _: None) -> None:
-    """Serve until a signal ends it.
+    """Serve the API until a signal ends the process.
 
     Args:
         settings: how.
@@ -52,7 +52,7 @@ def serve(settings: Settings, tell: Callable[[str], None] = lambda _: None) -> N
         url = f"{'https' if settings.tls else 'http'}://{f'[{host}]' if ':' in host else host}:{port}"
 
         def ready() -> None:
-            # In the file for programs that start us and let us choose the port.
+            # In the file for programs that start the service and let it choose the port.
             write_atomically(settings.state / URL_FILE, url + "\n")
             tell(url)
 
@@ -66,13 +66,13 @@ def serve(settings: Settings, tell: Callable[[str], None] = lambda _: None) -> N
             ws="none",
             lifespan="on",
             http="h11",
-            loop="asyncio",  # which takes its connections from our listener
+            loop="asyncio",  # this loop accepts connections from `Listener`
             h11_max_incomplete_event_size=_MOST_HEADERS,
             timeout_graceful_shutdown=_LAST_ANSWERS,
             ssl_certfile=settings.tls_cert,
             ssl_keyfile=settings.tls_key,
         )
-        # A stop meets several turns of the event loop; each waits so long for a thread that computes.
+        # A stop takes several turns of the event loop; each waits up to this long for a computing thread.
         sys.setswitchinterval(_SWITCH)
         server = _Server(config, app, book, ready)
         try:
@@ -82,16 +82,16 @@ def serve(settings: Settings, tell: Callable[[str], None] = lambda _: None) -> N
 
 
 class _Server(uvicorn.Server):
-    """uvicorn's, that stops the arms as soon as it is to end, and tells the service manager that it lives."""
+    """uvicorn server that stops the arms as soon as it is to end, and sends notices to the service manager."""
 
     def __init__(self, config: uvicorn.Config, app: FastAPI, book: Connections, ready: Callable[[], None]) -> None:
         super().__init__(config)
         self._app, self._service, self._book, self._ready = app, app.state.service, book, ready
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Listen, and only then say so: whoever comes at the word is not refused."""
+        """Listen, and only then report ready, so that clients who wait for that are not refused."""
         await _make_routes(self._app)
-        # What is there now stays: a full collection would hold the first stops up for a tenth of a second.
+        # Objects made so far are kept for good: a full collection would delay the first stops by 0.1 s.
         gc.collect()
         gc.freeze()
         await super().startup(sockets)
@@ -99,22 +99,22 @@ class _Server(uvicorn.Server):
             self._ready()
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """A signal: the arms first. Another interrupt means in a hurry, and they are being stopped already."""
+        """Handle a signal: stop the arms first; a second interrupt also skips waiting for open requests."""
         tell_manager("STOPPING=1")
-        # Not in the signal's own frame: what it interrupts may hold the lock that is needed.
+        # Not in the signal handler: the interrupted code may hold the lock that is needed.
         if not self.should_exit:
             threading.Thread(target=self._service.engine.begin_closing, name="closing", daemon=True).start()
-        # uvicorn would raise the signal again at the end; ours is a good one.
+        # uvicorn would raise the signal again at the end; here it is a regular end.
         self.force_exit = self.should_exit and sig == signal.SIGINT
         self.should_exit = True
 
     async def on_tick(self, counter: int) -> bool:
-        """Ten times a second: let connections go that do not come to a request."""
+        """Close connections that wait too long without a request; called ten times a second."""
         self._book.sweep()
         return await super().on_tick(counter)
 
     async def main_loop(self) -> None:
-        """Serve; tell the manager that we are ready, then keep its watchdog quiet while the queue is looked after."""
+        """Serve; report ready to the service manager, then feed its watchdog while the queue is looked after."""
         task = asyncio.create_task(self._tell_manager())
         try:
             await super().main_loop()
@@ -124,7 +124,7 @@ class _Server(uvicorn.Server):
                 await task
 
     async def _tell_manager(self) -> None:
-        # Without READY=1 the manager would take us for failed; any other line may be lost.
+        # Without READY=1 the manager would count the service as failed; any other line may be lost.
         while not tell_manager("READY=1"):
             await asyncio.sleep(_READY_AGAIN)
         seconds = watchdog_seconds()
@@ -137,7 +137,7 @@ class _Server(uvicorn.Server):
 
 
 async def _make_routes(app: FastAPI) -> None:
-    """Ask for what is not there: FastAPI makes its routes at the first request, which may be a stop."""
+    """Send a request for a missing path, so that FastAPI builds its routes now and not during the first stop."""
 
     async def receive() -> dict[str, Any]:
         return {"type": "http.request", "body": b"", "more_body": False}
@@ -187,7 +187,7 @@ def _tls_words(error: Exception) -> str:
 
 @contextmanager
 def _listening(settings: Settings, book: Connections) -> Iterator[socket.socket]:
-    """A socket at the address.
+    """Yield a socket that is bound to the service's address.
 
     Raises:
         UsageError: it cannot be had.

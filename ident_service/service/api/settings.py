@@ -1,4 +1,4 @@
-"""How the service runs: where its state is, where it listens, and who may talk to it there."""
+"""Hold the settings of the service: state folder, listening address, TLS, host names, webhook."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _LOCAL_NAMES: Final = frozenset({"localhost", "127.0.0.1", "::1"})
 
 @dataclass(frozen=True)
 class Settings:
-    """What a service is started with.
+    """Settings that a service is started with.
 
     Attributes:
         state: the state folder.
@@ -45,7 +45,7 @@ class Settings:
     lease_factor: float = 1.0
 
     def __post_init__(self) -> None:
-        """Refuse what would be open to a network.
+        """Refuse settings that would expose the service to a network.
 
         Raises:
             UsageError: an address beyond loopback without TLS, half of what TLS or a webhook needs, or no address.
@@ -66,20 +66,20 @@ class Settings:
 
     @property
     def loopback(self) -> bool:
-        """Whether only this machine reaches it."""
+        """Return whether only this machine can reach the service."""
         try:
             return ipaddress.ip_address(self.host).is_loopback
         except ValueError:
-            # A name is what a resolver makes of it, and so is no promise; this one is.
+            # A resolver may map a name to any address; only this name is sure to mean loopback.
             return self.host == "localhost"
 
     @property
     def tls(self) -> bool:
-        """Whether it speaks TLS."""
+        """Return whether the service speaks TLS."""
         return self.tls_cert is not None
 
     @property
     def hosts(self) -> frozenset[str]:
-        """Names that a request's Host may have, in lower case, without port and brackets."""
+        """Return the names that a request's Host may have, in lower case, without port and brackets."""
         own = {name.lower() for name in (*self.names, self.host)} - {"0.0.0.0", "::"}  # noqa: S104 - taken out
         return frozenset(own | _LOCAL_NAMES) if self.loopback else frozenset(own)

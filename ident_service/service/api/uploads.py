@@ -1,4 +1,4 @@
-"""Routes about uploads: a recording of one's own arrives in pieces, and becomes a run that jobs take it from."""
+"""Serve the routes about uploads: a recording arrives in pieces, and becomes a run that jobs can use."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Offset = Annotated[int, Header(ge=0, lt=2**62, description="of the piece's first
 
 
 class NewUpload(BaseModel):
-    """A recording that is to be uploaded.
+    """Recording that is to be uploaded.
 
     `columns` is YAML that says how a CSV is laid out (`docs/recordings.md`), where the arm's description does not.
     """
@@ -40,7 +40,7 @@ class NewUpload(BaseModel):
 
 
 class UploadAnswer(BaseModel):
-    """An upload: `received` is where the next piece begins, `run` the id of the run that it has become."""
+    """Upload: `received` is the offset of the next piece, `run` the id of the run that it has become."""
 
     id: str
     arm: str
@@ -53,7 +53,7 @@ class UploadAnswer(BaseModel):
 
 @router.post("/uploads", status_code=201)
 def begin_upload(service: Serving, who: Operator, body: NewUpload) -> UploadAnswer:
-    """Announce a recording; one that was announced before goes on where it broke off, a whole one is not sent again."""
+    """Announce a recording; an interrupted upload is resumed, a complete one is not sent again."""
     announced = uploads.Announced(**body.model_dump(), by=who.name)
     try:
         return _answer(uploads.begin_upload(service.db, service.state, announced))

@@ -1,1 +1,1 @@
-"""Jobs: each a process of its own that runs a verb of the command, with ids turned into paths here and nowhere else."""
+"""Run jobs: each in its own process that runs a verb of the command line, with ids turned into paths here only."""

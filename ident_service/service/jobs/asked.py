@@ -1,7 +1,4 @@
-"""What may be asked of the service as a job: ids and plain values, never a path.
-
-Boundary: shapes and bounds; what becomes of them is `commands.py`.
-"""
+"""Define the requests for jobs: ids and plain values, never a path."""
 
 from __future__ import annotations
 
@@ -19,13 +16,13 @@ FeasibleSet = Literal["pseudo_inertia", "inertia", "none"]
 
 
 class Ask(BaseModel):
-    """A request that refuses keys it does not know."""
+    """Request that refuses unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class RecordingOf(Ask):
-    """A recording, by the run that it is of; whole, or from `start` to `end` [s].
+    """Recording, named by its run; whole, or from `start` to `end` [s].
 
     `name` is that of the file in the run's manifest; left out, it is the run's only recording, or `run.mcap`.
     """
@@ -37,7 +34,7 @@ class RecordingOf(Ask):
 
 
 class Design(Ask):
-    """Search for a motion; what is left out is as the arm's description says."""
+    """Search for a motion; options left out are as the arm's description says."""
 
     kind: Literal["design"]
     arm: ArmName
@@ -51,7 +48,7 @@ class Design(Ask):
 
 
 class Check(Ask):
-    """Preflight for a motion, the description's own without one, or for a way home."""
+    """Do the preflight for a motion, the description's own without one, or for the motion home."""
 
     kind: Literal["check"]
     arm: ArmName
@@ -66,7 +63,7 @@ class Check(Ask):
 
 
 class Rehearse(Ask):
-    """The run, slowly, while the lease is renewed as fast as a held key repeats."""
+    """Run the motion slowly, while the lease is renewed as fast as a held key repeats."""
 
     kind: Literal["rehearse"]
     arm: ArmName
@@ -75,7 +72,7 @@ class Rehearse(Ask):
 
 
 class Until(Ask):
-    """What a run is to learn, whereupon it ends early: deviations of at most this share of their parameters."""
+    """Accuracy at which a run ends early: standard deviations of at most this share of their parameters."""
 
     share: Annotated[float, Field(gt=0, lt=1)]
     parameters: Annotated[tuple[Annotated[str, Field(min_length=1, max_length=200)], ...], Field(max_length=100)] = ()
@@ -92,35 +89,35 @@ class Run(Ask):
 
 
 class Home(Ask):
-    """Lead the arm home, slowly."""
+    """Move the arm to its home position, slowly."""
 
     kind: Literal["home"]
     arm: ArmName
 
 
 class Zero(Ask):
-    """Take the arm's drives for home where they stand, by a person's word; nothing moves, and it never waits."""
+    """Set the encoders' zero: a person confirms that the arm stands at home; nothing moves, and it never waits."""
 
     kind: Literal["zero"]
     arm: ArmName
 
 
 class LeaveLimit(Ask):
-    """Lead an arm that stands outside its position limits back inside, slowly."""
+    """Move an arm that stands outside its position limits back inside, slowly."""
 
     kind: Literal["leave_limit"]
     arm: ArmName
 
 
 class Recover(Ask):
-    """After a fault or a stop: what is in the way, and what to do; nothing moves."""
+    """Report after a fault or a stop what prevents motion, and what to do; nothing moves."""
 
     kind: Literal["recover"]
     arm: ArmName
 
 
 class Watch(Ask):
-    """Look at the arm without a torque or a change of state."""
+    """Read the arm's positions and drive status without torque and without changing its state."""
 
     kind: Literal["watch"]
     arm: ArmName
@@ -128,7 +125,7 @@ class Watch(Ask):
 
 
 class BusLoad(Ask):
-    """What every frame costs on the arm's buses, and whether all of them fit."""
+    """Compute the load of every frame on the arm's buses, and whether all of them fit."""
 
     kind: Literal["bus_load"]
     arm: ArmName
@@ -136,35 +133,35 @@ class BusLoad(Ask):
 
 
 class BusScan(Ask):
-    """Who is on the arm's buses; reads only."""
+    """List the nodes on the arm's buses; reads only."""
 
     kind: Literal["bus_scan"]
     arm: ArmName
 
 
 class BusProbe(Ask):
-    """What the arm's drives can, and what they lack; reads only."""
+    """Read the capabilities of the arm's drives, and what they lack; reads only."""
 
     kind: Literal["bus_probe"]
     arm: ArmName
 
 
 class ConfigCheck(Ask):
-    """The arm's description: bus budget, and whether its gains are stable."""
+    """Check the arm's description: bus budget, and whether its gains are stable."""
 
     kind: Literal["config_check"]
     arm: ArmName
 
 
 class Base(Ask):
-    """Base parameters and their expressions."""
+    """List the base parameters and their expressions."""
 
     kind: Literal["base"]
     arm: ArmName
 
 
 class Preview(Ask):
-    """What a motion asks of the arm, and what it will teach."""
+    """Predict the demands of a motion on the arm, and the accuracy that it will give."""
 
     kind: Literal["preview"]
     arm: ArmName
@@ -172,7 +169,7 @@ class Preview(Ask):
 
 
 class Identify(Ask):
-    """From recordings to parameters."""
+    """Identify parameters from recordings."""
 
     kind: Literal["identify"]
     arm: ArmName
@@ -182,11 +179,11 @@ class Identify(Ask):
     feasible_set: FeasibleSet | None = None
     prior: Literal["none", "euclidean", "entropic"] | None = None
     as_accepted: Annotated[int, Field(ge=1, lt=10_000)] | None = None
-    """By the description that this acceptance keeps, which the comparison with its set needs; not by today's."""
+    """Number of an acceptance whose stored description is used instead of today's, for comparison with its set."""
 
 
 class Simulate(Ask):
-    """The whole job on a simulated arm, scored against the known truth."""
+    """Commission a simulated arm, and score the result against the known truth."""
 
     kind: Literal["simulate"]
     arm: ArmName = "wam7_sim"
@@ -196,14 +193,14 @@ class Simulate(Ask):
 
 
 class Report(Ask):
-    """The report of a run as one page."""
+    """Write the report of a run as one page."""
 
     kind: Literal["report"]
     run: Id
 
 
 class Export(Ask):
-    """The parameters of a run for other tools."""
+    """Write the parameters of a run for other tools."""
 
     kind: Literal["export"]
     run: Id
@@ -219,7 +216,7 @@ class Verify(Ask):
 
 
 class Feasible(Ask):
-    """Whether a real body could have a run's parameters; `arm` adds the conditions of its description."""
+    """Check whether a real body could have a run's parameters; `arm` adds the conditions of its description."""
 
     kind: Literal["feasible"]
     run: Id
@@ -228,7 +225,7 @@ class Feasible(Ask):
 
 
 class Correct(Ask):
-    """The feasible parameters nearest to a run's, as a file of their own; the run stays as it is."""
+    """Find the feasible parameters nearest to a run's, as a file of their own; the run is unchanged."""
 
     kind: Literal["correct"]
     run: Id
@@ -238,7 +235,7 @@ class Correct(Ask):
 
 
 class Figures(Ask):
-    """The drawings of a run's report as files."""
+    """Write the drawings of a run's report as files."""
 
     kind: Literal["figures"]
     run: Id
@@ -246,7 +243,7 @@ class Figures(Ask):
 
 
 class Payload(Ask):
-    """What the arm of a run carries in recordings of other runs."""
+    """Identify the payload that the arm of a run carries in recordings of other runs."""
 
     kind: Literal["payload"]
     run: Id
@@ -255,7 +252,7 @@ class Payload(Ask):
 
 
 class Compare(Ask):
-    """Two runs: what changed, and by how many deviations."""
+    """Compare two runs: what changed, and by how many standard deviations."""
 
     kind: Literal["compare"]
     run: Id
@@ -263,7 +260,7 @@ class Compare(Ask):
 
 
 class Judge(Ask):
-    """A run's parameters against those of an acceptance of its arm; the comparison becomes part of the run."""
+    """Compare a run's parameters with those of an acceptance of its arm; the comparison is stored in the run."""
 
     kind: Literal["judge"]
     arm: ArmName
@@ -300,7 +297,7 @@ Asked = Annotated[
     | Judge,
     Field(discriminator="kind"),
 ]
-"""Any of them; `kind` says which."""
+"""Any request for a job; `kind` tells which."""
 
 MOVES = frozenset({"check", "rehearse", "run", "home", "leave_limit", "zero"})
-"""Kinds that may give an arm a torque, or decide where it believes to stand: they need a lease, and a person's word."""
+"""Kinds of jobs that may command torque or set the encoders' zero: they need a lease and a person's confirmation."""

@@ -1,7 +1,7 @@
-"""The process of a job: started, spoken to over its standard input, and found again after a crash of ours.
+"""Start a job's process, talk to it over its standard input, and find it again after a crash of the service.
 
-What it prints goes into files of the job's folder, not through us: our death takes nothing of it away. The end of its
-standard input tells a motion that whoever asked for it is gone (`cli/lease.py`).
+The output goes into files of the job's folder, not through the service, so that nothing of it is lost when the service
+dies. The end of its standard input tells a motion that whoever asked for it is gone (`cli/lease.py`).
 
 A motion may be given to a unit of its own instead (`configs/systemd/`): then the process is the service manager's
 child, behind a local socket, and not ours; whatever becomes of our unit, it has the time to stop its arm.
@@ -28,37 +28,37 @@ STOP: Final = b"stop\n"
 
 
 class Child(Protocol):
-    """One job's process."""
+    """Process of one job."""
 
     def say(self, line: bytes) -> None:
-        """One line on its standard input; never waits. One that it has no room for ends the input, which is a stop."""
+        """Write one line to the process's standard input without waiting; if it has no room, end the input: a stop."""
 
     def ended(self) -> bool:
-        """Whether it has ended."""
+        """Return whether the process has ended."""
 
     def signal(self, number: int) -> None:
-        """Send it a signal, where it can be had."""
+        """Send the process a signal, if it can be reached."""
 
     @property
     def exit_code(self) -> int | None:
-        """As its parent sees it; None where somebody else is its parent."""
+        """Return the exit code that the parent sees; None where the service is not the parent."""
 
     @property
     def process(self) -> str:
-        """What it is found again by (`alive`)."""
+        """Return the name by which `alive` finds the process again."""
 
     def close(self) -> None:
-        """End its input."""
+        """End the process's standard input."""
 
 
 class OwnChild:
-    """A process of ours."""
+    """Implement `Child` with a subprocess of the daemon."""
 
     def __init__(self, words: tuple[str, ...], folder: Path) -> None:
         """Start `ident WORDS` with its files in `folder`."""
         paths = os.pathsep.join(path or str(Path.cwd()) for path in sys.path)
         environment = {**os.environ, "PYTHONPATH": paths, "OPENBLAS_NUM_THREADS": "1"}
-        environment.pop("NOTIFY_SOCKET", None)  # it is not the one whom a service manager watches
+        environment.pop("NOTIFY_SOCKET", None)  # the service manager watches the service, not this process
         with (folder / ANSWER).open("xb") as answer, (folder / LOG).open("xb") as log:
             self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and command
                 [sys.executable, "-P", "-m", "ident_service", *words],
@@ -76,7 +76,7 @@ class OwnChild:
         self._name = name_of(self._process.pid)
 
     def say(self, line: bytes) -> None:
-        """As the protocol says."""
+        """Write one line to the subprocess's standard input without waiting; end the input if it cannot be written."""
         if self._input is None:
             return
         try:
@@ -85,36 +85,36 @@ class OwnChild:
             self.close()
 
     def ended(self) -> bool:
-        """As the protocol says."""
+        """Return whether the subprocess has ended."""
         return self._process.poll() is not None
 
     def signal(self, number: int) -> None:
-        """As the protocol says."""
+        """Send the subprocess a signal, if it still exists."""
         with suppress(ProcessLookupError):
             self._process.send_signal(number)
 
     @property
     def exit_code(self) -> int | None:
-        """As the protocol says."""
+        """Return the subprocess's exit code; None while it runs."""
         return self._process.poll()
 
     @property
     def process(self) -> str:
-        """As the protocol says."""
+        """Return the name by which `alive` finds the subprocess again."""
         return self._name
 
     def close(self) -> None:
-        """As the protocol says."""
+        """End the subprocess's standard input."""
         if self._input is not None:
             os.close(self._input)
             self._input = None
 
 
 class UnitChild:
-    """A process in a unit of its own, at the other end of a local socket (`door.py`)."""
+    """Implement `Child` with a process of the service manager, at the other end of a local socket (`door.py`)."""
 
     def __init__(self, words: tuple[str, ...], folder: Path, door: Path) -> None:
-        """Have `ident WORDS` started behind `door`.
+        """Have `ident WORDS` started by the unit that listens at `door`.
 
         Raises:
             UsageError: nobody listens there.
@@ -131,7 +131,7 @@ class UnitChild:
         self._ended = False
 
     def say(self, line: bytes) -> None:
-        """As the protocol says."""
+        """Send one line to the process without waiting; end its input if the line cannot be sent."""
         try:
             self._socket.send(line, socket.MSG_NOSIGNAL)
         except OSError:
@@ -139,7 +139,7 @@ class UnitChild:
                 self._socket.shutdown(socket.SHUT_WR)
 
     def ended(self) -> bool:
-        """As the protocol says."""
+        """Return whether the process has ended, which closes its end of the socket."""
         if not self._ended:
             try:
                 self._ended = self._socket.recv(64) == b""
@@ -150,25 +150,25 @@ class UnitChild:
         return self._ended
 
     def signal(self, number: int) -> None:
-        """As the protocol says."""
+        """Send the process a signal, if it lives and may be signalled."""
         if alive(self.process):
             with suppress(ProcessLookupError, PermissionError):
                 os.kill(int(self.process.split()[0]), number)
 
     @property
     def exit_code(self) -> int | None:
-        """As the protocol says."""
+        """Return None: the service manager is the parent and has the exit code."""
         return None
 
     @property
     def process(self) -> str:
-        """As the protocol says."""
+        """Return the name by which `alive` finds the process again; empty before it has written it."""
         with suppress(OSError):
             return (self._folder / PROCESS).read_text(encoding="ascii").strip()
         return ""
 
     def close(self) -> None:
-        """As the protocol says; once it has ended, the whole socket."""
+        """End the process's input; once it has ended, close the whole socket."""
         if self._ended:
             self._socket.close()
             return
@@ -177,7 +177,7 @@ class UnitChild:
 
 
 def name_of(pid: int) -> str:
-    """A process for as long as this machine runs: its number, when it began, and the machine's boot."""
+    """Return a name for a process that is unique on this machine: its number, start time and the boot id."""
     try:
         began = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()[19]
         boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
@@ -187,7 +187,7 @@ def name_of(pid: int) -> str:
 
 
 def alive(process: str) -> bool:
-    """Whether the process of this name lives, and is no zombie."""
+    """Return whether the process of this name exists and is no zombie."""
     if not process or name_of(pid := int(process.split()[0])) != process:
         return False
     try:
@@ -198,7 +198,7 @@ def alive(process: str) -> bool:
 
 
 def end_orphan(process: str, seconds: float) -> bool:
-    """Have a process of a service that died end, politely first; whether it has."""
+    """End a process of a service that died, by SIGTERM; return whether it has ended within `seconds` [s]."""
     if not alive(process):
         return True
     pid = int(process.split()[0])

@@ -1,4 +1,4 @@
-"""From a request by ids to the words of a command: the only place where an id becomes a path."""
+"""Translate a request by ids into the arguments of a command: the only place where an id becomes a path."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ FOLDERS: Final = {"design": MOTIONS, **dict.fromkeys(TAKEN_AWAY, EXPORTS)}
 
 @dataclass(frozen=True)
 class Command:
-    """What a job's process is to do.
+    """Command that a job's process runs.
 
     Attributes:
         words: after `ident`.
@@ -95,7 +95,7 @@ class Command:
 
 
 def command(db: Database, state: Path, asked: Asked) -> Command:
-    """The command of a request.
+    """Return the command that carries out a request.
 
     Raises:
         UsageError: it names what is not known.
@@ -218,7 +218,7 @@ def _about_a_run(
         formats = asked.format if isinstance(asked, Figures) else ",".join(asked.formats)
         words = [asked.kind, str(folder), "--format", formats, "--out", str(place / str(made))]
     if made is not None or isinstance(asked, Report):
-        # The one command that writes a file, not a folder; `keep` takes away what stays empty.
+        # `correct` writes a file, not a folder, so the folder is made here; `keep` removes it if it stays empty.
         (place / str(made) if isinstance(asked, Correct) else place).mkdir(parents=True, exist_ok=True)
     return Command((*words, *_always(state)), arm, False, made or asked.run, (), LEASE_SECONDS)
 
@@ -255,20 +255,20 @@ def _as_described(db: Database, state: Path, asked: Sequence[RecordingOf]) -> li
 
 
 def _columns(db: Database, state: Path, asked: Sequence[RecordingOf]) -> list[str]:
-    """Say of each uploaded recording that came with a columns file how it is laid out."""
+    """Return `--columns` options for the uploaded recordings that came with a columns file."""
     files = {_recording(db, state, one): run_folder(db, state, one.run) / COLUMNS for one in asked}
     return [f"--columns={recording}={columns}" for recording, columns in files.items() if columns.is_file()]
 
 
 def range_words(one: RecordingOf) -> str:
-    """Write a recording's range as the command line has it; nothing for a whole one."""
+    """Format a recording's range as the command line has it; empty for a whole recording."""
     if one.start is None and one.end is None:
         return ""
     return "@" + ":".join("" if seconds is None else f"{seconds:.9f}" for seconds in (one.start, one.end))
 
 
 def _given(options: Mapping[str, object]) -> list[str]:
-    """Options that have a value, each in one word, so that no value can pass for an option."""
+    """Return options that have a value, each in one word, so that no value can pass for an option."""
     return [f"--{name}={value}" for name, value in options.items() if value is not None]
 
 

@@ -1,4 +1,4 @@
-"""What a motion's own unit runs: takes one request from its socket and becomes the command that was asked for.
+"""Run in the unit for motions: take one request from the socket and become the requested command.
 
 The socket is standard input, and stays it: its end stops the arm. Only verbs that move an arm under a lease are taken,
 and those that look at it or its bus without a torque, because the bus is here. The service is believed no more than
@@ -21,9 +21,9 @@ _OPTIONS_OF_LOOKS = ("--json", "--state", "--seconds=")
 
 
 def main() -> int:
-    """Become the command; returns only where nothing was asked for, or nothing that is done here."""
+    """Become the requested command; return only if nothing, or nothing allowed here, was requested."""
     line = bytearray()
-    # Byte by byte: what comes after the line is the command's.
+    # Byte by byte: the input after the line belongs to the command.
     while not line.endswith(b"\n") and len(line) < _MOST:
         if not (part := os.read(0, 1)):
             return 1
@@ -48,17 +48,17 @@ def main() -> int:
 
 
 def taken(words: list[str]) -> bool:
-    """Whether these are words of a motion under a lease, or of a look, whose options are known to move nothing."""
+    """Return whether the arguments are a motion under a lease, or a look whose options are known to move nothing."""
     if words and words[0] in _VERBS and "--lease-from-stdin" in words:
         return True
-    # By a list of what is good: a parser takes the beginning of an option, `--leave`, for the whole of it.
+    # A list of allowed options: argparse accepts a prefix of an option, such as `--leave`, for the whole.
     options = [word for word in words if word.startswith("-")]
     good = all(word.startswith(_OPTIONS_OF_LOOKS[2]) or word in _OPTIONS_OF_LOOKS[:2] for word in options)
     return good and any(tuple(words[: len(look)]) == look for look in _LOOKS)
 
 
 def refuse(why: str) -> int:
-    """Say why on stderr, which is the journal's."""
+    """Print the reason on stderr, which goes to the journal, and return exit code 2."""
     os.write(2, f"ident: {why}\n".encode())
     return 2
 

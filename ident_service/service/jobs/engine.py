@@ -1,4 +1,4 @@
-"""Jobs in the order they came: one motion at a time per arm and per bus, a few that compute beside them.
+"""Run jobs in the order they came: one motion at a time per arm and per bus, a few computations beside them.
 
 One thread starts what may run and sees its end, one per ended job enters it, one keeps leases (`live_jobs.py`). All
 that lasts is in the registry and in the jobs' folders, so that this process may be killed at any moment: `recovery.py`
@@ -40,12 +40,12 @@ from ident_service.service.registry.motions import new_id
 from ident_service.service.registry.runs import RUNS
 
 _POLITE = 15.0  # s for a computation that was asked to end
-_AGAIN = 1.0  # s between tries to enter what the registry has no room for
+_AGAIN = 1.0  # s between attempts to write to a registry that is full or locked
 LOG = logging.getLogger("ident.jobs")
 
 
 class Engine:
-    """Queues jobs, runs them, and stops arms."""
+    """Queue of jobs that runs them, and stops arms."""
 
     def __init__(
         self,
@@ -58,7 +58,7 @@ class Engine:
         now: Callable[[], float] = time.monotonic,
         metrics: Metrics | None = None,
     ) -> None:
-        """Nothing runs before `start`.
+        """Create the engine; nothing runs before `start`.
 
         Args:
             db: the registry.
@@ -81,7 +81,7 @@ class Engine:
         self.beat = now()
 
     def start(self, first: Callable[[], Any] = lambda: None) -> None:
-        """Tell what was interrupted, then begin to run what is asked for; returns at once.
+        """Mark the jobs that were interrupted, then begin to run the queue; returns at once.
 
         Args:
             first: done by the queue's thread before it begins anything.
@@ -94,12 +94,12 @@ class Engine:
 
     @property
     def closing(self) -> bool:
-        """Whether it ends."""
+        """Return whether the engine is ending."""
         return self._closing.is_set()
 
     @property
     def healthy(self) -> bool:
-        """Whether the queue is being looked after, and the registry can be written."""
+        """Return whether the queue is being looked after, and the registry can be written."""
         alive = self._thread.is_alive() and self.live.healthy
         return alive and self._now() - self.beat < 30.0 and not self._unwritten
 
@@ -150,7 +150,7 @@ class Engine:
         return row
 
     def cancel(self, job: str, by: str, why: str = "") -> None:
-        """Have a job end: a motion by a controlled stop, a computation politely, one that waits at once.
+        """End a job: a motion by a controlled stop, a computation by SIGTERM, one that waits at once.
 
         Raises:
             UsageError: no such job, or it has ended.
@@ -160,7 +160,7 @@ class Engine:
         self.audit.note(by, "job cancelled", job)
 
     def stop(self, arm: str | None, by: str) -> dict[str, list[str]]:
-        """Bring an arm, or all, to a controlled stop, whoever moves it; what waits to move it is cancelled.
+        """Bring an arm, or all, to a controlled stop, whoever moves it; motions that wait are cancelled.
 
         Waits for nobody: the word to our own children is a line in a pipe, the control file is memory, and what the
         audit trail says of it is entered later.
@@ -173,32 +173,32 @@ class Engine:
         return {"arms": reached, "jobs": ended}
 
     def pause(self, arm: str, by: str, *, wanted: bool) -> bool:
-        """Let an arm stand, or go on; whether anybody moves it."""
+        """Pause an arm, or let it go on (`wanted` False); return whether a process moves it."""
         reached = pause_arm(self.state, arm, wanted=wanted)
         self.audit.note(by, "pause" if wanted else "resume", arm, reached=[arm] if reached else [])
         return reached
 
     def finish(self, arm: str, by: str) -> bool:
-        """Let a run end early, in order, out of a pause too; whether anybody moves the arm."""
+        """End a run early by its regular end, out of a pause too; return whether a process moves the arm."""
         reached = finish_arm(self.state, arm)
         self.audit.note(by, "finish", arm, reached=[arm] if reached else [])
         return reached
 
     def confirm_support(self, arm: str, by: str) -> bool:
-        """Take a person's word that an arm that is held after a stop is supported or home; whether one was held."""
+        """Pass on a person's confirmation that an arm held after a stop is supported; return whether one was held."""
         reached = confirm_support(self.state, arm)
         self.audit.note(by, "supported", arm, reached=[arm] if reached else [])
         return reached
 
     def progress(self, row: Row) -> Progress | None:
-        """How far a job that runs is; None for one that does not."""
+        """Return the progress of a running job; None for one that does not run."""
         if row["state"] != "running" or row["started"] is None:
             return None
         typical = rows.typical_seconds(self.db, row["kind"], row["arm"])
         return progress(said(self.state / JOBS / row["id"]).log, time.time() - row["started"], typical)
 
     def moving(self) -> list[str]:
-        """Names of the arms that anybody moves."""
+        """Return the names of the arms that any process moves."""
         return moving_arms(self.state)
 
     def begin_closing(self) -> None:
@@ -208,7 +208,7 @@ class Engine:
         self.live.changed.set()
 
     def close(self, seconds: float = 40.0) -> None:
-        """Bring the arms to rest, have the rest end, and wait for it, but not for ever."""
+        """Bring the arms to rest, end the other jobs, and wait for both up to a bound [s]."""
         self.begin_closing()
         if self._thread.ident is not None:
             self._thread.join(seconds)
@@ -243,7 +243,7 @@ class Engine:
         for live in found:
             if live.order.moves and not live.asked_to_end and self._stopped_at_terminal(live):
                 self.live.end(live.job, "somebody asked for a stop")
-            # First what runs: who waits may have to wait for the registry.
+            # Running jobs first: a waiting one may have to wait for the registry.
             if live.child is not None:
                 self._watch(live, live.child)
         for live in found:
@@ -251,13 +251,13 @@ class Engine:
                 self._wait(live)
 
     def _stopped_at_terminal(self, live: LiveJob) -> bool:
-        """Tell whether a stop, which need not have come through us, was asked for after this motion was."""
+        """Return whether a stop was asked for after this motion was, possibly not through this service."""
         stamp = stop_asked_ns(control_path(self.state, str(live.order.arm)))
-        # One that seems yet to come is from before the machine was started.
+        # A stamp in the future is from before the machine was started.
         return live.asked_ns < stamp <= time.monotonic_ns()
 
     def _wait(self, live: LiveJob) -> None:
-        """One that is queued: it ends, goes on waiting, or begins."""
+        """Handle a queued job: end it if asked to, begin it if it is its turn."""
         if live.asked_to_end:
             self._finish(live, "cancelled", live.asked_to_end, None)
         elif self.live.free(live, self._computing):
@@ -268,12 +268,12 @@ class Engine:
         if not rows.started(self.db, live.job, ""):
             self.live.remove(live)
             return
-        if live.asked_to_end:  # while the registry was written
+        if live.asked_to_end:  # cancelled while the registry was written
             self._finish(live, "cancelled", live.asked_to_end, None)
             return
         child: Child
         try:
-            # Where the motions' unit is, the bus is there, too.
+            # The unit for motions also has access to the buses.
             if live.order.resources and self._door is not None:
                 child = UnitChild(live.order.words, folder, self._door)
             else:
@@ -286,7 +286,7 @@ class Engine:
         LOG.info("job started", extra={"job": live.job, "arm": live.order.arm})
 
     def _watch(self, live: LiveJob, child: Child) -> None:
-        """Look at one that runs; a computation is asked to end politely, and then not."""
+        """Check a running job; end a computation by SIGTERM, then by SIGKILL, and conclude a job that has ended."""
         if live.asked_to_end and not live.order.moves:
             if not live.told:
                 live.told = True
@@ -295,29 +295,29 @@ class Engine:
                 live.killed = True
                 child.signal(signal.SIGKILL)
         if child.ended() and not live.concluding:
-            # Beside the queue: a long recording has a long hash.
+            # In a thread of its own: hashing a long recording takes long.
             live.concluding = True
             threading.Thread(target=self._conclude, args=(live, child), name=live.job, daemon=True).start()
 
     def _conclude(self, live: LiveJob, child: Child) -> None:
-        """One that has ended: enter what it made, then say so."""
+        """Enter what an ended job has made, then the job's end."""
         self.live.conclude(live, child)
         ended = outcome(said(self.state / JOBS / live.job), child.exit_code, live.asked_to_end)
         while True:
             try:
                 self._finish(live, ended.state, self._kept(live, ended.detail), ended.exit_code)
             except sqlite3.Error as error:
-                # A full disk, say; until there is room, nobody may take this service for a sound one.
+                # For example a full disk; until there is room, the service must not count as healthy.
                 LOG.error("the end of a job cannot be entered yet: %s", error, extra={"job": live.job})
                 self._unwritten.add(live.job)
                 if self._closing.wait(_AGAIN):
-                    return  # the next start finds out what became of it
+                    return  # the next start determines the job's outcome
             else:
                 self._unwritten.discard(live.job)
                 return
 
     def _kept(self, live: LiveJob, detail: str) -> str:
-        """Enter what a job made; `detail`, with what stood in the way."""
+        """Enter what a job made; return `detail`, with the error if that failed."""
         try:
             keep(self.db, self.state, rows.known_job(self.db, live.job), live.by)
         except sqlite3.Error:
@@ -346,7 +346,7 @@ class Engine:
             self.metrics.lateness(lateness_of(self.state / RUNS / row["run"]))
 
     def _requeue(self) -> None:
-        """What still waits to compute, in its old place."""
+        """Queue computations again that waited when the service ended, in their old order."""
         from pydantic import TypeAdapter
 
         reader: TypeAdapter[Asked] = TypeAdapter(Asked)
@@ -356,7 +356,7 @@ class Engine:
             except (IdentError, ValueError) as error:
                 rows.ended(self.db, row["id"], "failed", f"it cannot be begun any more: {error}")
                 continue
-            # Its words and its folder are those that were told when it was asked for.
+            # Its arguments and folder are those that were entered when it was requested.
             order = Command(tuple(row["words"]), order.arm, order.moves, row["run"], order.resources, order.lease)
             waiting = LiveJob(row["id"], order, row["created_by"], False, self._now())
             self.live.add(waiting)

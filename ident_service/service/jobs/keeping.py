@@ -1,4 +1,4 @@
-"""What a job has made is entered in the registry: its run, its motion."""
+"""Enter in the registry what a job has made: its run or its motion."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _ABOUT_A_RUN = frozenset({"report", "verify", "compare", "judge", "feasible"})
 
 
 def keep(db: Database, state: Path, row: Row, by: str) -> None:
-    """Enter the folder that a job's process has left, if it has.
+    """Enter the folder that a job's process has left, if any.
 
     Args:
         db: the registry.
@@ -32,19 +32,19 @@ def keep(db: Database, state: Path, row: Row, by: str) -> None:
     if made is None:
         return
     if row["kind"] in _MAKES_A_RUN and (folder := state / RUNS / made).is_dir():
-        # What was killed has no manifest. Nothing writes there any more, so what is there now is what there is.
+        # A killed process leaves no manifest. Nothing writes there any more, so the present files are final.
         if not (folder / MANIFEST).is_file():
             write_manifest(folder)
         index_run(db, state, made)
     elif row["kind"] == "design" and (state / MOTIONS / made / MOTION_FILE).is_file():
         index_motion(db, state, made, row["arm"], by)
     elif row["kind"] == "correct":
-        with suppress(OSError):  # there is a file in it, or it is gone
+        with suppress(OSError):  # not empty, or removed already
             (state / EXPORTS / made).rmdir()
 
 
 def folder_of(state: Path, row: Row) -> Path | None:
-    """The folder that a job makes, there or not; None for one that makes none."""
+    """Return the folder that a job makes, whether it exists or not; None for a job that makes none."""
     if row["run"] is None or row["kind"] in _ABOUT_A_RUN:
         return None
     return state / FOLDERS.get(row["kind"], RUNS) / str(row["run"])

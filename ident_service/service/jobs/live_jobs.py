@@ -1,8 +1,7 @@
-"""Jobs that wait or run, in memory: their leases, their stops, and whose turn it is.
+"""Hold the jobs that wait or run in memory: their leases, their stops, and their order.
 
 The lock guards memory, and lines into pipes that never wait. So a stop or a renewal waits neither for the registry, nor
 for a disk, nor for the queue.
-Boundary: no file and no registry here; processes are started, and their ends entered, by `engine.py`.
 """
 
 from __future__ import annotations
@@ -17,16 +16,16 @@ from ident_service.errors import MotionRefused
 from ident_service.service.jobs.child import RENEW, STOP, Child
 from ident_service.service.jobs.commands import Command
 
-TICK: Final = 0.05  # s between looks at leases, and of the queue at what runs and what waits
+TICK: Final = 0.05  # s between checks of leases, and of running and waiting jobs
 
 
 @dataclass
 class LiveJob:
-    """A job that waits or runs, and what only this process knows of it.
+    """Job that waits or runs, with the state that only this process knows.
 
     Attributes:
         job: its id.
-        order: what its process is to do.
+        order: the command of its process.
         by: who asked for it.
         own_lease: whether a motion's lease is the service's own.
         renewed: when that was renewed last [s].
@@ -35,7 +34,7 @@ class LiveJob:
         child: its process, once it runs.
         asked_to_end: why it is to end; empty while it is not.
         since: when that was asked [s].
-        told: whether a computation was asked politely.
+        told: whether a computation was sent SIGTERM.
         killed: whether it was ended by force.
         concluding: whether its end is being entered.
     """
@@ -56,7 +55,7 @@ class LiveJob:
 
 
 class LiveJobs:
-    """Keeps the jobs in the order they came; used from any thread."""
+    """Table of live jobs in the order they came; may be used from any thread."""
 
     def __init__(
         self, lease_factor: float, now: Callable[[], float], renewed: Callable[[float], None] = lambda _: None
@@ -78,24 +77,24 @@ class LiveJobs:
         self._thread = threading.Thread(target=self._keep_leases, name="leases", daemon=True)
 
     def start(self) -> None:
-        """Look after leases from now on."""
+        """Start the thread that watches leases."""
         self._thread.start()
 
     def close(self) -> None:
-        """Look after no lease any more."""
+        """Stop the thread that watches leases."""
         self._over.set()
 
     @property
     def healthy(self) -> bool:
-        """Tell whether leases are looked after."""
+        """Return whether the thread that watches leases is alive."""
         return self._thread.is_alive()
 
     def add(self, live: LiveJob, stops: int | None = None) -> None:
-        """Give a job its place; from now on a stop finds it.
+        """Add a job in its place; from now on a stop finds it.
 
         Args:
             live: the job.
-            stops: what `stops` answered when that was begun of which it is a later step.
+            stops: result of `stops` when the sequence began of which this job is a step; None for a single job.
 
         Raises:
             MotionRefused: nothing is begun any more; somebody has asked for a stop meanwhile; or it may not wait, and
@@ -113,31 +112,31 @@ class LiveJobs:
             self._jobs[live.job] = live
 
     def enter(self, live: LiveJob) -> None:
-        """Let a job that the registry knows begin when it is its turn; its lease begins."""
+        """Let a job that the registry knows begin when its turn comes; its lease begins."""
         with self._lock:
             live.renewed, live.entered = self._now(), True
         self.changed.set()
 
     def remove(self, live: LiveJob) -> None:
-        """Forget one that has ended, or was not taken."""
+        """Remove a job that has ended, or was not accepted."""
         with self._lock:
             self._jobs.pop(live.job, None)
 
     def entered(self) -> list[LiveJob]:
-        """List those that the registry knows."""
+        """Return the jobs that the registry knows."""
         with self._lock:
             return [live for live in self._jobs.values() if live.entered]
 
     def __bool__(self) -> bool:
-        """Tell whether there are any."""
+        """Return whether there are any jobs."""
         return bool(self._jobs)
 
     def __contains__(self, live: LiveJob) -> bool:
-        """Tell whether a job has not ended yet."""
+        """Return whether a job has not ended yet."""
         return live.job in self._jobs
 
     def free(self, live: LiveJob, computing: int) -> bool:
-        """Tell whether nothing stands before a job: who came later does not overtake on the same arm or bus.
+        """Return whether a job may begin: a later job does not overtake an earlier one on the same arm or bus.
 
         Args:
             live: the job.
@@ -156,21 +155,21 @@ class LiveJobs:
             return True
 
     def began(self, live: LiveJob, child: Child) -> None:
-        """Know the process of a job; it hears of what was asked while it was started."""
+        """Store the process of a job; pass on a stop that was asked for while it was being started."""
         with self._lock:
             live.child = child
             if live.asked_to_end:
                 _say_stop(live)
 
     def conclude(self, live: LiveJob, child: Child) -> None:
-        """Speak no more to a process that has ended."""
+        """Close the input of a process that has ended."""
         with self._lock:
             child.close()
 
     # --- leases and stops
 
     def lease_holder(self, job: str) -> str | None:
-        """Name who asked for a motion that waits or moves, and so renews its lease; None where there is no lease."""
+        """Return who requested a motion that waits or moves, and so renews its lease; None without a lease."""
         live = self._jobs.get(job)
         return None if live is None or not live.order.moves else live.by
 
@@ -205,11 +204,11 @@ class LiveJobs:
         return [live.job for live in found]
 
     def stops(self, arm: str | None) -> int:
-        """Count the stops of this arm, or of all, that have been asked for here."""
+        """Return the number of stops asked for so far that concern an arm: those of all arms plus its own."""
         return self._stops[None] + (self._stops[arm] if arm is not None else 0)
 
     def end(self, job: str, why: str) -> bool:
-        """Ask one job to end, a motion by a controlled stop; tell whether it is there."""
+        """Ask one job to end, a motion by a controlled stop; return whether the job is live."""
         with self._lock:
             live = self._jobs.get(job)
             if live is not None:
@@ -217,7 +216,7 @@ class LiveJobs:
         return live is not None
 
     def end_all(self, why: str) -> None:
-        """Ask all to end, and take no more."""
+        """Ask all jobs to end, and accept no more."""
         with self._lock:
             self._closing = True
             for live in self._jobs.values():
@@ -231,7 +230,7 @@ class LiveJobs:
         self.changed.set()
 
     def _keep_leases(self) -> None:
-        """Renew those of our own; ask for a stop where nobody has renewed another one."""
+        """Renew the leases that are the service's own; stop motions whose lease nobody has renewed in time."""
         while not self._over.wait(TICK):
             with self._lock:
                 for live in self._jobs.values():
@@ -250,6 +249,6 @@ class LiveJobs:
 
 
 def _say_stop(live: LiveJob) -> None:
-    """Tell a motion's process, where there is one; a computation is ended by the queue."""
+    """Send the stop to a motion's process, if it runs; a computation is ended by the queue."""
     if live.child is not None and live.order.moves:
         live.child.say(STOP)

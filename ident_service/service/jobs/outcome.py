@@ -1,7 +1,4 @@
-"""What became of a job, told from the files that its process left; after a crash of the service, too.
-
-Boundary: files in, a state and words out.
-"""
+"""Determine the outcome of a job from the files that its process left, also after a crash of the service."""
 
 from __future__ import annotations
 
@@ -24,7 +21,7 @@ _REFUSING: Final = ("failed", "needs_person")  # verdicts of a preflight's check
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a job.
+    """Outcome of a job.
 
     Attributes:
         state: one of those in `registry/jobs.py`.
@@ -39,11 +36,11 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Said:
-    """The files of a job's process.
+    """Output of a job's process, from its files.
 
     Attributes:
         answer: its one JSON object; empty where it had none.
-        log: the end of what it said.
+        log: the end of its output.
     """
 
     answer: dict[str, Any] = field(default_factory=dict)
@@ -51,14 +48,14 @@ class Said:
 
 
 def said(folder: Path, most: int = _LAST) -> Said:
-    """Read them; `most` bytes of the log."""
+    """Read the answer and the last `most` bytes of the log of a job's process."""
     answer: dict[str, Any] = {}
     try:
         with (folder / ANSWER).open("rb") as stream:
             content = json.loads(stream.read(_MOST))
         answer = content if isinstance(content, dict) else {}
     except (OSError, ValueError, RecursionError):
-        pass  # none yet, or torn with its process
+        pass  # there is none yet, or it was cut off when its process was killed
     try:
         with (folder / LOG).open("rb") as stream:
             end = stream.seek(0, 2)
@@ -70,10 +67,10 @@ def said(folder: Path, most: int = _LAST) -> Said:
 
 
 def outcome(heard: Said, exit_code: int | None, asked_to_end: str) -> Outcome:
-    """Judge a process that has ended.
+    """Return the outcome of a process that has ended.
 
     Args:
-        heard: what it said.
+        heard: its output.
         exit_code: as its parent saw it, None where it had another one.
         asked_to_end: why it was asked to, empty if it was not.
     """
@@ -93,10 +90,10 @@ def outcome(heard: Said, exit_code: int | None, asked_to_end: str) -> Outcome:
 
 
 def interrupted(heard: Said, folder: Path | None, *, moves: bool) -> str:
-    """What can be told of a job that was running when the service died.
+    """Describe a job that was running when the service died, from its output and its folder.
 
     Args:
-        heard: what its process said, until now.
+        heard: output of its process so far.
         folder: that it made, if any.
         moves: whether it is about a motion.
     """
@@ -123,7 +120,7 @@ def interrupted(heard: Said, folder: Path | None, *, moves: bool) -> str:
 
 
 def lateness_of(folder: Path) -> Any:
-    """Read how late the cycles of a run were, as `motion/histogram.py` writes it; None where it is not known."""
+    """Return the lateness histogram of a run's cycles (`motion/histogram.py`); None where it is not known."""
     try:
         return json.loads((folder / ENDED).read_text(encoding="utf-8"))["lateness"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):

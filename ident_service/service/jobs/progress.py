@@ -1,7 +1,4 @@
-"""How far a job is, from what it said so far and how long such jobs took before.
-
-Boundary: text and numbers in, an estimate out.
-"""
+"""Estimate the progress of a job from its output and the duration of earlier jobs of its kind."""
 
 from __future__ import annotations
 
@@ -10,17 +7,17 @@ from dataclasses import dataclass
 
 _MOTION = re.compile(r"motion of (?P<seconds>[0-9.e+-]+) s")
 _SEARCH = re.compile(r"about (?P<seconds>[0-9]+) s left")
-_SURE = 0.99  # a job that still runs is never told to be done
+_SURE = 0.99  # a job that still runs is never shown as completed
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a job is.
+    """Progress of a job.
 
     Attributes:
         phase: its last words.
-        fraction: from 0 to 1; None where nobody can know.
-        remaining: seconds, None where nobody can know.
+        fraction: from 0 to 1; None where it cannot be known.
+        remaining: time to the end [s]; None where it cannot be known.
     """
 
     phase: str
@@ -29,10 +26,10 @@ class Progress:
 
 
 def progress(log: str, elapsed: float, typical: float | None) -> Progress:
-    """Judge a job that runs.
+    """Estimate the progress of a running job.
 
     Args:
-        log: what it said, its last lines at least.
+        log: output of the job, its last lines at least.
         elapsed: since it began [s].
         typical: what such jobs took [s]; None before there was one.
     """
@@ -44,7 +41,7 @@ def progress(log: str, elapsed: float, typical: float | None) -> Progress:
     motion = _MOTION.search(log)
     if typical is None and motion is None:
         return Progress(phase, None, None)
-    # A first run knows how long its motion is, and not its ways there and back.
+    # For a first run only the duration of its motion is known, not that of its approach and return.
     return _of(phase, elapsed, typical if typical is not None else float(motion["seconds"]) if motion else 0.0)
 
 

@@ -1,7 +1,4 @@
-"""Whoever moves an arm of a state folder, reached over its control file: a job of ours, a terminal, anybody.
-
-Boundary: control files; who asked, and what becomes of jobs, is `engine.py`.
-"""
+"""Reach the process that moves an arm of a state folder over its control file, whoever started it."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ from ident_service.service.arm_state import control_path
 
 
 def stop_arms(state: Path, arm: str | None) -> list[str]:
-    """Bring an arm, or all, to a controlled stop, and let no motion begin that was asked for; names of those reached.
+    """Bring an arm, or all, to a controlled stop and block motions asked for before; return the arms reached.
 
     Args:
         state: the state folder.
@@ -25,12 +22,12 @@ def stop_arms(state: Path, arm: str | None) -> list[str]:
 
 
 def pause_arm(state: Path, arm: str, *, wanted: bool) -> bool:
-    """Let an arm stand, or go on; whether anybody moves it."""
+    """Pause an arm, or let it go on (`wanted` False); return whether a process moves it."""
     return bool(_reach(state, arm, _asking(lambda controls: controls.ask_pause(wanted))))
 
 
 def finish_arm(state: Path, arm: str) -> bool:
-    """Let a run end early, in order, out of a pause too; whether anybody moves the arm."""
+    """End a run early by its regular end, out of a pause too; return whether a process moves the arm."""
 
     def ask(controls: ControlFile) -> None:
         controls.ask_finish()
@@ -40,7 +37,7 @@ def finish_arm(state: Path, arm: str) -> bool:
 
 
 def confirm_support(state: Path, arm: str) -> bool:
-    """Let an arm that is held after a stop go, since a person sees it supported; whether one was held."""
+    """Release an arm held after a stop, since a person sees it supported; return whether one was held."""
     return bool(_reach(state, arm, _asking(ControlFile.confirm_support)))
 
 
@@ -54,7 +51,7 @@ def held_arm(state: Path, arm: str) -> bool:
 
 
 def moving_arms(state: Path) -> list[str]:
-    """Names of the arms that anybody moves."""
+    """Return the names of the arms that any process moves."""
     return _reach(state, None, mover)
 
 
@@ -72,7 +69,7 @@ def _reach(state: Path, arm: str | None, act: Callable[[Path], int | None]) -> l
     there = [path.name for path in place.iterdir()] if place.is_dir() else []
     reached = []
     for name in there if arm is None else [arm] if arm in there else []:
-        with suppress(UsageError):  # nobody moves it
+        with suppress(UsageError):  # no process moves it
             if act(control_path(state, name)) is not None:
                 reached.append(name)
     return sorted(reached)

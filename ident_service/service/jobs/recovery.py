@@ -1,6 +1,6 @@
-"""After the service died: what ran is called interrupted, with what its files show, and never done.
+"""Mark jobs as interrupted after the service died, with what their files show.
 
-A motion is not begun by a restart: a person asked for it at another moment. What waits to compute goes on waiting.
+A restart begins no motion: a person asked for it at another moment. Queued computations stay queued.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from ident_service.service.registry.audit import note
 from ident_service.service.registry.database import Database, Row
 
 UNTOLD = "the service died while it ran; its process is being looked for"
-_WAIT = 40.0  # s for a process of the service before: a controlled stop and its recording take less
+_WAIT = 40.0  # s for a process of the previous service: a controlled stop and its recording take less
 
 
 def mark_interrupted(db: Database, state: Path) -> None:
-    """Mark what ran, and motions that waited; quick, before anything is answered."""
+    """Mark running jobs and waiting motions as interrupted; quick, before any request is answered."""
     with db.transaction():
         for row in rows.jobs(db, states=rows.LIVE, most=1_000_000):
             if row["state"] == "running":
@@ -39,12 +39,12 @@ def mark_interrupted(db: Database, state: Path) -> None:
 
 
 def explain_interrupted(db: Database, state: Path, cut_short: Callable[[], bool] = lambda: False) -> None:
-    """See that processes of the service before have ended, and tell what their files show."""
+    """Wait until processes of the previous service have ended, and enter what their files show."""
     for row in rows.jobs(db, states=("interrupted",), most=1_000_000):
         if row["detail"] != UNTOLD or cut_short():
             continue
         process = _process(state, row)
-        # A motion has heard the end of its input and stops its arm; a computation is nobody's any more.
+        # A motion has seen the end of its input and stops its arm; a computation is of no use to anybody.
         if not end_orphan(process, _WAIT):
             rows.explain(db, row["id"], f"the service died while it ran; its process lives on ({process.split()[0]})")
             continue
@@ -60,13 +60,13 @@ def explain_interrupted(db: Database, state: Path, cut_short: Callable[[], bool]
 
 
 def orphans(db: Database, state: Path) -> list[str]:
-    """Ids of interrupted jobs whose process lives still."""
+    """Return the ids of interrupted jobs whose process is still alive."""
     found = rows.jobs(db, states=("interrupted",), most=1000)
     return [row["id"] for row in found if alive(_process(state, row))]
 
 
 def _wait_for_rest(controls: Path) -> None:
-    """The motion process may outlive its parent for as long as its stop takes."""
+    """Wait for the motion process, which may outlive its parent for as long as its stop takes."""
     until = time.monotonic() + _WAIT
     while in_use(controls) and time.monotonic() < until:
         time.sleep(0.05)

@@ -1,1 +1,1 @@
-"""Re-identification: when it is due, the steps that do it, its verdict, and the alarm that it may raise."""
+"""Re-identify arms: schedules and due entries, the steps, the verdict, and the drift alarm that it may raise."""

@@ -1,4 +1,4 @@
-"""Drift alarms: raised by a re-identification that found a change, there until a person acknowledges or accepts."""
+"""Keep drift alarms: a re-identification that found a change raises one, a person acknowledges it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ LONGEST_NOTE: Final = 2000
 
 
 def raise_alarm(db: Database, arm: str, reidentification: str, run: str, what: str, now: float) -> None:
-    """Enter one.
+    """Enter a drift alarm.
 
     Args:
         db: the registry.
@@ -33,7 +33,7 @@ def raise_alarm(db: Database, arm: str, reidentification: str, run: str, what: s
 def alarms(
     db: Database, arm: str | None = None, *, closed: bool = False, before: int | None = None, most: int = 100
 ) -> list[Row]:
-    """Alarms that stand, or `closed` ones too, the newest first, from the one before the number `before`."""
+    """Return open alarms, or `closed` ones too, the newest first, from the one before the number `before`."""
     return db.rows(
         "SELECT * FROM alarms WHERE (?1 IS NULL OR arm = ?1) AND (?2 OR closed IS NULL) AND id < ?3 "
         "ORDER BY id DESC LIMIT ?4",
@@ -42,7 +42,7 @@ def alarms(
 
 
 def acknowledge_alarm(db: Database, number: int, remark: str, by: str, now: float) -> Row:
-    """A person's word that they know.
+    """Close an alarm that a person has acknowledged.
 
     Raises:
         UsageError: no note.
@@ -61,5 +61,5 @@ def acknowledge_alarm(db: Database, number: int, remark: str, by: str, now: floa
 
 
 def end_alarms(db: Database, arm: str, how: str, by: str, now: float) -> None:
-    """A person has accepted another set; what differed from the one before is no alarm any more."""
+    """Close the alarms of an arm whose accepted set has been replaced."""
     db.write("UPDATE alarms SET closed = ?, closed_by = ?, how = ? WHERE arm = ? AND closed IS NULL", now, by, how, arm)

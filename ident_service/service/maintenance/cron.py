@@ -20,7 +20,7 @@ _LONGEST: Final = 200  # characters
 
 @dataclass(frozen=True)
 class Cron:
-    """Instants by cron.
+    """Times given by cron's five fields.
 
     Attributes:
         text: the five fields as they were given, with single spaces.
@@ -41,7 +41,7 @@ class Cron:
 
 
 def parse_cron(text: str) -> Cron:
-    """Read five fields: minute, hour, day of month, month, day of week.
+    """Parse cron's five fields: minute, hour, day of month, month, day of week.
 
     Raises:
         UsageError: they are not; the message names the field.
@@ -53,6 +53,6 @@ def parse_cron(text: str) -> Cron:
     try:
         cron.after(0.0)
     except CronSimError as error:
-        # cronsim says which field: "Bad day-of-month", which a day that its months never have is, too.
+        # cronsim names the field: "Bad day-of-month", also for a day that its months never have.
         raise UsageError(f"{cron.text!r}: {str(error).lower()} in cron's five fields") from None
     return cron

@@ -1,8 +1,9 @@
-"""Looks what is due, begins what may begin by itself, leads re-identifications on, and tells whoever is to know.
+"""Find due re-identifications, begin those that may begin unattended, advance their steps, send notices.
 
-An arm begins by itself only where its description says `unattended_motion: allowed`, and then only at the time: what is
-late, what was due before this process began, and an arm that has a latched fault, is moved or is waited for, all ask
-for a person. That is decided once, so that neither an acknowledged fault nor a new description sets an arm in motion.
+A re-identification begins unattended only where the description says `unattended_motion: allowed`, and then only on
+time. One that is late, or was due before this process began, and one of an arm that has a latched fault, is moved or is
+waited for, needs a person. That is decided once, so that neither an acknowledged fault nor a new description sets an
+arm in motion later.
 """
 
 from __future__ import annotations
@@ -27,15 +28,15 @@ from ident_service.service.registry.audit import note
 from ident_service.service.registry.database import Row
 from ident_service.service.registry.jobs import LIVE, jobs
 
-_TICK = 0.5  # s between looks
+_TICK = 0.5  # s between passes
 LOG = logging.getLogger("ident.maintenance")
 
 
 class Keeper:
-    """One for a service."""
+    """Scheduler of a service's re-identifications."""
 
     def __init__(self, engine: Engine, webhook: Webhook | None = None, now: Callable[[], float] = time.time) -> None:
-        """Nothing is looked at before `start`.
+        """Create the scheduler; nothing is checked before `start`.
 
         Args:
             engine: does the jobs.
@@ -50,16 +51,16 @@ class Keeper:
         self._thread = threading.Thread(target=self._work, name="maintenance", daemon=True)
 
     def start(self) -> None:
-        """Begin to look, after the engine has told what was interrupted; returns at once."""
+        """Start the scheduler's thread, after the engine has marked what was interrupted; returns at once."""
         self._thread.start()
 
     @property
     def healthy(self) -> bool:
-        """Whether anybody looks."""
+        """Return whether the scheduler's thread is alive."""
         return self._thread.is_alive()
 
     def close(self) -> None:
-        """Look no more."""
+        """Stop the scheduler's thread and the webhook."""
         self._ending.set()
         if self._thread.ident is not None:
             self._thread.join(30.0)
@@ -67,7 +68,7 @@ class Keeper:
             self._webhook.close()
 
     def look(self) -> None:
-        """One look; the thread's work."""
+        """Do one pass: mark what is due, advance re-identifications, begin what may begin, send notices."""
         now = self._now()
         fall_due(self._db, now)
         self.reidentifications.advance()
@@ -83,12 +84,12 @@ class Keeper:
                 self.look()
             except sqlite3.Error as error:  # a full disk, say
                 LOG.error("what is due waits for the registry: %s", error)
-            except Exception:  # the next look may go better
+            except Exception:  # the next pass may succeed
                 LOG.exception("what is due could not be looked at")
             self._ending.wait(_TICK)
 
     def _decide(self, row: Row, now: float) -> None:
-        """Whether what is due begins by itself; once. What is written comes before what moves."""
+        """Decide once whether a due re-identification begins unattended; it is marked before anything moves."""
         self._db.write("UPDATE dues SET tried = 1 WHERE id = ?", row["id"])
         try:
             why = self._against(row, now)
@@ -101,7 +102,7 @@ class Keeper:
             note(self._db, SERVICE, "due asks for a person", row["arm"], due=row["id"], why=why)
 
     def _against(self, row: Row, now: float) -> str:
-        """What stands against beginning it without a person; empty if nothing does."""
+        """Return why a due re-identification must not begin without a person; empty if nothing prevents it."""
         arm = row["arm"]
         found = [one for one in schedules(self._db, arm) if one["id"] == row["schedule"]]
         if known_arm(self._db, self._state, arm).config.unattended_motion != "allowed":
@@ -120,7 +121,7 @@ class Keeper:
         return ""
 
     def _tell(self) -> None:
-        """Tell of each once; a notice is kept in the same transaction that says so."""
+        """Send each notice once; it is stored in the transaction that marks it as sent."""
         for table, rows in (("dues", dues(self._db)), ("alarms", alarms(self._db))):
             for row in rows:
                 if row["told"]:

@@ -1,12 +1,11 @@
-"""A re-identification: preflight, run, identification, and the comparison with the accepted set, each a job.
+"""Re-identify an arm in four jobs: preflight, run, identification, comparison with the accepted set.
 
-Its row in the registry says which step it is at; the job of that step says how far. Whatever ends a step badly ends it.
-A person's word, or that of the schedule, is good for both motions, and for no longer than this process lives and nobody
-asks for a stop: after a restart only what computes goes on.
+Its row in the registry names the present step and that step's job. A step that ends badly ends the re-identification.
+The confirmation by a person, or the schedule, covers both motions, but only while this process lives and nobody asks
+for a stop: after a restart only computations go on.
 
 The identification uses the description that the acceptance kept, so that both sets have the same parameters and the
-same shape of friction.
-Boundary: rows and jobs; what is due, and when, is `schedules.py` and `keeper.py`.
+same friction model.
 """
 
 from __future__ import annotations
@@ -40,15 +39,15 @@ from ident_service.service.registry.motions import new_id
 
 SERVICE: Final = "service"
 LOG = logging.getLogger("ident.maintenance")
-_SAME = ("kinematics", "gravity", "terms", "transmission")  # without which parameters are others
+_SAME = ("kinematics", "gravity", "terms", "transmission")  # sections whose change gives the parameters another meaning
 
 
 def require_comparable(state: Path, config: ArmConfig, number: int | None = None) -> int:
-    """The number of the acceptance that an arm is to be compared with; the current one's if `number` is None.
+    """Check that an arm can be compared with an acceptance, the current one if `number` is None; return its number.
 
     Raises:
         UsageError: nothing was accepted; or the mechanism in the description is another one since.
-        ParameterError: what was accepted was changed on the disk.
+        ParameterError: the accepted set was changed on the disk.
     """
     act, folder = accepted_set(state, config.name, number)
     before = arm_from_json(folder / ARM)
@@ -62,7 +61,7 @@ def require_comparable(state: Path, config: ArmConfig, number: int | None = None
 
 
 def known_reidentification(db: Database, name: str) -> Row:
-    """The re-identification of this id.
+    """Return the re-identification of this id.
 
     Raises:
         UnknownId: there is none.
@@ -74,7 +73,7 @@ def known_reidentification(db: Database, name: str) -> Row:
 
 
 def reidentifications(db: Database, arm: str | None = None, *, before: str | None = None, most: int = 100) -> list[Row]:
-    """Re-identifications, or those of an arm, the newest first, from the one after the id `before`.
+    """Return re-identifications, or those of an arm, the newest first, from the one after the id `before`.
 
     Raises:
         UnknownId: there is none of that id.
@@ -88,7 +87,7 @@ def reidentifications(db: Database, arm: str | None = None, *, before: str | Non
 
 
 def conclude(db: Database, row: Row, verdict: Verdict, now: float) -> None:
-    """Enter a verdict: nothing is due any more, or a drift alarm is raised.
+    """Enter a verdict: close what was due, and raise a drift alarm if the arm has changed.
 
     Args:
         db: the registry.
@@ -108,7 +107,7 @@ def conclude(db: Database, row: Row, verdict: Verdict, now: float) -> None:
 def enter_concluded(
     db: Database, arm: str, against: int, recorded: str, run: str, verdict: Verdict, begun: float, by: str, now: float
 ) -> str:
-    """Enter one whose steps were done at a terminal; its id.
+    """Enter a re-identification whose steps were done at a terminal; return its id.
 
     Args:
         db: the registry.
@@ -128,7 +127,7 @@ def enter_concluded(
             "VALUES (?, ?, 'judge', 'interrupted', ?, 0, ?, ?, ?, ?)",
             *(name, arm, against, recorded, run, begun, by),
         )
-        # For this moment only; nobody sees it outside of the transaction.
+        # `conclude` ends running ones only; nobody sees this state outside of the transaction.
         db.write("UPDATE reidentifications SET state = 'running' WHERE id = ?", name)
         conclude(db, known_reidentification(db, name), verdict, now)
     return name
@@ -136,7 +135,7 @@ def enter_concluded(
 
 @dataclass(frozen=True)
 class Wanted:
-    """What is asked for.
+    """Request for a re-identification.
 
     Attributes:
         arm: name.
@@ -150,10 +149,10 @@ class Wanted:
 
 
 class Reidentifications:
-    """Those that run in this process."""
+    """Re-identifications that run in this process."""
 
     def __init__(self, engine: Engine, now: Callable[[], float] = time.time) -> None:
-        """Nothing is begun.
+        """Create the table without re-identifications.
 
         Args:
             engine: does the jobs.
@@ -165,14 +164,14 @@ class Reidentifications:
         self._lock = threading.Lock()
 
     def step(self, name: str) -> tuple[str, str] | None:
-        """Tell from memory who began one that runs, and the job that it is at; None for one that this does not know."""
+        """Return who began a running re-identification, and its present job; None for one unknown to this process."""
         return self._steps.get(name)
 
     def begin(self, wanted: Wanted, by: str) -> Row:
-        """Queue the first step.
+        """Begin a re-identification by queuing its first step.
 
         Args:
-            wanted: what.
+            wanted: the request.
             by: the name of a token, or `service`; it keeps the lease of the motions, unless unattended.
 
         Raises:
@@ -184,7 +183,7 @@ class Reidentifications:
         if wanted.unattended:
             _require_allowed(config)
         against = require_comparable(self._state, config)
-        accepted_description(self._state, config.name, against)  # told here, before anything moves
+        accepted_description(self._state, config.name, against)  # checked here, before anything moves
         name, stops = new_id(wanted.arm), self._engine.live.stops(wanted.arm)
 
         def enter(job: Row) -> None:
@@ -206,7 +205,7 @@ class Reidentifications:
         return known_reidentification(self._db, name)
 
     def advance(self) -> None:
-        """Begin the next step of every one whose step has ended, or end it."""
+        """Begin the next step of each re-identification whose step has ended, or end it."""
         with self._lock:
             for row in self._db.rows("SELECT * FROM reidentifications WHERE state = 'running' ORDER BY begun"):
                 try:

@@ -1,9 +1,8 @@
-"""Schedules of an arm: by cron, by operating hours, or by maintenance; and what falls due by them.
+"""Keep the schedules of an arm (cron, operating hours, maintenance) and what is due by them.
 
-A time that was missed, because nothing ran or the clock was wrong, is due once. What is due stays so until a
-re-identification of the arm came to a verdict, or a person says that it is not to be done; meanwhile its schedule adds
-nothing. Operating hours are those that runs of this registry drove the arm; what drives it otherwise is not seen here.
-Boundary: rows and an injected time; nothing is begun here.
+A time that was missed, because nothing ran or the clock was wrong, is due once. It stays due until a re-identification
+of the arm came to a verdict, or a person dismisses it; meanwhile its schedule adds nothing. Operating hours count only
+the time in which runs of this registry drove the arm.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ MAINTENANCE: Final = "maintenance"
 LONGEST_WHAT: Final = 200
 LONGEST_NOTE: Final = 2000
 MOST_SCHEDULES: Final = 100  # of an arm
-LATE: Final = 600.0  # s after which what is due does not begin without a person any more
+LATE: Final = 600.0  # s after which a due re-identification does not begin without a person any more
 _HOUR = 3600.0
 _DAY = 86400.0
 _HOURS = "hours:"
@@ -31,7 +30,7 @@ _HOURS = "hours:"
 
 @dataclass(frozen=True)
 class When:
-    """When a re-identification is due; exactly one of these.
+    """Rule for when a re-identification is due; exactly one of these.
 
     Attributes:
         cron: five fields in UTC (`cron.py`); None otherwise.
@@ -45,7 +44,7 @@ class When:
 
 
 def add_schedule(db: Database, arm: str, when: When, by: str, now: float, motion: str | None = None) -> Row:
-    """Add one; it counts from now.
+    """Add a schedule that counts from now.
 
     Args:
         db: the registry.
@@ -56,7 +55,7 @@ def add_schedule(db: Database, arm: str, when: When, by: str, now: float, motion
         motion: id; the description's own if None.
 
     Raises:
-        UsageError: not exactly one time or trigger, one that cannot be meant, too many, or a motion for another arm.
+        UsageError: not exactly one time or trigger, an invalid one, too many schedules, or a motion for another arm.
     """
     if sum((when.cron is not None, when.hours is not None, when.maintenance)) != 1:
         raise UsageError("give one of: cron, operating hours, maintenance")
@@ -84,13 +83,13 @@ def add_schedule(db: Database, arm: str, when: When, by: str, now: float, motion
 
 
 def schedules(db: Database, arm: str | None = None) -> list[Row]:
-    """All of them, or those of an arm, the earliest first; `motion` is an id or None."""
+    """Return all schedules, or those of an arm, the earliest first; `motion` is an id or None."""
     rows = db.rows("SELECT * FROM schedules WHERE ?1 IS NULL OR arm = ?1 ORDER BY id", arm)
     return [{**row, "motion": json.loads(row["request"]).get("motion")} for row in rows]
 
 
 def known_schedule(db: Database, number: int) -> Row:
-    """The one of this number.
+    """Return the schedule of this number.
 
     Raises:
         UnknownId: there is none.
@@ -102,7 +101,7 @@ def known_schedule(db: Database, number: int) -> Row:
 
 
 def enable_schedule(db: Database, number: int, by: str, now: float, *, enabled: bool) -> Row:
-    """Let one count again from now, or no more. What is due by it already stays due.
+    """Enable a schedule from now on, or disable it; what is already due by it stays due.
 
     Raises:
         UnknownId: there is none.
@@ -120,7 +119,7 @@ def enable_schedule(db: Database, number: int, by: str, now: float, *, enabled: 
 
 
 def remove_schedule(db: Database, number: int, by: str) -> None:
-    """Take one away. What is due by it already stays due.
+    """Remove a schedule; what is already due by it stays due.
 
     Raises:
         UnknownId: there is none.
@@ -132,7 +131,7 @@ def remove_schedule(db: Database, number: int, by: str) -> None:
 
 
 def add_event(db: Database, arm: str, what: str, remark: str, by: str, now: float) -> Row:
-    """Maintenance was done; what is scheduled after it falls due.
+    """Enter maintenance that was done; schedules that follow maintenance become due.
 
     Args:
         db: the registry.
@@ -161,7 +160,7 @@ def add_event(db: Database, arm: str, what: str, remark: str, by: str, now: floa
 
 
 def events(db: Database, arm: str, *, before: int | None = None, most: int = 100) -> list[Row]:
-    """Maintenance that was done, the newest first, from the event before the number `before`."""
+    """Return the maintenance of an arm, the newest first, from the event before the number `before`."""
     last = 2**62 if before is None else before
     return db.rows(
         "SELECT * FROM maintenance_events WHERE arm = ? AND id < ? ORDER BY id DESC LIMIT ?", arm, last, most
@@ -169,7 +168,7 @@ def events(db: Database, arm: str, *, before: int | None = None, most: int = 100
 
 
 def fall_due(db: Database, now: float) -> None:
-    """Enter what has fallen due by time or by operating hours until now [s since 1970 in UTC]."""
+    """Enter what has become due by cron or by operating hours until now [s since 1970 in UTC]."""
     with db.transaction():
         for row in schedules(db):
             if not row["enabled"]:
@@ -187,7 +186,7 @@ def _by_cron(db: Database, row: Row, now: float) -> None:
         _falls_due(db, row, f"cron {row['cron']}", now, late=now - coming > LATE)
         db.write("UPDATE schedules SET last = ?, next = ? WHERE id = ?", now, cron.after(now), row["id"])
         return
-    # A clock that was put back: what has been due is not due again, but a clock that was wrong by more than a day
+    # If the clock was put back, a past time is not due again; but a clock that was wrong by more than a day
     # must not silence the schedule until it is right.
     last = row["last"] or 0.0
     right = cron.after(max(now, last) if last - now <= _DAY else now)
@@ -203,7 +202,7 @@ def _by_hours(db: Database, row: Row, now: float) -> None:
 
 
 def _falls_due(db: Database, row: Row, cause: str, now: float, *, late: bool = False) -> None:
-    """Unless it is due already."""
+    """Enter a schedule as due, unless it is due already."""
     if db.write(
         "INSERT INTO dues (arm, schedule, cause, at, late) VALUES (?, ?, ?, ?, ?) ON CONFLICT DO NOTHING",
         *(row["arm"], row["id"], cause, now, int(late)),
@@ -212,12 +211,12 @@ def _falls_due(db: Database, row: Row, cause: str, now: float, *, late: bool = F
 
 
 def dues(db: Database, arm: str | None = None) -> list[Row]:
-    """What is due and has not been done, the earliest first."""
+    """Return what is due and has not been done, the earliest first."""
     return db.rows("SELECT * FROM dues WHERE closed IS NULL AND (?1 IS NULL OR arm = ?1) ORDER BY id", arm)
 
 
 def dismiss(db: Database, number: int, why: str, by: str, now: float) -> None:
-    """A person's word that what is due is not to be done.
+    """Close a due entry that is not to be done, on a person's decision.
 
     Raises:
         UsageError: no reason, or it is not due.
@@ -234,7 +233,7 @@ def dismiss(db: Database, number: int, why: str, by: str, now: float) -> None:
 
 
 def close_dues(db: Database, arm: str, before: float, how: str, by: str, now: float) -> None:
-    """What was due for an arm until `before` has been done."""
+    """Close an arm's entries that were due until `before` [s since 1970 in UTC], since they are done."""
     db.write(
         "UPDATE dues SET closed = ?, closed_by = ?, how = ? WHERE arm = ? AND at <= ? AND closed IS NULL",
         *(now, by, how, arm, before),

@@ -1,7 +1,4 @@
-"""What a comparison with the accepted set says, in one line, for the registry, the alarm and whoever is told.
-
-Boundary: the document of `results/comparison` in, words out.
-"""
+"""Summarise a comparison with the accepted set in one line, for the registry, the alarm and notices."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ _MOST = 4000  # characters
 
 @dataclass(frozen=True)
 class Verdict:
-    """What came of a re-identification.
+    """Verdict of a re-identification.
 
     Attributes:
         state: `unchanged`, `changed` or `impossible`.
@@ -26,7 +23,7 @@ class Verdict:
 
 
 def verdict_of(document: Mapping[str, Any]) -> Verdict:
-    """The verdict of a comparison of two.
+    """Return the verdict of a comparison of two parameter sets.
 
     Args:
         document: `comparison.json`.

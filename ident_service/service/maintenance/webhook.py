@@ -1,8 +1,8 @@
-"""Notices to a program elsewhere, by the convention of standardwebhooks.com: what is due, and drift alarms.
+"""Send notices of due re-identifications and drift alarms to a webhook, by the convention of standardwebhooks.com.
 
-Each notice is a row of the registry before anybody is told that it was sent. It is tried again, later and later, for
-three days, also after a restart; then it is given up with a line in the audit trail. A failure harms nothing: a thread
-of its own sends. Only https, or http to this machine; redirections are not followed.
+Each notice is a row of the registry before it counts as sent. Failed attempts are repeated at growing intervals for
+three days, also after a restart; then the notice is given up with a line in the audit trail. A thread of its own sends,
+so that a failure delays nothing else. Only https, or http to this machine; redirections are not followed.
 
 The receiver verifies `webhook-signature` with a library of the convention and the shared secret, refuses old
 timestamps, and tells repetitions by `webhook-id`, which is the same for all attempts.
@@ -36,9 +36,9 @@ from ident_service.service.registry.database import Database, Row
 
 WAITS: Final = (5.0, 300.0, 1800.0, 7200.0, 18_000.0, 36_000.0, 50_400.0, 72_000.0, 86_400.0)
 """After each attempt that failed [s]: the schedule that the convention recommends, about three days in all."""
-KEPT: Final = 30 * 24 * 3600.0  # s that what became of a notice is remembered
+KEPT: Final = 30 * 24 * 3600.0  # s that a delivered notice stays in the registry
 _PATIENCE = 5.0  # s for connecting, and for each answer
-_LOOK = 0.5  # s between looks at what is to be sent
+_LOOK = 0.5  # s between checks for notices to send
 _LEAST_SECRET, _MOST_SECRET = 16, 1024  # bytes
 _PREFIX: Final = "whsec_"
 SERVICE: Final = "service"
@@ -46,7 +46,7 @@ LOG = logging.getLogger("ident.webhook")
 
 
 class Webhook:
-    """Sends notices to one address."""
+    """Sender of notices to one address."""
 
     def __init__(
         self,
@@ -57,7 +57,7 @@ class Webhook:
         waits: tuple[float, ...] = WAITS,
         now: Callable[[], float] = time.time,
     ) -> None:
-        """Begin to send what waits in the registry, of an earlier process, too.
+        """Start sending the notices that wait in the registry, also those of an earlier process.
 
         Args:
             db: the registry.
@@ -79,7 +79,7 @@ class Webhook:
         self._thread.start()
 
     def send(self, kind: str, at: float, data: Mapping[str, Any]) -> str:
-        """Have a notice sent; it is there when the caller's transaction is. Returns at once.
+        """Enter a notice to be sent, within the caller's transaction; returns at once.
 
         Args:
             kind: `arm.due` and so on.
@@ -99,7 +99,7 @@ class Webhook:
         return name
 
     def close(self) -> None:
-        """Send nothing more; what waits is sent after the next start."""
+        """Stop sending; waiting notices are sent after the next start."""
         self._ending.set()
         self._thread.join(3 * _PATIENCE)
 
@@ -110,14 +110,14 @@ class Webhook:
                     self._attempt(row)
             except sqlite3.Error as error:
                 LOG.error("notices wait for the registry: %s", error)
-            except Exception:  # the next notice is sent all the same
+            except Exception:  # the next notice must be sent all the same
                 LOG.exception("the webhook stumbled")
 
     def _due(self) -> Row | None:
         return self._db.row("SELECT * FROM deliveries WHERE next <= ? ORDER BY next, number LIMIT 1", self._now())
 
     def _attempt(self, row: Row) -> None:
-        """Try once; what became of it is written before anything else is tried."""
+        """Try to send a notice once, and enter the result before another attempt."""
         tries, why, status = row["tries"] + 1, "", 0
         try:
             status = self._post(row["id"], row["body"])
@@ -129,7 +129,7 @@ class Webhook:
             self._db.write("DELETE FROM deliveries WHERE next IS NULL AND created < ?", now - KEPT)
             return
         why = why or f"answered {status}"
-        # By the convention, 410 says that nothing is wanted there any more.
+        # By the convention, status 410 says that the receiver wants no more notices.
         if status != HTTPStatus.GONE and tries <= len(self._waits):
             self._write(row, tries, now + self._waits[tries - 1], None, why)
             return
@@ -167,7 +167,7 @@ class Webhook:
 
 
 def deliveries(db: Database, *, before: int | None = None, most: int = 100) -> list[Row]:
-    """Notices and what became of them, the newest first, from the one before the number `before`."""
+    """Return notices with their results, the newest first, from the one before the number `before`."""
     return db.rows(
         "SELECT * FROM deliveries WHERE number < ? ORDER BY number DESC LIMIT ?",
         *(2**62 if before is None else before, most),
@@ -175,7 +175,7 @@ def deliveries(db: Database, *, before: int | None = None, most: int = 100) -> l
 
 
 def require_address(url: str) -> None:
-    """See whether notices may be sent there.
+    """Check that notices may be sent to an address.
 
     Raises:
         UsageError: not https, nor http to this machine.
@@ -193,7 +193,7 @@ def require_address(url: str) -> None:
 
 
 def read_secret(path: Path) -> bytes:
-    """Read the secret in a file that only its owner can read.
+    """Read the signing secret from a file that only its owner can read.
 
     Args:
         path: of the file: `whsec_` and the key in base 64, as the convention has it, or the key itself.

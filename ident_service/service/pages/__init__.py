@@ -1,1 +1,1 @@
-"""The page: what the API does, for a browser; rendered here, with a little script that only adds comfort."""
+"""Serve the web pages: what the API does, for a browser; rendered here, scripts only add comfort."""

@@ -1,7 +1,7 @@
-"""What pages show of a re-identification: its steps with their jobs, and what its comparison has found.
+"""Collect what pages show of a re-identification: its steps with their jobs, and the findings of its comparison.
 
-The registry's words are what was concluded. The comparison in the run's folder says the same with more structure; it
-is shown only where the manifest names it as it is, and where it is that very one and not a later one.
+The registry's text is the verdict that was concluded. The comparison in the run's folder has the same content in more
+detail; it is shown only if the manifest names it with its hash, and if it leads to that same text.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ StepState = Literal["done", "busy", "open", "ended"]
 
 @dataclass(frozen=True)
 class Step:
-    """One step.
+    """One step of a re-identification.
 
     Attributes:
         key: one of `TITLES`.
         title: for people.
-        words: what it does.
+        words: description of the step.
         state: `ended` where the whole ended badly.
         job: id of its job; None where it has none yet, or was done at a terminal.
     """
@@ -53,7 +53,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that has changed.
+    """One change that a comparison has found.
 
     Attributes:
         what: and of which joint or link.
@@ -72,7 +72,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Compared:
-    """A comparison that was concluded from.
+    """Comparison that a verdict was concluded from.
 
     Attributes:
         folder: of the run that keeps it.
@@ -86,7 +86,7 @@ class Compared:
 
 
 def steps(db: Database, row: Row) -> tuple[Step, ...]:
-    """Its steps, in order.
+    """Return the steps of a re-identification, in order.
 
     Args:
         db: the registry.
@@ -103,7 +103,7 @@ def steps(db: Database, row: Row) -> tuple[Step, ...]:
 
 
 def compared(db: Database, state: Path, run: str | None, words: str) -> Compared | None:
-    """The comparison that these words were concluded from; None where it is not there, or another has replaced it.
+    """Return the comparison that these words were concluded from; None if it is missing or was replaced.
 
     Args:
         db: the registry.
@@ -134,9 +134,10 @@ def _told(folder: Path, pair: dict[str, Any]) -> Compared:
 
 
 def _jobs(db: Database, row: Row) -> dict[str, str]:
-    """Key of each step that has a job to its id.
+    """Return the job id of each step that has a job, by the step's key.
 
-    What a job makes names it. A check makes nothing: it is the one that was asked for when this was begun.
+    A step's job is found by the run that it made. A check makes none: it is the one whose creation time is nearest to
+    the beginning of the re-identification.
     """
     found = {
         key: job["id"]

@@ -1,7 +1,7 @@
-"""Pages of re-identifications: a person's word for one, its way through the steps, and what it found.
+"""Serve the pages of re-identifications: confirmation by a person, progress, and findings.
 
-A person's word is the arm's name, typed, as for any motion; a note may say why, and stands in the audit trail. The page
-that then opens keeps the lease of both motions.
+A person confirms by typing the arm's name, as for any motion; a note may say why, and is entered in the audit trail.
+The page that then opens renews the lease of both motions.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ _NOTED = "re-identification note"
 
 @router.post("/arms/{arm}/reidentify/confirm")
 def ask_confirmation(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
-    """Say what is about to move, and against what it is judged; ask for the arm's name."""
+    """Show what is about to move, and what it is compared with; ask for the arm's name."""
     return _confirmation(service, who, arm, form, "")
 
 
 @router.post("/arms/{arm}/reidentify")
 def begin(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
-    """Begin one that a person has confirmed; its page keeps the lease from then on."""
+    """Begin a re-identification that a person has confirmed; its page keeps the lease from then on."""
     remark = form.get("note", "").strip()
     if len(remark) > _LONGEST_NOTE:
         raise UsageError(f"a note has {_LONGEST_NOTE} characters at most; nothing has moved")
@@ -60,7 +60,7 @@ def begin(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response
 
 @router.get("/reidentifications/{name}")
 def show(service: Serving, who: Viewer, name: Id, attended: bool = False) -> Response:
-    """One of them; `attended` where this page is to keep its lease."""
+    """Show one re-identification; `attended` where this page is to keep its lease."""
     row = known_reidentification(service.db, name)
     live, job = row["state"] == "running", None if row["job"] is None else rows.known_job(service.db, row["job"])
     attends = attended and live and not row["unattended"] and row["begun_by"] == who.name and who.role == "operator"
@@ -85,22 +85,22 @@ def show(service: Serving, who: Viewer, name: Id, attended: bool = False) -> Res
 
 @router.post("/reidentifications/{name}/cancel")
 def cancel(service: Serving, who: Operator, name: Id, form: Form) -> Response:
-    """Have it end: its motion by a controlled stop."""
-    del form  # that it came from a page of ours is all that counts
+    """End a re-identification: its motion by a controlled stop."""
+    del form  # reading the form has checked that it comes from a page of this service
     row = known_reidentification(service.db, name)
     if row["state"] != "running" or row["job"] is None:
         raise UsageError(f"this re-identification has ended already: {row['state']}")
     try:
         jobs.cancel_job(service, who, row["job"])
     except UsageError:
-        # Between two steps there is no job to cancel. What a stop reaches is that no motion begins any more.
+        # Between two steps there is no job to cancel; a stop makes sure that no motion begins any more.
         service.engine.stop(row["arm"], who.name)
     return seen(f"/reidentifications/{name}?attended=1")
 
 
 @router.get("/reidentifications/{name}/comparison")
 def show_comparison(service: Serving, _: Viewer, name: Id) -> Response:
-    """Its comparison, as it was kept."""
+    """Show the stored comparison of a re-identification."""
     row = known_reidentification(service.db, name)
     found = compared(service.db, service.state, row["run"], row["detail"])
     if found is None:
@@ -114,7 +114,7 @@ _REMARK = "SELECT json_extract(detail, '$.note') AS detail FROM audit WHERE what
 
 def _confirmation(service: Service, who: Access, arm: str, form: dict[str, str], problem: str) -> Response:
     config = known_arm(service.db, service.state, arm).config
-    against = require_comparable(service.state, config)  # told here, before anybody types
+    against = require_comparable(service.state, config)  # checked here, before a person types the name
     given = arms.challenge(service, who, arm)
     motion = known_motions.known_motion(service.db, form["motion"]) if form.get("motion") else None
     return page(

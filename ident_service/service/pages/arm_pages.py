@@ -1,4 +1,4 @@
-"""Pages of arms: the list, one with its ladder, and the acts of a person: confirm, acknowledge, accept, roll back."""
+"""Serve the pages of arms: list, commissioning steps, and a person's acts: confirm, acknowledge, accept, roll back."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _KINDS: Final = frozenset({"design", "identify", "simulate", "report", "export"}
 
 @router.get("/")
 def list_arms(service: Serving, who: Viewer) -> Response:
-    """All arms, without reading their descriptions: that takes longer than a first page may."""
+    """List all arms without reading their descriptions, which would take too long for a first page."""
     accepted = {
         row["arm"]: row["number"]
         for row in service.db.rows("SELECT arm, MAX(number) AS number FROM acceptances GROUP BY arm")
@@ -43,7 +43,7 @@ def list_arms(service: Serving, who: Viewer) -> Response:
         try:
             faults = len(fault_file(service.state, row["name"]).latched())
         except IdentError:
-            faults = 1  # a file that somebody damaged stands in the way like one
+            faults = 1  # a damaged file prevents motion like a fault
         moving = in_use(control_path(service.state, row["name"]))
         lines.append({**row, "accepted": accepted.get(row["name"]), "faults": faults, "moving": moving})
     busy = rows.jobs(service.db, states=rows.LIVE, most=50)
@@ -57,13 +57,13 @@ def list_arms(service: Serving, who: Viewer) -> Response:
 
 @router.get("/new")
 def describe(who: Operator) -> Response:
-    """Ask for a description."""
+    """Show the form for a new description."""
     return page("new", who, problem="", text="", replace=False)
 
 
 @router.post("/new")
 def take_description(service: Serving, who: Operator, form: Form) -> Response:
-    """Take it, or show every mistake in it."""
+    """Add the arm of the form's description, or show every mistake in it."""
     text, replace = form.get("description", "").replace("\r\n", "\n"), "replace" in form
     try:
         added = arms.add_arm(service, who, arms.NewArm(description=text, replace=replace))
@@ -74,7 +74,7 @@ def take_description(service: Serving, who: Operator, form: Form) -> Response:
 
 @router.get("/arms/{arm}")
 def show_arm(service: Serving, who: Viewer, arm: ArmName) -> Response:
-    """One arm: where it stands on the ladder, what was recorded, and what was accepted."""
+    """Show one arm: its commissioning steps, its runs, and its acceptances."""
     answer = arms.get_arm(service, who, arm)
     config = known.known_arm(service.db, service.state, arm).config
     due = planned.dues(service.db, answer.name)
@@ -101,7 +101,7 @@ def show_arm(service: Serving, who: Viewer, arm: ArmName) -> Response:
 
 @router.post("/arms/{arm}/confirm")
 def ask_confirmation(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
-    """Say what is about to move, and ask for the arm's name."""
+    """Show what is about to move, and ask for the arm's name."""
     return _confirmation(service, who, arm, form, "")
 
 
@@ -131,14 +131,14 @@ def compute(service: Serving, who: Operator, arm: ArmName, form: Form) -> Respon
 
 @router.post("/arms/{arm}/ack")
 def acknowledge(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
-    """Acknowledge a fault that was read."""
+    """Acknowledge a fault that a person has read."""
     arms.acknowledge(service, who, arm, form.get("code", ""))
     return seen(f"/arms/{arm}")
 
 
 @router.post("/arms/{arm}/accept")
 def accept(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
-    """A person's word that the parameters of a run are the arm's."""
+    """Accept the parameters of a run as the arm's, on a person's decision."""
     _require_name(arm, form)
     arms.accept_run(service, who, arm, arms.Acceptance(run=form.get("run", ""), note=form.get("note", "")))
     return seen(f"/arms/{arm}#accepted")
@@ -146,7 +146,7 @@ def accept(service: Serving, who: Operator, arm: ArmName, form: Form) -> Respons
 
 @router.post("/arms/{arm}/rollback")
 def roll_back(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
-    """A person's word that an earlier set is the arm's again."""
+    """Return to an earlier accepted set, on a person's decision."""
     _require_name(arm, form)
     body = {"note": form.get("note", ""), **({"to": form["to"]} if form.get("to") else {})}
     arms.roll_back(service, who, arm, arms.Rollback.model_validate(body))
@@ -155,7 +155,7 @@ def roll_back(service: Serving, who: Operator, arm: ArmName, form: Form) -> Resp
 
 @router.post("/arms/{arm}/pause")
 def pause(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
-    """Let the arm stand, or go on."""
+    """Pause the motion of an arm, or resume it."""
     (arms.pause if form.get("wanted") == "pause" else arms.resume)(service, who, arm)
     job, again = form.get("job", ""), form.get("again", "")
     if again:
@@ -165,7 +165,7 @@ def pause(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response
 
 @router.post("/arms/{arm}/finish")
 def finish(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
-    """Let a run end early, in order."""
+    """End a run early by its regular end."""
     arms.finish(service, who, arm)
     job = form.get("job", "")
     return seen(f"/jobs/{rows.known_job(service.db, job)['id']}?attended=1" if job else f"/arms/{arm}")
@@ -173,14 +173,14 @@ def finish(service: Serving, who: Operator, arm: ArmName, form: Form) -> Respons
 
 @router.post("/arms/{arm}/supported")
 def supported(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
-    """Take a person's word that an arm that is held is supported."""
+    """Confirm, on a person's word, that an arm that is held is supported."""
     arms.supported(service, who, arm, arms.Support(confirm=form.get("name", "").strip()))
     job = form.get("job", "")
     return seen(f"/jobs/{rows.known_job(service.db, job)['id']}?attended=1" if job else f"/arms/{arm}")
 
 
 def _alarms(service: Service, arm: str | None) -> list[dict[str, Any]]:
-    """Drift alarms that stand, of an arm or of all, each with what was found."""
+    """Return the open drift alarms of an arm, or of all, each with its comparison."""
     return [
         {**row, "compared": compared(service.db, service.state, row["run"], row["what"])}
         for row in alarms(service.db, arm, most=50)
@@ -188,7 +188,7 @@ def _alarms(service: Service, arm: str | None) -> list[dict[str, Any]]:
 
 
 def _asked(arm: str, form: dict[str, str]) -> dict[str, Any]:
-    """The job that a form asks for; what it leaves empty is left out."""
+    """Return the job that a form asks for; empty fields are left out."""
     kind = form.get("kind", "")
     given = {key: value for key, value in form.items() if value and key in _FIELDS.get(kind, ())}
     try:
@@ -230,7 +230,7 @@ def _confirmation(service: Service, who: Access, arm: str, form: dict[str, str],
     fields = {"kind": form["kind"], **{key: form.get(key, "") for key in ("motion", "speed", "until")}}
     motion = known_motions.known_motion(service.db, fields["motion"]) if fields["motion"] else None
     status = 409 if problem else 200
-    # A rehearsal begins with the hand on its button: its lease would lapse before a page could be loaded.
+    # A rehearsal begins on its own page while its button is held: the lease would lapse while a page loads.
     if form["kind"] == "rehearse":
         return page("rehearse", who, status, arm=given.arm, given=given, fields=fields, motion=motion)
     return page("confirm", who, status, arm=given.arm, given=given, fields=fields, motion=motion, problem=problem)

@@ -1,7 +1,7 @@
-"""What page routes share: forms, and what goes wrong as a page.
+"""Parse the forms of page routes, and render their failures as pages.
 
-A form comes from a page of ours or not at all: its Origin must be there and ours (`api/doors.py`), besides the cookie
-that other sites do not send.
+A form must come from a page of this service: besides the cookie, which other sites do not send, its Origin header must
+be present and this service's (`api/doors.py`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _MOST_FIELDS = 64
 
 
 async def form_of(request: Request) -> dict[str, str]:
-    """The fields of a form, the last of each name; its size is bounded at the door.
+    """Return the fields of a form, the last of each name; its size is bounded by the middleware (`api/doors.py`).
 
     Raises:
         HTTPException: 403 where it does not say which page it comes from, 400 where it is none.
@@ -45,10 +45,10 @@ Form = Annotated[dict[str, str], Depends(form_of)]
 
 
 class PageRoute(APIRoute):
-    """A route whose failures are pages; who is not known is led to the way in."""
+    """Route whose failures are pages; a caller who is not logged in is sent to the login page."""
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
-        """The handler, wrapped."""
+        """Return the handler, wrapped so that its errors become pages."""
         handler = super().get_route_handler()
 
         async def handle(request: Request) -> Response:
@@ -67,14 +67,14 @@ class PageRoute(APIRoute):
 
 
 def words_of(error: IdentError | RequestValidationError | ValidationError) -> str:
-    """What is wrong with what was asked, for a person."""
+    """Return what is wrong with a request, for a person."""
     if isinstance(error, IdentError):
         return str(error)
     return "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()[:5])
 
 
 def failure(request: Request, status: int, words: str) -> Response:
-    """What went wrong, as a page."""
+    """Return a failure as a page."""
     service = service_of(request)
     cookie = request.cookies.get(COOKIE)
     who = service.gate.known(None, cookie)
@@ -84,12 +84,12 @@ def failure(request: Request, status: int, words: str) -> Response:
 
 
 def seen(address: str) -> RedirectResponse:
-    """After a form: look there."""
+    """Redirect to an address after a form (303 See Other)."""
     return RedirectResponse(address, 303)
 
 
 def inside(address: str) -> str:
-    """An address of ours, the first page for any other."""
+    """Return the address if it is on this service, else that of the first page."""
     good = address.startswith("/") and not address.startswith("//") and "\\" not in address and address.isprintable()
     return address if good else "/"
 

@@ -1,4 +1,4 @@
-"""The way in and out, what pages load, and the stop that needs no script."""
+"""Serve login and logout, the static files of pages, and the stop that works without scripts."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ Next = Annotated[str, Query(alias="next", max_length=500)]
 
 @router.get("/login")
 def show_login(where: Next = "/") -> Response:
-    """Ask for a token."""
+    """Show the form that asks for a token."""
     return page("login", None, where=inside(where), problem="")
 
 
 @router.post("/login")
 def log_in(service: Serving, request: Request, form: Form) -> Response:
-    """Exchange it for a session."""
+    """Exchange the form's token for a session."""
     where, answer = inside(form.get("next", "/")), seen(inside(form.get("next", "/")))
     try:
         about.login(service, request, answer, about.Login(token=form.get("token", "").strip()[:200] or "none"))
@@ -48,7 +48,7 @@ def log_in(service: Serving, request: Request, form: Form) -> Response:
 @router.post("/logout")
 def log_out(service: Serving, form: Form, cookie: Cookie = None) -> Response:
     """End the session."""
-    del form  # that it came from a page of ours is all that counts
+    del form  # reading the form has checked that it comes from a page of this service
     answer = seen("/login")
     about.logout(service, answer, cookie)
     return answer
@@ -62,7 +62,7 @@ def show_api() -> Response:
 
 @router.get("/static/{version}/{name}")
 def load(version: str, name: str) -> Response:
-    """A style sheet or script."""
+    """Return a style sheet or script."""
     if (version, name) == (viewer_version(), VIEWER):
         return Response(viewer_file(), media_type="text/javascript", headers=_KEPT)
     if name not in STATIC or version != mark():
@@ -72,7 +72,7 @@ def load(version: str, name: str) -> Response:
 
 @router.post("/stop")
 async def stop(service: Serving, request: Request, near: Near, cookie: Cookie = None) -> Response:
-    """Bring all arms to a controlled stop; who may is who may ask the API to."""
+    """Bring all arms to a controlled stop; the same callers may as for the API's stop."""
     done = await stop_all(service, near)
     back = inside(urlsplit(request.headers.get("referer", "")).path or "/")
     who = service.gate.known(None, cookie)

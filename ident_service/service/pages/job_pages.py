@@ -1,4 +1,4 @@
-"""Pages of jobs: the list, one with its progress and log, what it shows while an arm moves, and what it exported."""
+"""Serve the pages of jobs: the list, one with its progress and log, live data of a motion, exported files."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ router = APIRouter(include_in_schema=False, route_class=PageRoute)
 
 @router.get("/jobs")
 def list_jobs(service: Serving, who: Viewer, before: Annotated[int, Query(ge=0, lt=2**62)] | None = None) -> Response:
-    """Jobs, the newest first."""
+    """List jobs, the newest first."""
     found = rows.jobs(service.db, before=before, most=50)
     return page("jobs", who, jobs=[jobs.answer_of(service, row) for row in found], more=len(found) == 50)
 
 
 @router.get("/jobs/{job}")
 def show_job(service: Serving, who: Viewer, job: Id, attended: bool = False) -> Response:
-    """One job; `attended` where this page is to keep the lease of its motion."""
+    """Show one job; `attended` where this page is to keep the lease of its motion."""
     row = rows.known_job(service.db, job)
     live = row["state"] in rows.LIVE
     attends = attended and live and bool(row["motion"]) and row["created_by"] == who.name and who.role == "operator"
-    attends = attends and row["kind"] != "rehearse"  # whose lease is kept by a hand on its own page
+    attends = attends and row["kind"] != "rehearse"  # its lease is kept by the held button on its own page
     return page(
         "job",
         who,
@@ -51,15 +51,15 @@ def show_job(service: Serving, who: Viewer, job: Id, attended: bool = False) -> 
 
 @router.post("/jobs/{job}/cancel")
 def cancel(service: Serving, who: Operator, job: Id, form: Form) -> Response:
-    """Have it end."""
-    del form  # that it came from a page of ours is all that counts
+    """Cancel a job."""
+    del form  # reading the form has checked that it comes from a page of this service
     jobs.cancel_job(service, who, job)
     return seen(f"/jobs/{job}")
 
 
 @router.get("/exports/{job}/{name}")
 def get_export(service: Serving, _: Viewer, job: Id, name: FileName) -> Response:
-    """A file that an export made; as something to be kept, never as a page."""
+    """Download a file that an export made, never shown as a page."""
     row = rows.known_job(service.db, job)
     if name not in _exported(service, row):
         raise UnknownId(f"the job {job} has exported no file {name!r}; its page names them")

@@ -1,8 +1,8 @@
-"""The ladder of an arm: every step of its commissioning, what is done of it, and which comes next.
+"""Determine the commissioning steps of an arm: what is done of each, and which comes next.
 
-Told from the registry and the arm's folder each time it is asked, so that it is true after any restart. Steps count
-from the last description on: another description begins the ladder anew. What a re-identification did belongs to its
-own step alone. That step comes next whenever something is due or a drift alarm stands, and can be done.
+Read from the registry and the arm's folder at each request, so that it is right after any restart. Steps count from the
+last description on: a new description begins them anew. Jobs of a re-identification count for its own step alone. That
+step comes next whenever something is due or a drift alarm stands, and it can be done.
 """
 
 from __future__ import annotations
@@ -47,15 +47,15 @@ _MAKE_RUNS: Final = ("rehearse", "run", "identify")
 
 @dataclass(frozen=True)
 class Step:
-    """One step.
+    """One step of the commissioning.
 
     Attributes:
         key: one of `TITLES`.
         title: for people.
         state: `next` for exactly one step, unless a job of a step is under way, which then is `busy`; `skipped` for a
             rehearsal that a run went without.
-        words: what is done of it.
-        link: page of what does it now.
+        words: result so far, in words.
+        link: page of the job that is doing it now.
     """
 
     key: str
@@ -67,7 +67,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Ladder:
-    """All steps, and what they are about.
+    """All commissioning steps of an arm, and what they are about.
 
     Attributes:
         steps: in order.
@@ -89,10 +89,10 @@ class Ladder:
 
 
 def ladder(db: Database, state: Path, config: ArmConfig) -> Ladder:
-    """Where an arm stands.
+    """Return the commissioning steps of an arm with their states.
 
     Raises:
-        ParameterError: what was accepted cannot be read.
+        ParameterError: the accepted set cannot be read.
     """
     arm = config.name
     row = db.row("SELECT added FROM arms WHERE name = ?", arm)
@@ -158,7 +158,7 @@ def ladder(db: Database, state: Path, config: ArmConfig) -> Ladder:
 
 
 def _comparable(state: Path, config: ArmConfig) -> tuple[bool, str]:
-    """Whether the arm can be compared with what is accepted, and if not, why."""
+    """Return whether the arm can be compared with what is accepted, and if not, why."""
     try:
         require_comparable(state, config)
     except IdentError as error:
@@ -167,7 +167,7 @@ def _comparable(state: Path, config: ArmConfig) -> tuple[bool, str]:
 
 
 def _asks(db: Database, arm: str) -> list[str]:
-    """What asks for a re-identification, in words."""
+    """Return the reasons for a re-identification, in words."""
     due = [f"due: {row['cause']}" for row in dues(db, arm)]
     return [*due, *(["a drift alarm stands"] if alarms(db, arm, most=1) else [])]
 
@@ -185,7 +185,7 @@ def _newest(jobs: list[Row], kind: str) -> Row | None:
 
 
 def _deleted(job: Row, there: set[str]) -> bool:
-    """Tell whether the run that a job has made is gone."""
+    """Return whether the run that a job has made is deleted."""
     return job["kind"] in _MAKE_RUNS and job["state"] == "done" and job["run"] not in there
 
 
@@ -216,7 +216,7 @@ def _step(kind: str) -> str:
 
 
 def _ticket(path: Path, config: ArmConfig) -> tuple[bool, str]:
-    """Whether the last preflight's ticket may count still, and words; the run itself holds it against the open arm."""
+    """Return whether the last preflight's ticket still looks valid, and words; the run itself checks it again."""
     if not path.is_file():
         return False, "not checked yet"
     try:

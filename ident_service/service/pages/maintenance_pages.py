@@ -1,4 +1,4 @@
-"""The page of an arm's maintenance: what is due, its schedules, what was done; and the answer to a drift alarm.
+"""Serve the page of an arm's maintenance: what is due, schedules, past maintenance; and acknowledge drift alarms.
 
 A form with a mistake comes back as it was filled in, with the words that the API has for it.
 """
@@ -31,7 +31,7 @@ _HOUR = 3600.0
 
 @router.get("/arms/{arm}/maintenance")
 def show(service: Serving, who: Viewer, arm: ArmName) -> Response:
-    """What is due, by which schedules, and what was done."""
+    """Show what is due, by which schedules, and what maintenance was done."""
     return _page(service, who, arm)
 
 
@@ -53,7 +53,7 @@ def add_schedule(service: Serving, who: Operator, arm: ArmName, form: Form) -> R
 
 @router.post("/schedules/{number}/enabled")
 def enable_schedule(service: Serving, who: Operator, number: Number, form: Form) -> Response:
-    """Let one count again from now, or no more."""
+    """Enable a schedule from now on, or disable it."""
     wanted = maintenance.Enabled(enabled=form.get("wanted") == "enable")
     row = maintenance.enable_schedule(service, who, number, wanted)
     return seen(f"/arms/{row.arm}/maintenance#schedules")
@@ -61,8 +61,8 @@ def enable_schedule(service: Serving, who: Operator, number: Number, form: Form)
 
 @router.post("/schedules/{number}/remove")
 def remove_schedule(service: Serving, who: Operator, number: Number, form: Form) -> Response:
-    """Take one away."""
-    del form  # that it came from a page of ours is all that counts
+    """Remove a schedule."""
+    del form  # reading the form has checked that it comes from a page of this service
     arm = planned.known_schedule(service.db, number)["arm"]
     maintenance.remove_schedule(service, who, number)
     return seen(f"/arms/{arm}/maintenance#schedules")
@@ -70,7 +70,7 @@ def remove_schedule(service: Serving, who: Operator, number: Number, form: Form)
 
 @router.post("/arms/{arm}/maintenance")
 def add_maintenance(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
-    """Maintenance was done; what is scheduled after it falls due."""
+    """Enter maintenance that was done; schedules that follow maintenance become due."""
     body = {"what": form.get("what", "").strip(), "note": form.get("note", "").strip()}
     try:
         maintenance.add_maintenance(service, who, arm, maintenance.Event.model_validate(body))
@@ -81,7 +81,7 @@ def add_maintenance(service: Serving, who: Operator, arm: ArmName, form: Form) -
 
 @router.post("/due/{number}/dismiss")
 def dismiss(service: Serving, who: Operator, number: Number, form: Form) -> Response:
-    """A person's word that what is due is not to be done."""
+    """Dismiss a due re-identification, on a person's decision."""
     arm = next((row["arm"] for row in planned.dues(service.db) if row["id"] == number), None)
     if arm is None:
         raise UsageError(f"nothing of number {number} is due any more")
@@ -91,7 +91,7 @@ def dismiss(service: Serving, who: Operator, number: Number, form: Form) -> Resp
 
 @router.post("/alarms/{number}/ack")
 def acknowledge(service: Serving, who: Operator, number: Number, form: Form) -> Response:
-    """A person's word that they know of a drift; the accepted set stays as it is."""
+    """Acknowledge a drift alarm for a person; the accepted set stays as it is."""
     body = maintenance.Remark(note=form.get("note", "").strip())
     return seen(f"/arms/{maintenance.acknowledge_alarm(service, who, number, body).arm}")
 
@@ -104,7 +104,7 @@ def _page(
     problem: IdentError | ValidationError | None = None,
     where: str = "",
 ) -> Response:
-    """The page; after a mistake with the form as it was filled in, and the words beside it."""
+    """Return the page; after a mistake with the form as it was filled in, and the error beside it."""
     answer = arms.get_arm(service, who, arm)
     driven = operating_seconds(service.db, answer.name)
     status = 200 if problem is None else 422 if isinstance(problem, ValidationError) else status_of(problem)
@@ -126,7 +126,7 @@ def _page(
 
 
 def _line(row: Row, driven: float) -> dict[str, Any]:
-    """A schedule in words: when it is due, and what comes next."""
+    """Return a schedule with words on when it is due, and what comes next."""
     if row["cron"]:
         return {**row, "words": f"at {row['cron']}", "coming": None}
     if not row["trigger"].startswith(_HOURS):

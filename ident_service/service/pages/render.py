@@ -1,7 +1,7 @@
-"""From a template and values to an answer: everything that stands in a value is escaped, nothing stands inline.
+"""Render pages from templates: every value is escaped, no script or style stands inline.
 
-A page's own policy allows scripts, styles and connections of this service only. Its referrer policy tells our own
-origin, because a browser that is to say nothing sends `Origin: null` with a form, which the doors refuse.
+The content security policy of a page allows scripts, styles and connections of this service only. Its referrer policy
+is `same-origin`, because with `no-referrer` a browser sends `Origin: null` with a form, which the middleware refuses.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _HEADERS: Final = {
 
 
 VIEWER: Final = "rapidoc-min.js"
-# Of the page with the viewer, whose own styles stand in its elements; it sends nothing anywhere.
+# Policy of the page with the API viewer, which uses inline styles; it may send no form.
 _VIEWER_POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
     "connect-src 'self'; form-action 'none'; base-uri 'none'; frame-ancestors 'none'"
@@ -44,11 +44,11 @@ _VIEWER_POLICY: Final = (
 
 
 def page(name: str, who: Access | None, status: int = 200, **values: Any) -> HTMLResponse:
-    """A page.
+    """Render a template as a page.
 
     Args:
         name: of the template, without its ending.
-        who: looks at it; None for nobody that we know.
+        who: the caller; None for one that is not logged in.
         status: of the answer.
         values: of the template; every one that it names must be there.
     """
@@ -57,7 +57,7 @@ def page(name: str, who: Access | None, status: int = 200, **values: Any) -> HTM
 
 
 def viewer_page() -> HTMLResponse:
-    """Show the description of the API in the viewer that came along; nothing is loaded from elsewhere."""
+    """Return the page with the vendored viewer of the API's description; nothing is loaded from elsewhere."""
     text = _environment().get_template("api.html").render(mark=mark(), viewer=viewer_version())
     return HTMLResponse(text, headers={**_HEADERS, "Content-Security-Policy": _VIEWER_POLICY})
 
@@ -69,7 +69,7 @@ def viewer_file() -> bytes:
 
 @lru_cache(maxsize=1)
 def viewer_version() -> str:
-    """Return what changes in the address of the viewer when it does."""
+    """Return the part of the viewer's address that changes with its version."""
     told = json.loads(_vendored().joinpath("vendored.json").read_text(encoding="utf-8"))
     return f"{told['package']}-{told['version']}"
 
@@ -80,14 +80,14 @@ def _vendored() -> Traversable:
 
 @lru_cache(maxsize=1)
 def static() -> dict[str, bytes]:
-    """Name to content of what pages load."""
+    """Return the static files of pages, name to content."""
     place = files(__package__).joinpath("static")
     return {name: place.joinpath(name).read_bytes() for name in STATIC}
 
 
 @lru_cache(maxsize=1)
 def mark() -> str:
-    """What changes in the addresses of these files when they do, so that browsers may keep them."""
+    """Return the part of the static files' addresses that changes with their content, so that browsers cache them."""
     return hashlib.sha256(b"".join(static().values())).hexdigest()[:12]
 
 
@@ -105,14 +105,14 @@ def _environment() -> Environment:
 
 
 def _when(seconds: float | None) -> str:
-    """A time [s since 1970] in UTC, for people."""
+    """Format a time [s since 1970] in UTC."""
     if seconds is None:
         return "\u2014"
     return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
 
 
 def _lasting(seconds: float | None) -> str:
-    """A duration [s] for people."""
+    """Format a duration [s]."""
     if seconds is None:
         return "\u2014"
     minutes, rest = divmod(round(seconds), 60)
@@ -120,5 +120,5 @@ def _lasting(seconds: float | None) -> str:
 
 
 def _short(sha256: str) -> str:
-    """The beginning of a hash."""
+    """Return the first 12 digits of a hash."""
     return sha256[:12]

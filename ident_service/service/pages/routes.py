@@ -1,4 +1,4 @@
-"""All routes of the page; none is in the API's description."""
+"""List the routers of all pages; none is in the API's description."""
 
 from __future__ import annotations
 

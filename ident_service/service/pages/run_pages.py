@@ -1,4 +1,4 @@
-"""Pages of runs: history, one run with its files and what can be done with it, comparison; and the audit trail."""
+"""Serve the pages of runs: history, one run with its files and actions, comparison; and the audit trail."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from ident_service.service.registry.audit import trail
 from ident_service.service.registry.runs import REPORTS
 
 router = APIRouter(include_in_schema=False, route_class=PageRoute)
-# Of a page whose own style stands in it, and that needs nothing else.
+# `POLICY` is for a page with an inline style that loads nothing else.
 _RUNS: Final = 200  # of one page
 POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'; sandbox"
 
 
 @router.get("/runs")
 def list_runs(service: Serving, who: Viewer, arm: ArmName | None = None, before: BeforeId = None) -> Response:
-    """Runs, the newest first."""
+    """List runs, the newest first."""
     sets = {row["run"]: row for row in service.db.rows("SELECT * FROM parameter_sets")}
     found = known.runs(service.db, arm, before=before, most=_RUNS + 1)
     return page("runs", who, arm=arm, runs=found[:_RUNS], more=len(found) > _RUNS, sets=sets)
@@ -35,7 +35,7 @@ def list_runs(service: Serving, who: Viewer, arm: ArmName | None = None, before:
 
 @router.get("/runs/{run}")
 def show_run(service: Serving, who: Viewer, run: Id) -> Response:
-    """One run."""
+    """Show one run."""
     answer = runs.get_run(service, who, run)
     sets = service.db.rows("SELECT run FROM parameter_sets WHERE arm = ? AND run <> ?", answer.arm, answer.id)
     reported = (service.state / REPORTS / f"{answer.id}.html").is_file()
@@ -50,8 +50,8 @@ def show_run(service: Serving, who: Viewer, run: Id) -> Response:
 
 @router.get("/compare")
 def compare(service: Serving, who: Viewer, reference: Id, other: Id) -> Response:
-    """The comparison of two runs' parameters, as `ident compare` writes it."""
-    # Loaded when they are asked for: the service starts without.
+    """Show the comparison of two runs' parameters, as `ident compare` writes it."""
+    # Imported only when a comparison is asked for, so that the service starts without these modules.
     from ident_service.results.comparison.page import comparison_html
     from ident_service.service.comparison import compare_files
 
@@ -64,7 +64,7 @@ def compare(service: Serving, who: Viewer, reference: Id, other: Id) -> Response
 
 @router.get("/audit")
 def audit(service: Serving, who: Viewer, before: Annotated[int, Query(ge=0, lt=2**62)] | None = None) -> Response:
-    """Who did what, the newest first."""
+    """List the lines of the audit trail, the newest first."""
     service.engine.audit.flush(AUDIT_SECONDS)
     lines = trail(service.db, before=before, most=100)
     return page("audit", who, lines=lines, more=len(lines) == 100)

@@ -1,4 +1,4 @@
-"""What the service remembers: arms, jobs, runs, acceptances, access, and who did what; one SQLite file.
+"""Store arms, jobs, runs, acceptances, tokens and the audit trail of the service in one SQLite file.
 
 Folders stay the truth about results: `runs.index_runs` and `acceptances` can rebuild their tables from them.
 """

@@ -1,4 +1,4 @@
-"""Arms by name: the shipped ones, and descriptions that were uploaded, each kept in a folder named after its hash.
+"""Keep arms by name: the shipped ones, and uploaded descriptions, each in a folder named after its hash.
 
 An uploaded description is read by the loader that reads every other, from a folder of its own which nothing in it may
 lead out of: files that it names are uploaded with it, and what it `extends` is a shipped arm.
@@ -34,7 +34,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
 @dataclass(frozen=True)
 class KnownArm:
-    """An arm that the service knows.
+    """Arm that the service knows.
 
     Attributes:
         name: which is its id.
@@ -50,15 +50,15 @@ class KnownArm:
 
 
 def resources(config: ArmConfig) -> tuple[str, ...]:
-    """What a motion of this arm has for itself: the arm, and every bus that it hangs on."""
+    """Return what a motion of this arm must have for itself: the arm, and every bus that it is on."""
     buses = getattr(config.driver, "buses", ())
-    # Nobody shares a bus in lock step: it is within one process.
+    # A bus in lock step is not shared: it is within one process.
     wires = {f"bus {bus.interface} {bus.channel}" for bus in buses if bus.interface != "lock_step"}
     return (f"arm {config.name}", *sorted(wires))
 
 
 def know_shipped(db: Database) -> None:
-    """Enter the shipped arms; an uploaded one of the same name stays.
+    """Enter the shipped arms in the registry; an uploaded one of the same name stays.
 
     Their descriptions are read when they are asked for: reading all of them takes longer than a start may.
     """
@@ -71,12 +71,12 @@ def know_shipped(db: Database) -> None:
 
 
 def arm_names(db: Database) -> list[Row]:
-    """Name and source of every arm."""
+    """Return name, source and description data of every arm."""
     return db.rows("SELECT name, source, description, sha256, added, added_by FROM arms ORDER BY name")
 
 
 def known_arm(db: Database, state: Path, name: str) -> KnownArm:
-    """The arm of this name.
+    """Return the arm of this name.
 
     Raises:
         UnknownId: there is none.
@@ -91,7 +91,7 @@ def known_arm(db: Database, state: Path, name: str) -> KnownArm:
     try:
         config = load_arm(path)
     except (ConfigError, UsageError):
-        if db.row("SELECT 1 FROM arms WHERE name = ?", name) is None:  # deleted in this moment
+        if db.row("SELECT 1 FROM arms WHERE name = ?", name) is None:  # deleted meanwhile
             raise UnknownId(f"no arm {name!r} is known; the list of arms names them") from None
         raise
     if row["sha256"] != config.sha256:
@@ -112,7 +112,7 @@ def add_arm(
     replace: bool = False,
     judge: Callable[[Path], object] = lambda _: None,
 ) -> KnownArm:
-    """Take an uploaded description; the one that had its name stays on the disk.
+    """Add an uploaded description; a replaced one of the same name stays on the disk.
 
     Args:
         db: the registry.
@@ -134,7 +134,7 @@ def add_arm(
         folder = state / DESCRIPTIONS / f"{config.name}-{config.sha256[:16]}"
         if not folder.exists():
             judge(path)
-        with db.transaction():  # whoever deletes the arm, or adds it too, comes before or after
+        with db.transaction():  # so that deleting or adding the same arm happens before or after
             _require_free(db, config, replace=replace)
             if not folder.exists():
                 with appearing_folder(folder) as built:
@@ -164,7 +164,7 @@ def _require_free(db: Database, config: ArmConfig, *, replace: bool) -> None:
 
 @contextmanager
 def uploaded(state: Path, text: str, files: Mapping[str, str]) -> Iterator[Path]:
-    """The file of an uploaded description, beside the files that it names, for as long as the block lasts.
+    """Yield the file of an uploaded description, beside the files that it names, for the duration of the block.
 
     Args:
         state: the state folder.
@@ -182,10 +182,10 @@ def uploaded(state: Path, text: str, files: Mapping[str, str]) -> Iterator[Path]
     for name in files:
         if not _NAME.fullmatch(name) or name == ARM_FILE:
             raise UsageError(f"{name!r}: a file's name is a plain one, and not {ARM_FILE}")
-        if name in shipped_arms():  # it would be taken for what the description extends
+        if name in shipped_arms():  # `extends` would take it for the shipped arm
             raise UsageError(f"{name!r}: is the name of a shipped arm; give the file another")
     place = state / DESCRIPTIONS
-    # Below its own name only when it has been found good.
+    # Under its own name only after it has been checked.
     staging = place / f".{time.time_ns():x}.{secrets.token_hex(4)}.partial"
     try:
         staging.mkdir(parents=True)

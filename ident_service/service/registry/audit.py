@@ -20,7 +20,7 @@ from ident_service.record.files import write_atomically
 from ident_service.service.registry.database import Database, Row
 from ident_service.service.state_folder import leave_to_owner
 
-_AGAIN: Final = 1.0  # s between tries to enter what the registry has no room for
+_AGAIN: Final = 1.0  # s between attempts to enter a line that the registry cannot take
 _MOST_WAITING: Final = 10_000
 _WAITING: Final = "audit.waiting"
 LOG = logging.getLogger("ident.audit")
@@ -28,7 +28,7 @@ _Line = tuple[float, str, str, str, str]
 
 
 def note(db: Database, who: str, what: str, about: str, **detail: Any) -> None:
-    """Add one line.
+    """Add one line to the audit trail.
 
     Args:
         db: the registry.
@@ -77,17 +77,17 @@ def enter_waiting(db: Database, state: Path) -> None:
 
 
 class AuditQueue:
-    """Lines that a thread of its own enters: whoever stops an arm waits neither for a disk nor for another process."""
+    """Queue of audit lines that a thread enters: whoever stops an arm waits neither for a disk nor for a process."""
 
     def __init__(self, db: Database) -> None:
-        """Begin the thread."""
+        """Start the thread."""
         self._db, self._lines, self._changed = db, deque[_Line](), threading.Condition()
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._work, name="audit", daemon=True)
         self._thread.start()
 
     def note(self, who: str, what: str, about: str, **detail: Any) -> None:
-        """Add one line soon, with the time of now; never waits."""
+        """Queue one line with the present time; never waits."""
         line = _line(who, what, about, detail)
         with self._changed:
             if len(self._lines) < _MOST_WAITING:
@@ -97,12 +97,12 @@ class AuditQueue:
         LOG.error("a line of the audit trail is lost, because too many wait: %s", line)
 
     def flush(self, seconds: float) -> bool:
-        """Wait until every line is entered, so long at most; tell whether all are."""
+        """Wait until every line is entered, at most `seconds`; return whether all are."""
         with self._changed:
             return self._changed.wait_for(lambda: not self._lines, seconds)
 
     def close(self, seconds: float = 5.0) -> None:
-        """Enter what waits, as far as the registry takes it in that time, and end the thread."""
+        """Enter the queued lines, as far as the registry takes them in `seconds`, and end the thread."""
         self.flush(seconds)
         self._ending.set()
         with self._changed:
@@ -138,7 +138,7 @@ def _enter(db: Database, line: _Line) -> None:
 
 
 def trail(db: Database, *, before: int | None = None, most: int = 100) -> list[Row]:
-    """Lines, the newest first, from the one before the id `before`."""
+    """Return lines of the audit trail, the newest first, from the one before the id `before`."""
     rows = db.rows(
         "SELECT * FROM audit WHERE id < ? ORDER BY id DESC LIMIT ?", 2**62 if before is None else before, most
     )
@@ -146,7 +146,7 @@ def trail(db: Database, *, before: int | None = None, most: int = 100) -> list[R
 
 
 def trail_after(db: Database, line: int, most: int = 500) -> list[Row]:
-    """Lines after the one of this id, the earliest first."""
+    """Return lines of the audit trail after the one of this id, the earliest first."""
     rows = db.rows("SELECT * FROM audit WHERE id > ? ORDER BY id LIMIT ?", line, most)
     return [{**row, "detail": json.loads(row["detail"])} for row in rows]
 

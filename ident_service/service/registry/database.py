@@ -1,4 +1,4 @@
-"""The registry's database: opened, migrated, and used in short transactions from any thread.
+"""Open and migrate the registry's database, and use it in short transactions from any thread.
 
 Write-ahead logging with full synchronisation: what a transaction has written is on the disk when it ends, and a kill at
 any moment loses nothing of it. Other processes of the same machine (`ident accept`) may use the file at the same time.
@@ -25,7 +25,7 @@ from ident_service.service.registry.migrations import MIGRATIONS
 from ident_service.service.state_folder import require_whole
 
 FILE: Final = "registry.sqlite"
-_BUSY = 10.0  # s that another process may keep it
+_BUSY = 10.0  # s to wait for another process that writes
 _IDLE = 2.0  # s
 Row = Mapping[str, Any]
 
@@ -74,10 +74,10 @@ def _primary(error: BaseException) -> int:
 
 
 class Database:
-    """A connection that writes and one that reads, each used by one thread at a time."""
+    """Two connections to the registry, one for writing and one for reading, each used by one thread at a time."""
 
     def __init__(self, state: Path, migrations: Sequence[str] = MIGRATIONS, *, busy: float = _BUSY) -> None:
-        """Open the registry of a state folder; made and migrated where necessary.
+        """Open the registry of a state folder; create and migrate it where necessary.
 
         Args:
             state: the state folder.
@@ -92,7 +92,7 @@ class Database:
         require_whole(state)
         self._path, self._lock, self._read_lock = state / FILE, threading.RLock(), threading.Lock()
         self._writer: int | None = None  # the thread whose transaction is open
-        self._busy, self._wrote = busy, math.inf  # when something was last written that is in the log only
+        self._busy, self._wrote = busy, math.inf  # when the last write was that is only in the log [s]
         try:
             state.mkdir(mode=0o700, parents=True, exist_ok=True)
             with suppress(FileExistsError):  # SQLite gives its other files the mode of this one
@@ -107,7 +107,7 @@ class Database:
             self._migrate(migrations)
             self._checkpointed()
             self._reader.execute("PRAGMA query_only = ON")
-            for ending in ("", "-wal", "-shm"):  # of folders that older software made
+            for ending in ("", "-wal", "-shm"):  # older software made these files with other modes
                 with suppress(FileNotFoundError):
                     self._path.with_name(self._path.name + ending).chmod(0o600)
         except sqlite3.Error as error:
@@ -139,8 +139,8 @@ class Database:
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
-        """All that is written in the block, or nothing of it; blocks within blocks are one."""
-        # Who waits behind one that waits for another process waits no longer than that one.
+        """Write all statements of the block, or none of them; nested blocks belong to the outer one."""
+        # A thread waits here hardly longer than the thread before it may wait for another process.
         if not self._lock.acquire(timeout=self._busy + 1.0):
             busy = sqlite3.OperationalError("other threads have written for too long")
             busy.sqlite_errorcode, busy.sqlite_errorname = sqlite3.SQLITE_BUSY, "SQLITE_BUSY"
@@ -167,29 +167,29 @@ class Database:
             self._lock.release()
 
     def write(self, sql: str, *values: Any) -> int:
-        """Execute one statement; how many rows it changed."""
+        """Execute one statement; return how many rows it changed."""
         with self.transaction():
             return self._connection.execute(sql, values).rowcount
 
     def rows(self, sql: str, *values: Any) -> list[Row]:
-        """All rows of a query, as mappings of column to value; within a transaction, with what it has written."""
+        """Return all rows of a query as mappings of column to value; within a transaction, with what it has written."""
         if self._writer == threading.get_ident():
             return [dict(row) for row in self._connection.execute(sql, values)]
         with self._read_lock:
             return [dict(row) for row in self._reader.execute(sql, values)]
 
     def row(self, sql: str, *values: Any) -> Row | None:
-        """The first row of a query."""
+        """Return the first row of a query, or None."""
         return next(iter(self.rows(sql, *values)), None)
 
     def sound(self) -> bool:
-        """Whether SQLite finds nothing wrong in the whole file."""
+        """Return whether SQLite finds nothing wrong in the whole file."""
         return self.rows("PRAGMA integrity_check") == [{"integrity_check": "ok"}] and not self.rows(
             "PRAGMA foreign_key_check"
         )
 
     def rest(self) -> None:
-        """Put what was written into the main file, once nothing has been written for two seconds; waits for nobody.
+        """Move the log into the main file once nothing has been written for two seconds; waits for nobody.
 
         Until then the last transactions are in SQLite's log beside it, which whoever copies one file leaves behind.
         """
@@ -202,7 +202,7 @@ class Database:
             self._lock.release()
 
     def _checkpointed(self) -> bool:
-        """Move the log into the main file, as far as no other process reads or writes now; whether all of it was."""
+        """Move the log into the main file unless another process uses it; return whether all of it was moved."""
         self._connection.execute("PRAGMA busy_timeout = 0")
         try:
             busy, *_ = self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
@@ -213,7 +213,7 @@ class Database:
         return not busy
 
     def close(self) -> None:
-        """Put what was written into the main file, and let it go."""
+        """Move the log into the main file, and close both connections."""
         with self._lock, self._read_lock:
             self._reader.close()
             with suppress(sqlite3.Error):  # damaged, or closed already
@@ -221,18 +221,18 @@ class Database:
             self._connection.close()
 
     def __enter__(self) -> Self:
-        """Nothing more to do."""
+        """Return the database itself."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close."""
+        """Close the database."""
         self.close()
 
 
 def _statements(script: str) -> Iterator[str]:
-    """The statements of a script one by one: `executescript` would end our transaction."""
+    """Yield the statements of a script one by one; `executescript` would end the transaction."""
     statement = ""
     for piece in re.findall(r"[^;]*;|[^;]+$", script):
         statement += piece

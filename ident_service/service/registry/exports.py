@@ -1,4 +1,4 @@
-"""Exports by id: what jobs made for somebody to fetch, each a folder below the state folder; a file by its name in it.
+"""Find exports by id: files that jobs made for download, each export a folder below the state folder.
 
 An id counts if a job that has ended made it, a name if the folder has such a file of its own: neither is ever joined to
 a path before.
@@ -12,11 +12,11 @@ from ident_service.errors import UnknownId
 from ident_service.service.registry.database import Database, Row
 from ident_service.service.registry.runs import EXPORTS, TAKEN_AWAY
 
-_ENDED = ("done", "refused")  # a payload that is nothing has files, too
+_ENDED = ("done", "refused")  # a payload job that found no load has files, too
 
 
 def known_export(db: Database, export: str) -> Row:
-    """The job that made the export of this id.
+    """Return the job that made the export of this id.
 
     Raises:
         UnknownId: there is none, or it made nothing.
@@ -33,7 +33,7 @@ def known_export(db: Database, export: str) -> Row:
 
 
 def export_files(db: Database, state: Path, export: str) -> dict[str, int]:
-    """Name to size [bytes] of its files.
+    """Return the files of an export, name to size [bytes].
 
     Raises:
         UnknownId: no such export.
@@ -44,7 +44,7 @@ def export_files(db: Database, state: Path, export: str) -> dict[str, int]:
 
 
 def export_file(db: Database, state: Path, export: str, name: str) -> Path:
-    """One of its files.
+    """Return the path of one file of an export.
 
     Raises:
         UnknownId: no such export, or no such file in it.

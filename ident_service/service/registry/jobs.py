@@ -1,4 +1,4 @@
-"""Jobs by id: what was asked, by whom, and what became of it; the queue is their order.
+"""Store jobs by id: the request, who made it, the outcome; their numbers are the order of the queue.
 
 | state | what it means |
 |---|---|
@@ -38,7 +38,7 @@ def add_job(
     motion: bool,
     run: str | None,
 ) -> Row:
-    """Queue a job."""
+    """Enter a queued job."""
     db.write(
         "INSERT INTO jobs (id, kind, arm, state, motion, request, words, run, created, created_by) "
         "VALUES (?, ?, ?, 'queued', ?, ?, ?, ?, ?, ?)",
@@ -48,7 +48,7 @@ def add_job(
 
 
 def known_job(db: Database, job: str) -> Row:
-    """The job of this id.
+    """Return the job of this id.
 
     Raises:
         UnknownId: there is none.
@@ -67,7 +67,7 @@ def jobs(
     before: int | None = None,
     most: int = 100,
 ) -> list[Row]:
-    """Jobs in some states, of an arm if one is named, the newest first."""
+    """Return jobs in some states, of an arm if one is named, the newest first."""
     marks = ", ".join("?" * len(states))
     rows = db.rows(
         f"SELECT * FROM jobs WHERE state IN ({marks}) AND (? IS NULL OR arm = ?) AND number < ? "  # noqa: S608 - marks
@@ -78,12 +78,12 @@ def jobs(
 
 
 def queue(db: Database) -> list[Row]:
-    """What waits, the earliest first."""
+    """Return the queued jobs, the earliest first."""
     return [_read(row) for row in db.rows("SELECT * FROM jobs WHERE state = 'queued' ORDER BY number")]
 
 
 def started(db: Database, job: str, process: str) -> bool:
-    """A queued job runs now; False where it does not wait any more."""
+    """Mark a queued job as running; False where it is not queued any more."""
     return bool(
         db.write(
             "UPDATE jobs SET state = 'running', started = ?, process = ? WHERE id = ? AND state = 'queued'",
@@ -93,7 +93,7 @@ def started(db: Database, job: str, process: str) -> bool:
 
 
 def ended(db: Database, job: str, state: str, detail: str, exit_code: int | None = None) -> bool:
-    """A job has ended; False where that is known already."""
+    """Mark a job as ended; False where it is marked already."""
     return bool(
         db.write(
             "UPDATE jobs SET state = ?, detail = ?, exit_code = ?, ended = ? "
@@ -104,18 +104,18 @@ def ended(db: Database, job: str, state: str, detail: str, exit_code: int | None
 
 
 def explain(db: Database, job: str, detail: str) -> None:
-    """Say more about a job that has ended."""
+    """Replace the detail of a job that has ended."""
     db.write("UPDATE jobs SET detail = ? WHERE id = ?", detail, job)
 
 
 def enter_key(db: Database, who: str, key: str, request: str, job: str) -> None:
-    """Remember for a day that a request with an idempotency key made a job.
+    """Store for a day that a request with an idempotency key made a job.
 
     Args:
         db: the registry.
         who: name of the token.
         key: of the request; each token has its own.
-        request: SHA-256 of what was asked.
+        request: SHA-256 of the request's content.
         job: id.
 
     Raises:
@@ -126,7 +126,7 @@ def enter_key(db: Database, who: str, key: str, request: str, job: str) -> None:
 
 
 def job_of_key(db: Database, who: str, key: str, request: str) -> Row | None:
-    """Find the job that a request with an idempotency key has made within a day.
+    """Return the job that a request with an idempotency key has made within a day, or None.
 
     Raises:
         AlreadyThere: the key was used to ask for something else.
@@ -143,7 +143,7 @@ def job_of_key(db: Database, who: str, key: str, request: str) -> Row | None:
 
 
 def typical_seconds(db: Database, kind: str, arm: str | None) -> float | None:
-    """The median duration of the last jobs of a kind that came to their end; None before there was one."""
+    """Return the median duration of the last completed jobs of a kind [s]; None before there was one."""
     rows = db.rows(
         "SELECT ended - started AS seconds FROM jobs WHERE kind = ? AND arm IS ? AND state IN ('done', 'refused') "
         "ORDER BY number DESC LIMIT 9",

@@ -1,4 +1,4 @@
-"""The tables, as numbered steps: `PRAGMA user_version` says how many a database has seen.
+"""Define the tables in numbered migrations: `PRAGMA user_version` says how many a database has seen.
 
 A step that has been released is never changed; a new one is appended. Times are seconds since 1970 in UTC.
 """

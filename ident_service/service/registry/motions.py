@@ -1,4 +1,4 @@
-"""Motions by id: designed here, or uploaded; each is one `motion.json` in a folder below the state folder."""
+"""Store motions by id, designed here or uploaded; each is one `motion.json` in a folder below the state folder."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ MOTION_FILE: Final = "motion.json"
 
 
 def new_id(arm: str) -> str:
-    """An id that nothing has: when, for which arm, and some chance."""
+    """Return a new id: time, arm, and random digits."""
     return f"{datetime.now(UTC).strftime('%Y%m%dT%H%M%SZ')}-{arm}-{secrets.token_hex(3)}"
 
 
 def index_motion(db: Database, state: Path, motion: str, arm: str, by: str) -> None:
-    """Enter a motion that was designed for an arm into its folder.
+    """Enter the motion that is in its folder in the registry.
 
     Raises:
         UsageError: it is not one.
@@ -66,7 +66,7 @@ def add_motion(db: Database, state: Path, arm: str, text: str, by: str, joints: 
 
 
 def known_motion(db: Database, motion: str) -> Row:
-    """The motion of this id.
+    """Return the motion of this id.
 
     Raises:
         UnknownId: there is none.
@@ -78,7 +78,7 @@ def known_motion(db: Database, motion: str) -> Row:
 
 
 def motions(db: Database, arm: str | None = None, *, before: str | None = None, most: int = 500) -> list[Row]:
-    """Motions, or those of an arm, the newest first, from the one after the id `before`; raises as `known_motion`."""
+    """Return motions, or those of an arm, the newest first, from the one after the id `before`; as `known_motion`."""
     at = None if before is None else known_motion(db, before)["added"]
     return db.rows(
         "SELECT * FROM motions WHERE (?1 IS NULL OR arm = ?1) AND (?2 IS NULL OR added < ?2 OR added = ?2 AND id > ?3) "
@@ -88,5 +88,5 @@ def motions(db: Database, arm: str | None = None, *, before: str | None = None, 
 
 
 def motion_path(db: Database, state: Path, motion: str) -> Path:
-    """Its file; by the id that the registry has, never by a word from outside."""
+    """Return the file of a motion, from the id in the registry, never from a word of the request."""
     return state / MOTIONS / str(known_motion(db, motion)["id"]) / MOTION_FILE

@@ -1,4 +1,4 @@
-"""Runs by id, which is the name of their folder: what each holds, how it ended, and the recordings in it.
+"""Store runs by id, the name of their folder: what each holds, how it ended, and its recordings.
 
 The folder is the truth: rows are made from its manifest, and can be made again.
 """
@@ -18,9 +18,9 @@ from ident_service.service.registry.database import Database, Row
 
 RUNS, REPORTS, EXPORTS = "runs", "reports", "exports"
 TAKEN_AWAY: Final = frozenset({"export", "figures", "payload", "correct"})
-"""Kinds of jobs whose files are made for somebody to fetch: a folder of its own below `EXPORTS`."""
+"""Kinds of jobs that make files for download, in a folder of their own below `EXPORTS`."""
 UPLOAD, COLUMNS = "upload.json", "columns.yaml"
-"""Files of a run that is an uploaded recording: what was announced, and how its columns are laid out."""
+"""Files of a run that is an uploaded recording: its announcement, and the layout of its columns."""
 KILLED: Final = "killed"
 _ARM, _PARAMETERS, _SCORE = "arm.json", "parameters.json", "score.json"
 _MOST_BYTES = 64 * 2**20
@@ -28,14 +28,14 @@ _RECORDING = ".mcap"
 
 
 def index_run(db: Database, state: Path, run: str) -> Row:
-    """Enter a run's folder, or enter it again.
+    """Enter a run's folder in the registry, or enter it again.
 
     Raises:
         UsageError: no such folder, or no arm in it.
         ParameterError: its files are not what its manifest names.
     """
     folder = state / RUNS / run
-    # A run that was killed has no manifest; its folder says so by not having one.
+    # A run without a manifest was killed.
     whole = (folder / MANIFEST).is_file()
     gone = frozenset(row["name"] for row in db.rows("SELECT name FROM recordings WHERE run = ? AND deleted > 0", run))
     files = dict(verified_files(folder, but=gone)) if whole else {}
@@ -77,7 +77,7 @@ def index_run(db: Database, state: Path, run: str) -> Row:
 
 
 def rebuild_runs(db: Database, state: Path) -> list[str]:
-    """Enter every run folder that the registry does not know; what cannot be read is told, in words."""
+    """Enter every run folder that the registry does not know; return the folders that cannot be read, and why."""
     known = {row["id"] for row in db.rows("SELECT id FROM runs")}
     busy = {row["run"] for row in db.rows("SELECT run FROM jobs WHERE state = 'running' AND run IS NOT NULL")}
     told = []
@@ -93,7 +93,7 @@ def rebuild_runs(db: Database, state: Path) -> list[str]:
 
 
 def known_run(db: Database, run: str) -> Row:
-    """The run of this id.
+    """Return the run of this id.
 
     Raises:
         UnknownId: there is none.
@@ -105,7 +105,7 @@ def known_run(db: Database, run: str) -> Row:
 
 
 def runs(db: Database, arm: str | None = None, *, before: str | None = None, most: int = 100) -> list[Row]:
-    """Runs, or those of an arm, the newest first, from the one after the id `before`; raises as `known_run`."""
+    """Return runs, or those of an arm, the newest first, from the one after the id `before`; raises as `known_run`."""
     at = None if before is None else known_run(db, before)["created"]
     return db.rows(
         "SELECT * FROM runs WHERE (?1 IS NULL OR arm = ?1) "
@@ -115,7 +115,7 @@ def runs(db: Database, arm: str | None = None, *, before: str | None = None, mos
 
 
 def recordings(db: Database, run: str) -> list[Row]:
-    """The recordings of a run."""
+    """Return the recordings of a run."""
     return db.rows("SELECT name, sha256, bytes, deleted FROM recordings WHERE run = ? ORDER BY name", run)
 
 
@@ -130,17 +130,17 @@ def recording_name(db: Database, run: str) -> str:
 
 
 def parameter_set(db: Database, run: str) -> Row | None:
-    """What is known of the parameters that a run holds."""
+    """Return the entry of the parameters that a run holds; None where it holds none."""
     return db.row("SELECT * FROM parameter_sets WHERE run = ?", run)
 
 
 def run_folder(db: Database, state: Path, run: str) -> Path:
-    """Its folder; by the id that the registry has, never by a word from outside."""
+    """Return the folder of a run, from the id in the registry, never from a word of the request."""
     return state / RUNS / str(known_run(db, run)["id"])
 
 
 def run_files(db: Database, state: Path, run: str) -> dict[str, str]:
-    """Name to SHA-256 of the files that its manifest names and that are there."""
+    """Return name and SHA-256 of the files of a run that its manifest names and that exist."""
     folder = run_folder(db, state, run)
     if not (folder / MANIFEST).is_file():
         return {}
@@ -148,7 +148,7 @@ def run_files(db: Database, state: Path, run: str) -> dict[str, str]:
 
 
 def run_file(db: Database, state: Path, run: str, name: str) -> Path:
-    """A file that the manifest of a run names.
+    """Return the path of a file that the manifest of a run names.
 
     Raises:
         UnknownId: no such run, or no such file in it.
@@ -198,13 +198,13 @@ def _ending(files: dict[str, str], ended: dict[str, Any] | None) -> str:
 
 
 def _driven(arm: dict[str, Any], ended: dict[str, Any] | None) -> float | None:
-    """How long the loop drove the arm [s]; None where that was not written down."""
+    """Return how long the control loop drove the arm [s]; None where that is not recorded."""
     cycles, rate = (ended or {}).get("cycles"), arm.get("control", {}).get("rate")
     return cycles / rate if isinstance(cycles, int | float) and isinstance(rate, int | float) and rate > 0 else None
 
 
 def operating_seconds(db: Database, arm: str) -> float:
-    """How long runs of this registry drove an arm, all together [s]; what drives it otherwise is not known here."""
+    """Return how long the runs of this registry drove an arm in total [s]; other use is not counted."""
     row = db.row("SELECT TOTAL(seconds) AS seconds FROM runs WHERE arm = ?", arm)
     return float(row["seconds"]) if row is not None else 0.0
 

@@ -1,4 +1,4 @@
-"""Access: tokens of 256 random bits with a name and a role; only their SHA-256 is kept.
+"""Keep access tokens of 256 random bits with a name and a role; only their SHA-256 is stored.
 
 A random token of that length needs no slow hash, and looking up its digest tells nobody anything about it.
 """
@@ -29,7 +29,7 @@ _RESERVED = frozenset({"service", "terminal", "anybody"})
 
 @dataclass(frozen=True)
 class Access:
-    """Who asks.
+    """Identity of a caller.
 
     Attributes:
         name: of the token.
@@ -41,7 +41,7 @@ class Access:
 
 
 def add_token(db: Database, name: str, role: Role, by: str) -> str:
-    """Make a token; returned here and nowhere else.
+    """Make a token and return it; it cannot be read again later.
 
     Raises:
         UsageError: the name is taken, or not one.
@@ -58,7 +58,7 @@ def add_token(db: Database, name: str, role: Role, by: str) -> str:
 
 
 def revoke_token(db: Database, name: str, by: str) -> None:
-    """Let a token count no more.
+    """Revoke a token.
 
     Raises:
         UnknownId: no such token that counts.
@@ -70,27 +70,27 @@ def revoke_token(db: Database, name: str, by: str) -> None:
 
 
 def tokens(db: Database) -> list[Row]:
-    """All tokens that ever were, without their digests."""
+    """Return all tokens that were ever made, without their digests."""
     return db.rows("SELECT name, role, created, revoked FROM tokens ORDER BY created, name")
 
 
 def digests(db: Database) -> dict[str, Access]:
-    """Read who may ask, by the digest of their token."""
+    """Return the valid tokens' names and roles, by the digest of the token."""
     rows = db.rows("SELECT name, role, sha256 FROM tokens WHERE revoked IS NULL")
     return {row["sha256"]: Access(row["name"], row["role"]) for row in rows}
 
 
 def access(db: Database, secret: str) -> Access | None:
-    """Whose token this is, None if nobody's."""
+    """Return whose token this is; None if nobody's."""
     return digests(db).get(digest(secret))
 
 
 def begin_session(db: Database, session: str, secret: str, until: float, most: int) -> None:
-    """Keep a session of the page over restarts of the service; beyond `most`, the ones that end first are forgotten.
+    """Store a session of the page, beyond restarts of the service; over `most`, those that end first are deleted.
 
     Args:
         db: the registry.
-        session: its word, of which the digest is kept.
+        session: random word of the session's cookie, of which only the digest is stored.
         secret: the token that it was exchanged for; it ends with that, too.
         until: when it ends [s since 1970 in UTC].
         most: how many there may be.
@@ -104,17 +104,17 @@ def begin_session(db: Database, session: str, secret: str, until: float, most: i
 
 
 def end_session(db: Database, session: str) -> None:
-    """Forget a session."""
+    """Delete a session."""
     db.write("DELETE FROM sessions WHERE sha256 = ?", digest(session))
 
 
 def sessions(db: Database) -> dict[str, tuple[str, float]]:
-    """Read all sessions: digest of the word to the digest of its token and its end [s since 1970 in UTC]."""
+    """Return all sessions: digest of the session's word to its token's digest and its end [s since 1970 in UTC]."""
     return {row["sha256"]: (row["token"], row["until"]) for row in db.rows("SELECT * FROM sessions")}
 
 
 def digest(secret: str) -> str:
-    """What is kept of a token."""
+    """Return the SHA-256 that is stored of a token."""
     return hashlib.sha256(secret.encode("utf-8", "surrogatepass")).hexdigest()
 
 
@@ -161,7 +161,7 @@ def revoke_first_tokens(db: Database, by: str) -> None:
 
 
 def read_token(path: Path) -> str | None:
-    """The token in a file; None without one.
+    """Return the token in a file; None without one.
 
     Raises:
         UsageError: others than its owner can read it, or it cannot be read.
