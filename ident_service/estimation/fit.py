@@ -1,4 +1,4 @@
-"""From recordings to an unconstrained fit: what has to be found before, the estimator, and its covariance.
+"""Fit unconstrained parameters to recordings: filter, delay, friction shape, torque constants, estimator, covariance.
 
 Order: the filter, the delay between the channels, the shape of the friction, the equations, the factors of the torque
 constants, the estimator. Each step looks at the recordings that are fitted to, never at those that validate.
@@ -41,7 +41,7 @@ SAME = 0.01  # of its deviation: a parameter that changes by less is as good as 
 
 @dataclass(frozen=True)
 class Prepared:
-    """Recordings turned into equations.
+    """Equations of recordings, with the nonlinear quantities that were found first.
 
     Attributes:
         model: the arm, with the friction's shape and the delay as numbers.
@@ -60,7 +60,7 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Fit:
-    """An unconstrained estimate and its doubt.
+    """Unconstrained estimate with its uncertainty.
 
     Attributes:
         fit: the least squares whose factors constrained estimates use.
@@ -95,7 +95,7 @@ def prepare(
     conditions: FeasibleSet,
     validation: Sequence[Recording] = (),
 ) -> Prepared:
-    """Find what has to be known before the equations are linear, and gather them.
+    """Find delay, friction shape and torque constants, which make the equations linear, and gather the equations.
 
     Args:
         recordings: to fit to.
@@ -142,7 +142,7 @@ def prepare(
 def _with_velocity(
     recordings: Sequence[Recording], validation: Sequence[Recording], model: ArmModel, base: BaseParameters
 ) -> tuple[ArmModel, tuple[Choice, ...]]:
-    """Choose whose velocities to use, and the filter with them.
+    """Choose between measured and differentiated velocities, and the filter with them.
 
     Our own recordings have the velocities of the loop, which lag behind the positions.
     """
@@ -173,7 +173,7 @@ def _with_velocity(
 
 
 def gather(recordings: Sequence[Recording], model: ArmModel, base: BaseParameters) -> Equations:
-    """The equations of several recordings."""
+    """Return the equations of several recordings."""
     return equations(recordings, model, base)
 
 
@@ -184,7 +184,7 @@ def unconstrained(
     base: BaseParameters,
     conditions: FeasibleSet,
 ) -> Fit:
-    """The estimate of a method, or of the one of `wls` and `huber` that predicts held-out thirds better.
+    """Return the estimate of a method, or of the one of `wls` and `huber` that predicts held-out thirds better.
 
     Raises:
         RecordingError: a recording cannot be used.
@@ -233,7 +233,7 @@ def _doubted(method: Method, fit: LeastSquares, equations: Equations, shares: Ar
 
 
 def as_good_as_the_same(fit: LeastSquares, base: BaseParameters, deviations: Array, beta: Array) -> Near | None:
-    """Give N of `central.py`: changes of the links' base parameters by less than a hundredth of their deviations.
+    """Return N of `central.py`: base-parameter changes of the links below a hundredth of their deviations.
 
     In the metric of eq. 81 a change of length 1 moves each parameter by at most its white deviation, which is no
     larger than the one that is told; so no torque changes by what could be seen. Friction does not move.

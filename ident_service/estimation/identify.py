@@ -1,4 +1,4 @@
-"""From recordings to one estimate with its doubt, and the other estimates of the paper beside it (tables 6 and 8)."""
+"""Identify one estimate with its uncertainty from recordings, and the paper's other estimates (tables 6 and 8)."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Scored:
 
 @dataclass(frozen=True)
 class Candidate:
-    """One of the paper's estimates.
+    """One of the paper's estimates, with its torque errors.
 
     Attributes:
         name: for tables.
@@ -82,7 +82,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class CustomKnowledge:
-    """Record the function of `constraints.custom` and the torque errors with and without it.
+    """Function of `constraints.custom`, and the torque errors with and without it.
 
     Attributes:
         function: that was called.
@@ -99,7 +99,7 @@ class CustomKnowledge:
 
 @dataclass(frozen=True)
 class Estimate:
-    """An identified parameter set with everything needed to doubt it.
+    """Identified parameter set with the evidence to judge it by.
 
     Attributes:
         model: the arm, with what the recordings said of its friction's shape.
@@ -174,7 +174,7 @@ class Estimate:
 
     @property
     def feasible(self) -> bool:
-        """Whether a real body could have these parameters."""
+        """Return whether a real body could have these parameters."""
         return self.margin > 0.0
 
 
@@ -363,7 +363,7 @@ def _unseen(recording: Recording, prepared: Prepared, base: BaseParameters) -> E
 
 
 def _prior(model: ArmModel, found: Fit, base: BaseParameters, conditions: FeasibleSet) -> Prior | None:
-    """What the configuration asks constrained estimates to be drawn to."""
+    """Return the prior that the configuration asks constrained estimates to be drawn to; None for none."""
     pull = model.config.identification.prior
     if pull.kind == "none":
         return None

@@ -1,4 +1,4 @@
-"""Reasons why an estimate cannot be right: data in wrong units, swapped columns, wrong signs, another arm's geometry.
+"""Find reasons why an estimate cannot be right: wrong units or signs, swapped columns, another arm's geometry.
 
 A set of parameters can be physically feasible, and its regression well conditioned, and still describe nothing: the
 recording may be in degrees, or of other joints. Each rule here compares with what any arm, or this arm by its
@@ -39,7 +39,7 @@ _SAMPLES_OF_A_JUMP = 100  # fewer say nothing about what is usual
 
 
 def reasons_against(estimate: Estimate) -> tuple[str, ...]:
-    """Say why an estimate must not be used, by its errors; empty where nothing does.
+    """Return the reasons not to use an estimate, from its errors; empty where there are none.
 
     The words name the most likely cause where the numbers tell one.
     """
@@ -48,7 +48,7 @@ def reasons_against(estimate: Estimate) -> tuple[str, ...]:
 
 
 def reasons_in_length(estimate: Estimate, seconds: float) -> tuple[str, ...]:
-    """Say why so short a motion tells too little, as that before a fault; empty where it tells enough.
+    """Return the reasons why a short motion tells too little, as one before a fault; empty where it tells enough.
 
     A short motion that leaves much unidentified predicts itself and nothing else. Where other recordings validate the
     estimate, their errors judge it.
@@ -78,7 +78,7 @@ def reasons_in_length(estimate: Estimate, seconds: float) -> tuple[str, ...]:
 
 
 def reasons_in_recording(recording: str, joints: Sequence[JointQuality], model: ArmModel) -> tuple[str, ...]:
-    """Say why a recording cannot be of this arm in SI units; empty where nothing does.
+    """Return the reasons why a recording cannot be of this arm in SI units; empty where there are none.
 
     Args:
         recording: its name, for the words.
@@ -94,7 +94,7 @@ def reasons_in_recording(recording: str, joints: Sequence[JointQuality], model: 
 
 
 def remarks_on_limits(recording: str, joints: Sequence[JointQuality], model: ArmModel) -> tuple[str, ...]:
-    """Name joints that leave their position limits by less than what makes a recording unusable.
+    """Return remarks on joints that leave their position limits by less than what makes a recording unusable.
 
     Args:
         recording: its name, for the words.
@@ -170,7 +170,7 @@ def _against_the_unconstrained(estimate: Estimate) -> Iterator[str]:
 
 
 def _mirrored(estimate: Estimate) -> str:
-    """Name the joint whose torques the conditions of a real body allow better with the other sign; none is empty."""
+    """Return the name of a joint whose torques fit the feasible set better with the other sign; else empty."""
     free, own = (estimate.candidates[place].moving.joint_relative_percent for place in (0, estimate.chosen))
     information, weights = estimate.information, estimate.fit.weights
     for joint, name in enumerate(estimate.model.chain.names):
@@ -191,7 +191,7 @@ def _mirrored(estimate: Estimate) -> str:
 
 
 def _driving_friction(estimate: Estimate, deviations: float) -> list[tuple[str, float, float]]:
-    """Find drives whose unconstrained friction adds energy: name, friction at the usual speed, its deviation.
+    """Return drives whose unconstrained friction adds energy: name, friction at the usual speed, its deviation.
 
     Coulomb, Stribeck and viscous terms explain each other's torque, so only their sum at a speed has a sign. The usual
     speed is the root mean square of the velocity, which is the viscous column's, of the rows that were fitted to.
@@ -266,7 +266,7 @@ def _of_joint(name: str, seen: JointQuality, model: ArmModel, *, revolute: bool)
 
 
 def _weight(joints: Sequence[JointQuality], model: ArmModel) -> Iterator[str]:
-    """Compare the largest torque with what could hold an arm of this size."""
+    """Yield reasons where the largest torque does not fit what could hold an arm of this size."""
     chain = model.chain
     # Where the first joint stands is not part of the arm.
     offsets = np.concatenate([chain.translation[1:], chain.link_translation])

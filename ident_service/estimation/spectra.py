@@ -36,7 +36,7 @@ _SAMPLES = 16384
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Keep the frequencies that end the motion and begin the noise of a recording.
+    """Frequencies of a recording at which its motion ends and its noise begins.
 
     Attributes:
         rate: of the samples [Hz].
@@ -50,7 +50,7 @@ class Spectrum:
 
     @property
     def cutoff(self) -> float:
-        """Cut-off [Hz] of a filter that passes the motion and stops the noise."""
+        """Return the cut-off [Hz] of a filter that passes the motion and stops the noise."""
         wanted = max(_MARGIN * self.motion, USUAL)
         return min(wanted, max(self.noise, _LEAST_MARGIN * self.motion), _HIGHEST * self.rate)
 
@@ -58,7 +58,7 @@ class Spectrum:
 def with_filter(
     recordings: Sequence[Recording], options: Identification, fmt: RecordingFormat | None = None
 ) -> Identification:
-    """Put numbers where the filter is left to be chosen; the cut-off is the largest that a recording asks for.
+    """Return the options with the filter's free settings chosen; the cut-off is the largest that a recording needs.
 
     Args:
         recordings: read once where there is something to choose.
@@ -83,7 +83,7 @@ def with_filter(
 
 
 def settled(model: ArmModel, recordings: Sequence[Recording]) -> ArmModel:
-    """Give the arm with numbers where its filter is left to be chosen.
+    """Return the arm with its filter's free settings chosen from the recordings.
 
     Raises:
         RecordingError: a recording cannot be read.
@@ -93,7 +93,7 @@ def settled(model: ArmModel, recordings: Sequence[Recording]) -> ArmModel:
 
 
 def spectrum(recording: Recording, fmt: RecordingFormat, *, measured: bool = False) -> Spectrum:
-    """Look at the spectra of a recording's positions, in windows of about 20 s.
+    """Return where motion ends and noise begins in the spectra of a recording's positions, in windows of about 20 s.
 
     Args:
         recording: to look at.
@@ -143,7 +143,7 @@ def _ends(
     difference: NDArray[np.floating],
     white: NDArray[np.floating],
 ) -> tuple[float, float]:
-    """Give the frequencies [Hz] that a joint's motion ends at and its noise matters from; `power` is of its rates."""
+    """Return the frequencies [Hz] that a joint's motion ends at and its noise matters from; `power` is of its rates."""
     flat = power / white
     high = (frequency > 0.25 / period) & (frequency < 0.475 / period)
     # The mean of an exponential distribution from its median.

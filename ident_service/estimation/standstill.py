@@ -20,7 +20,7 @@ _MOST_ROUNDS = 100
 
 
 def standstill_shares(gathered: Equations) -> Array:
-    """Find what rows near standstill are to be multiplied by, shape (joints,), at most one.
+    """Return the factors of the rows near standstill, shape (joints,), at most one.
 
     Args:
         gathered: equations with their rows near standstill apart.

@@ -1,12 +1,10 @@
-"""Tell which limits hold a motion back, and what each of them costs.
+"""Find the limits that constrain a motion, and the cost of each of them.
 
 At the best motion the criterion's gradient is balanced by those of the limits that are reached, `g + A' lambda = 0`
 with `lambda >= 0` (Karush-Kuhn-Tucker). A limit L whose share is `c = |s| / L - 1` then costs
 `lambda = -df / d(log L)`. A criterion that is the logarithm of something changes that by the factor `r^lambda` where
 the limit is r times as wide.
 That is the slope at this motion, which far away from it is no more than a guess.
-
-Boundary: looks at a motion that has been found; nothing is searched.
 """
 
 from __future__ import annotations
@@ -35,7 +33,7 @@ _GAINS = {
 
 @dataclass(frozen=True)
 class Binding:
-    """One limit that is reached.
+    """Active limit of a motion, with its multiplier.
 
     Attributes:
         limit: its name among those of `Problem`.
@@ -49,7 +47,7 @@ class Binding:
 
 
 def binding(task: Task, coefficients: Array, per_period: int) -> tuple[Binding, ...]:
-    """Return the limits that hold a motion back, the costliest first.
+    """Return the limits that constrain a motion, the costliest first.
 
     Args:
         task: what was searched.
@@ -84,7 +82,7 @@ def binding(task: Task, coefficients: Array, per_period: int) -> tuple[Binding, 
 def binding_words(
     found: Sequence[Binding], task: Task, limits: MotionLimits, velocity: Array, lengths: Sequence[str]
 ) -> list[str]:
-    """Say what holds a motion back and what it costs.
+    """Describe the active limits of a motion and their cost, one sentence each.
 
     Args:
         found: the limits.

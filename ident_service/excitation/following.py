@@ -1,4 +1,4 @@
-"""Friction in the control law, and how far the arm falls behind by what the law does not know of it.
+"""Predict the following error that friction causes beyond the control law's friction feed-forward.
 
 Drives are expected to take `f(w) = F_c s(w) + F_v w` at their velocity w. The law adds the share s_f of it, for the
 velocity of the reference (`FrictionFeedforward`). What is left, `d = (b - s_f) f` where friction is b times what is
@@ -6,7 +6,7 @@ expected, computed torque (eq. 76) answers with the error `e = K_p^-1 M(q)^-1 d`
 inertia stands behind a joint, as behind the upper arm's rotation when the elbow is straight, little friction moves it
 far. Static, so a forecast and no bound; the guard keeps the limit itself.
 
-Boundary: forecasts; friction is the prior's where it has some, else a guess from the torque limits.
+Friction is the prior's where it has some, else a guess from the torque limits.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ DOUBT = (0.6, 1.4)
 
 
 def dry_friction(model: ArmModel, delta: Array) -> tuple[Array, Array]:
-    """The most that dry friction can take, of every drive and of every joint [N m or N], each of shape (joints,)."""
+    """Return the largest dry friction of every drive and of every joint [N m or N], each of shape (joints,)."""
     drives = np.abs(model.layout.term_values("coulomb", delta)) + np.abs(model.layout.term_values("stribeck", delta))
     return drives, drives @ np.abs(model.chain.coupling)
 
 
 def unknown_friction(friction: ExpectedFriction, share: float) -> ExpectedFriction:
-    """Return the most of the expected friction that a feed-forward of a share leaves, either way, within `DOUBT`."""
+    """Return the most of the expected friction that a feed-forward of `share` leaves, either way, within `DOUBT`."""
     left = max(DOUBT[1] - share, share - DOUBT[0])
     return ExpectedFriction(left * friction.coulomb, left * friction.viscous, 0.0 * friction.offset)
 
 
 class FollowingError:
-    """The forecast at many states, with derivatives of whatever is computed from it."""
+    """Predicted following error at many states, with derivatives of functions of it."""
 
     def __init__(self, model: ArmModel, limits: MotionLimits, friction: ExpectedFriction, creep: Array) -> None:
         """Take the prior model.
@@ -67,7 +67,7 @@ class FollowingError:
         self._slope = np.zeros((0, len(creep)))
 
     def run(self, position: Array, velocity: Array) -> Array:
-        """Forecast error [rad or m], shape (samples, joints), at states of shape (samples, joints)."""
+        """Return the predicted error [rad or m], shape (samples, joints), at states of shape (samples, joints)."""
         rate = velocity @ self._coupling.T
         turned = np.tanh(rate / self._creep)
         self._slope = self._friction.viscous + self._friction.coulomb * (1.0 - turned**2) / self._creep
@@ -75,13 +75,13 @@ class FollowingError:
         return self._response.run(position, torque) / self._kp
 
     def pull(self, seeds: Array) -> tuple[Array, Array]:
-        """The gradient of `sum(seeds * run(...))` over position and velocity, each of shape (samples, joints)."""
+        """Return the gradient of `sum(seeds * run(...))` over position and velocity, each (samples, joints)."""
         by_position, by_torque = self._response.pull(seeds / self._kp)
         return by_position, ((by_torque @ self._coupling.T) * self._slope) @ self._coupling
 
 
 def rate_of_change(times: Array) -> scipy.sparse.csr_array:
-    """The matrix that takes values at `times` [s] to their time derivatives, by differences of neighbours.
+    """Return the matrix that takes values at `times` [s] to time derivatives, by differences of neighbours.
 
     Neighbours are samples of one stretch; where times jump or turn back, another stretch begins.
     """
@@ -106,7 +106,7 @@ def rate_of_change(times: Array) -> scipy.sparse.csr_array:
 def forecast(
     model: ArmModel, limits: MotionLimits, friction: ExpectedFriction, position: Array, velocity: Array
 ) -> Array:
-    """The largest forecast error of every joint over samples of a motion [rad or m], shape (joints,).
+    """Return the largest predicted following error of every joint over a motion [rad or m], shape (joints,).
 
     Args:
         model: of the arm; its description says which share of the friction is fed forward.

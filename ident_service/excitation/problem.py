@@ -1,4 +1,4 @@
-"""A search's objective and limits at the samples of a time grid, with their derivatives.
+"""Compute a search's objective and limits at the samples of a time grid, with their derivatives.
 
 Variables are the coefficients of the basis, scaled to about one. Every limit is a number that must not be positive, in
 shares of the limit. They enter the objective as an augmented Lagrangian (Hestenes 1969, Powell 1969),
@@ -47,20 +47,20 @@ LINEAR = ("position", "velocity", "acceleration", "jerk")  # limits that are lin
 
 @dataclass
 class Multipliers:
-    """State of the augmented Lagrangian: one multiplier per limit and sample, and the weight of what is violated."""
+    """State of the augmented Lagrangian: one multiplier per limit and sample, and the weight of violations."""
 
     values: Limits
     weight: float
 
     def tightened(self, found: Limits, factor: float) -> Multipliers:
-        """The next state after a minimisation that ended with `found`."""
+        """Return the next state after a minimisation that ended with `found`."""
         values = {name: np.maximum(0.0, self.values[name] + self.weight * c) for name, c in found.items()}
         return Multipliers(values, self.weight * factor)
 
 
 @dataclass(frozen=True)
 class State:
-    """Everything at one point.
+    """Criterion and limits at one point of the search.
 
     Attributes:
         coefficients: of the basis, shape (joints, size).
@@ -74,15 +74,15 @@ class State:
 
     @property
     def worst(self) -> float:
-        """The largest share by which a limit is exceeded; not positive where all are kept."""
+        """Return the largest share by which a limit is exceeded; not positive where all are kept."""
         return max(float(values.max()) for values in self.limits.values() if values.size)
 
 
 class Problem:
-    """One search on one time grid."""
+    """Optimisation problem of one search on one time grid."""
 
     def __init__(self, task: Task, per_period: int) -> None:
-        """Lay the grid.
+        """Prepare the time grid.
 
         Args:
             task: what to search.
@@ -122,7 +122,7 @@ class Problem:
         self.names += ["clearance"] * bool(self._capsules.pairs)
 
     def _torque_parameters(self) -> None:
-        """The model's base parameters without dry friction, which is taken off the limits instead: it has no slope."""
+        """Compute base parameters without dry friction, which has no slope and is taken off the limits instead."""
         model = self.task.model
         self._beta = np.zeros(len(self.task.columns))
         self._torque_limit = self.task.limits.torque.copy()
@@ -143,25 +143,25 @@ class Problem:
 
     @property
     def size(self) -> int:
-        """Number of variables."""
+        """Return the number of variables."""
         return self._scale.size
 
     def coefficients(self, x: Array) -> Array:
-        """Coefficients of the basis, shape (joints, size), of variables of shape (size,)."""
+        """Return the coefficients of the basis, shape (joints, size), of variables of shape (size,)."""
         return np.asarray(self._offset + x.reshape(self._scale.shape) * self._scale)
 
     def variables(self, coefficients: Array) -> Array:
-        """The inverse of `coefficients`."""
+        """Return the variables of coefficients, the inverse of `coefficients`."""
         return np.asarray(((coefficients - self._offset) / self._scale).ravel())
 
     def no_multipliers(self, weight: float) -> Multipliers:
-        """Where an augmented Lagrangian begins."""
+        """Return the initial state of an augmented Lagrangian, all multipliers zero."""
         samples = len(self._weights)
         shapes = {"power": (samples, 1), "clearance": (samples + _LINE, len(self._capsules.pairs))}
         return Multipliers({name: np.zeros(shapes.get(name, (samples, self._n))) for name in self.names}, weight)
 
     def linear_peaks(self, x: Array, share: float) -> set[Peak]:
-        """Return where the limits that are linear in x are used most: local peaks above a share, and their neighbours.
+        """Return the local peaks, above a share, of the limits that are linear in x, and their neighbours.
 
         Args:
             x: variables, shape (size,).
@@ -190,18 +190,18 @@ class Problem:
         return A.reshape(len(peaks), self.size), b
 
     def _linear(self) -> tuple[tuple[Array, Array, Array], ...]:
-        """Maps of position and its derivatives, with the middle and the size of what each may be, shape (joints,)."""
+        """Return maps of position and its derivatives, with middle and size of each allowed range, shape (joints,)."""
         limits, zero = self.task.limits, np.zeros(self._n)
         middles = (self._middle, zero, zero, zero)
         sizes = (self._half, limits.velocity, limits.acceleration, limits.jerk)
         return tuple(zip(self._maps, middles, sizes, strict=True))
 
     def state(self, x: Array, sharpness: float) -> State:
-        """Criterion and limits at x."""
+        """Return criterion and limits at x."""
         return self._evaluate(x, sharpness, None)[0]
 
     def value_and_gradient(self, x: Array, sharpness: float, multipliers: Multipliers) -> tuple[float, Array]:
-        """The augmented Lagrangian and its gradient, shape (size,)."""
+        """Return the augmented Lagrangian and its gradient, shape (size,)."""
         _, value, gradient = self._evaluate(x, sharpness, multipliers)
         return value, gradient
 
@@ -292,7 +292,10 @@ class Problem:
         return state, value.value + penalty, (gradient * self._scale).ravel()
 
     def _power(self, torque: Array, velocity: Array) -> tuple[Array, tuple[Array, Array]]:
-        """Share of the supply's budget beyond it, shape (samples, 1), and its slopes over torque and velocity."""
+        """Return the power beyond the supply's budget, in shares of it, (samples, 1), and its slopes.
+
+        The slopes are over torque and velocity.
+        """
         supply = self._supply
         if supply is None:
             raise AssertionError("no supply")

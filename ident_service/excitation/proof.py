@@ -1,4 +1,4 @@
-"""What is proven of a motion for all time, and the largest motion of a family that it can be proven of."""
+"""Prove that a motion keeps all limits for all time, and find the largest motion of a family that can be proven."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def proof_of(
     collision: CollisionModel,
     torque_margin: float | None = None,
 ) -> Proof:
-    """Bound everything a motion asks, and simulate the arm where its reference is proven to keep every limit.
+    """Bound a motion's peaks, and simulate the arm where its reference is proven to keep every limit.
 
     Args:
         path: the motion.
@@ -78,7 +78,7 @@ def proof_of(
 
 
 def _ways(path: FourierPath | PosturePath, limits: MotionLimits) -> PosturePath:
-    """Straight ways from home to where a motion begins, back, and to where it ends, at half of the limits."""
+    """Return straight segments from home to a motion's beginning, back, and to its end, at half of the limits."""
     points = np.array([limits.home, path.at(0.0)[0], limits.home, path.at(path.duration)[0]])
     far = np.abs(np.diff(points, axis=0))
     needed = [
@@ -89,7 +89,7 @@ def _ways(path: FourierPath | PosturePath, limits: MotionLimits) -> PosturePath:
 
 
 def objections(proof: Proof, model: ArmModel, limits: MotionLimits) -> list[str]:
-    """Every limit that is not proven to be kept, in words; empty when all are."""
+    """Return every limit that is not proven to be kept, in words; empty when all are."""
     found = proof.demands.violations(model.chain.names, limits, model.config.supply)
     forces = proof.ways.forces_beyond(model.chain.names, limits, model.config.supply)
     found += [f"at home, or on the way from it or back: {one}" for one in forces]
@@ -111,7 +111,7 @@ def largest_proven(
     safe: Array,
     proven: Callable[[Array], Proof | None],
 ) -> tuple[Array, Proof] | None:
-    """The largest motion between standing still and the given one of which everything can be proven.
+    """Return the largest motion between standing still and the given one that can be proven to keep all limits.
 
     Sizes are tried ever more coarsely until one can be proven, then halfway back. That takes a few proofs, of seconds
     each, where one size after another would take twenty.

@@ -1,4 +1,4 @@
-"""Friction as it is expected before it is identified, and the share of it that the control law feeds forward.
+"""Predict friction before it is identified, and compute the control law's friction feed-forward.
 
 Drives are expected to take `f(w) = F_c s(w) + F_v w + F_o` at their velocity w: the prior's friction, or a guess in
 shares of the torque limits. Where it is felt by joints, `C^T f(C dq)`.
@@ -24,7 +24,7 @@ _TURNING = 500.0  # N m/s or N/s
 
 @dataclass(frozen=True)
 class ExpectedFriction:
-    """Friction of the drives.
+    """Expected friction of the drives.
 
     Attributes:
         coulomb: [N m or N], shape (joints,).
@@ -38,7 +38,7 @@ class ExpectedFriction:
 
 
 def expected_friction(model: ArmModel, limits: MotionLimits, guess: tuple[float, float]) -> ExpectedFriction:
-    """The prior's friction, or, of drives of which it has none, the guess.
+    """Return the prior's friction, or, for drives of which it has none, the guess.
 
     Args:
         model: of the arm.
@@ -54,7 +54,7 @@ def expected_friction(model: ArmModel, limits: MotionLimits, guess: tuple[float,
 
 
 class FrictionFeedforward:
-    """Friction that the control law adds for the velocity of the reference.
+    """Friction torque that the control law adds for the velocity of the reference.
 
     It depends on the reference alone, so that it closes no loop: it can neither chatter on the noise of a measured
     velocity nor drive a limit cycle, and where the reference stands it is the drives' offset.
@@ -65,7 +65,7 @@ class FrictionFeedforward:
     """
 
     def __init__(self, friction: ExpectedFriction, share: float, chain: Chain, limits: MotionLimits) -> None:
-        """Take what is expected.
+        """Store the expected friction and the share of it to add.
 
         Args:
             friction: of the drives.
@@ -81,7 +81,7 @@ class FrictionFeedforward:
         self._turns = 1.0 / over
 
     def torque(self, velocity: Array) -> Array:
-        """Torque to add [N m or N] for a reference's velocity [rad/s or m/s], each of shape (..., joints)."""
+        """Return the torque to add [N m or N] for a reference's velocity [rad/s or m/s], each (..., joints)."""
         rate = velocity @ self._coupling.T
         felt = self._coulomb * np.tanh(self._turns * rate) + self._viscous * rate + self.friction.offset
         return np.asarray(felt @ self._coupling)

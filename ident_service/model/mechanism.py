@@ -1,4 +1,4 @@
-"""A mechanism as a URDF or MJCF file describes it: the one door to the parsers that are written in C++.
+"""Read a mechanism from a URDF or MJCF file, guarding the parsers that are written in C++.
 
 Files come from strangers, and those parsers recurse: thousands of links in one another overflow the stack, and a small
 MJCF with a name twice damages the heap (decision 0052). So expat first counts what a file holds, in one pass that keeps
@@ -40,7 +40,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Mechanism:
-    """The joints of a file in pinocchio's order, fixed ones merged into their parents; arrays are read-only.
+    """Joints of a file in pinocchio's order, fixed ones merged into their parents; arrays are read-only.
 
     Attributes:
         names: of the joints.
@@ -105,7 +105,7 @@ def _read(file: TextFile, kind: Kind, part: str | None, own: bool) -> Mechanism:
 
 
 def count_mechanism(file: TextFile, kind: Kind) -> None:
-    """Refuse a file that its parser should not see.
+    """Refuse a file that could break its parser, by its size, elements and links.
 
     Raises:
         ModelError: not XML, too large, too many or too deeply nested elements or links, two joints that carry one
@@ -127,7 +127,7 @@ def count_mechanism(file: TextFile, kind: Kind) -> None:
 
 
 class _Counter:
-    """Count elements, links and how deep they stand in one another."""
+    """Counter of elements, links and their depth of nesting."""
 
     def __init__(self, name: str, kind: Kind) -> None:
         self._name, self._urdf = name, kind == "urdf"

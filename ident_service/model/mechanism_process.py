@@ -1,4 +1,4 @@
-"""Read a mechanism with pinocchio, as JSON values; as a program: an MJCF whose path it is given, within limits.
+"""Read a mechanism with pinocchio, as JSON values; as a program, read the MJCF at a given path within limits.
 
 `python -m ident_service.model.mechanism_process FILE` prints one JSON object. `error` in it says why there is no other.
 """
@@ -93,7 +93,7 @@ def _document(
 
 
 def main(words: list[str]) -> int:
-    """Read one file within the limits."""
+    """Read one MJCF file within the limits of memory and time, and print it as JSON."""
     return answer_within(MOST_MEMORY, MOST_SECONDS, lambda: mjcf_document(words[0], words[1] if words[1:] else None))
 
 

@@ -1,8 +1,7 @@
 """A small SVG pencil: canvas, axes, round numbers, and lines thinned to what a pixel shows.
 
 A drawing is one self-contained text: no script, no font, no identifier that could clash inside a larger page. What the
-kinds of shape look like is in `drawing_style.py`. Boundary: numbers in, text out; what is drawn is the figures'
-business (`motion_figures.py`, `posture_figure.py`).
+kinds of shape look like is in `drawing_style.py`.
 """
 
 from __future__ import annotations

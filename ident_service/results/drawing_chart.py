@@ -1,7 +1,4 @@
-"""Charts: a frame with round numbers around a range of two quantities, straight or in powers of ten.
-
-Boundary: numbers in, shapes on a canvas out; what is charted is the report's business.
-"""
+"""Charts: a frame with round numbers around a range of two quantities, straight or in powers of ten."""
 
 from __future__ import annotations
 

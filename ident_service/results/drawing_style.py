@@ -1,7 +1,6 @@
 """What the kinds of shape look like, in light and in dark: one style sheet that travels inside every drawing.
 
 Colours follow Okabe and Ito, "Color Universal Design" (2008), so that no meaning hangs on telling red from green.
-Boundary: names of kinds to CSS.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """The manifest of a folder: name and SHA-256 of every file in it.
 
-Nothing is believed of a folder that is read before every file has the hash that its manifest names. Boundary: files and
-hashes; what the files mean is `run_folder.py`.
+Nothing is believed of a folder that is read before every file has the hash that its manifest names.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """What a motion asks of every joint over time, drawn against the joint's limits.
 
 One row per joint, one column per quantity. Every panel reaches from limit to limit, so that equal heights are equal
-shares of what is allowed and a joint close to its limits is seen at once. Boundary: arrays in, SVG text out; the
-pencil is `drawing.py`.
+shares of what is allowed and a joint close to its limits is seen at once.
 """
 
 from __future__ import annotations

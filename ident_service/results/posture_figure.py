@@ -1,7 +1,6 @@
 """The arm along its motion as a stick figure, from the side and from above, among what it must not touch.
 
-Both views are orthographic and have the same scale, so lengths can be compared between them. Boundary: points in, SVG
-text out; where links are and how close they come to anything is computed elsewhere, the pencil is `drawing.py`.
+Both views are orthographic and have the same scale, so lengths can be compared between them.
 """
 
 from __future__ import annotations

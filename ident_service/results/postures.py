@@ -1,6 +1,6 @@
 """An arm along a motion and what is around it, as points: what a stick figure shows.
 
-Lengths in m, points in the base frame. Boundary: data and its checks; nothing is drawn or computed here.
+Lengths in m, points in the base frame.
 """
 
 from __future__ import annotations

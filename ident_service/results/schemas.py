@@ -1,7 +1,4 @@
-"""The published JSON Schemas of the files that results are kept in; every writer and reader is held against them.
-
-Boundary: from content to its mistakes in words; what the content means is each file's own module.
-"""
+"""The published JSON Schemas of the files that results are kept in; every writer and reader is held against them."""
 
 from __future__ import annotations
 

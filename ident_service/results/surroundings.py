@@ -1,7 +1,7 @@
 """What an arm must not touch, seen along an axis of the base frame.
 
 A view is the pair of axes it shows: (0, 2) from the side, (0, 1) from above. Solids are drawn as their outline,
-half-spaces where they meet the plane of the view through the base frame's origin. Boundary: one thing in one view.
+half-spaces where they meet the plane of the view through the base frame's origin.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ _KEPT = 0.5  # share of the margin, at most the paper's, that is left where data
 
 @dataclass(frozen=True)
 class Near:
-    """How far base parameters may move.
+    """Ellipsoid that base parameters may move in.
 
     Attributes:
         origin: base parameters that they move from [SI], shape (base,).
@@ -58,13 +58,13 @@ class Near:
     moves: NDArray[np.bool_]
 
     def moved(self, beta: Array) -> Array:
-        """N x of other base parameters, shape (rows,); they are near where its length is below 1."""
+        """Return N x of other base parameters, shape (rows,); they are near where its length is below 1."""
         return np.asarray(self.metric @ (beta - self.origin))
 
 
 @dataclass(frozen=True)
 class _Matrix:
-    """One symmetric matrix of the set over its reference scale, as an affine function of the free directions.
+    """Symmetric matrix of the set over its reference scale, as an affine function of the free directions.
 
     Attributes:
         value: shape (size, size).
@@ -148,7 +148,9 @@ def central(
 
 
 def _length(changes: Array, away: Array, going: Array, decrement: float) -> float:
-    """Minimise f along Newton's step, with mu the `changes`, and |N x| that of `away` + s `going`.
+    """Return the step length s that minimises f along Newton's step.
+
+    `changes` are the mu below, and |N x| is that of `away` + s `going`.
 
     There it is -sum log(1 + s mu) - log(1 - |N x|^2) and linear in s besides, with the slope -decrement^2 at 0.
     """
@@ -175,7 +177,7 @@ def _length(changes: Array, away: Array, going: Array, decrement: float) -> floa
 
 
 def _matrices(block: Block, delta: Array, free: Array, inset: float, likely: LikelyBodies | None) -> list[_Matrix]:
-    """The block's matrix, or its numbers as matrices of one row, those that no direction changes left out."""
+    """Return the block's matrix, or its numbers as matrices of one row, without those that no direction changes."""
     values, slopes = block.F @ delta + block.f - inset * block.identity(), block.F @ free
     directions = np.flatnonzero(np.any(slopes != 0.0, axis=0))
     if block.size:
@@ -197,7 +199,7 @@ def _matrices(block: Block, delta: Array, free: Array, inset: float, likely: Lik
 
 
 def _root(block: Block, likely: LikelyBodies | None) -> Array:
-    """A root of S_b, shape (size, size)."""
+    """Return a root of S_b, shape (size, size)."""
     scales = np.diag(np.sqrt(block.references()))
     if likely is None:
         return scales

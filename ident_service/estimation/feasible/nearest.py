@@ -1,4 +1,4 @@
-"""The feasible point nearest to a target: the shape that BPFC (eq. 55) and FBPE (eq. 74) share."""
+"""Find the feasible point nearest to a target, as BPFC (eq. 55) and FBPE (eq. 74) both do."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ HARD = 45  # iterations; an easy problem takes 10 to 30
 
 @dataclass(frozen=True)
 class FeasibleEstimate:
-    """A feasible point that is optimal for something.
+    """Feasible parameters that minimise an objective.
 
     Attributes:
         beta: base parameters, shape (base,).
@@ -75,7 +75,7 @@ class FeasibleEstimate:
 
 
 def hold(problem: ConicProblem, conditions: FeasibleSet, to_delta: Array, inside: Array) -> None:
-    """Every block of the set with its inset (eq. 21, `insets`), every equality exactly; delta = to_delta x."""
+    """Add every block of the set with its inset (eq. 21, `insets`) and every equality exactly; delta = to_delta x."""
     for block, inset in zip(conditions.blocks, inside, strict=True):
         constrain(problem, block, block.times(to_delta), block.f - inset * block.identity())
     E, e = conditions.equality_rows()

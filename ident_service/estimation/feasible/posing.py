@@ -1,4 +1,4 @@
-"""What all feasibility problems share: delta from (beta, delta_d), blocks into cones, optima that lie too far out.
+"""Share the formulation of all feasibility problems: delta from (beta, delta_d), cones, bounds on far-off optima.
 
 Where nothing bounds the mass of a link that hardly shows in beta, an optimum may only be approached as masses grow
 beyond all limits, and where a solver stops on that way depends on rounding, so on the processor. Every estimate
@@ -46,12 +46,12 @@ class Lift:
         self.of_dependent[self.dependent, np.arange(len(self.dependent))] = 1.0
 
     def delta(self, beta: Array, dependent: Array) -> Array:
-        """Link parameters, shape (parameters,)."""
+        """Return the link parameters, shape (parameters,)."""
         return np.asarray(self.of_beta @ beta + self.of_dependent @ dependent)
 
 
 def insets(conditions: FeasibleSet, base: BaseParameters, beta: Array) -> Array:
-    """Give how far inside each block the estimates stay: eq. 21 for links of usual size, less for smaller ones.
+    """Return the distance that estimates keep inside each block: eq. 21 for usual links, less for smaller ones.
 
     A millionth of a kg m^2 is what the finger of a hand has. How small a link is shows in the base parameters that its
     own parameters lead.
@@ -123,7 +123,7 @@ def minimise(
     accept: Callable[[Array], bool] = lambda _: True,
     reaches: Sequence[float] = OF_TESTS,
 ) -> Solution:
-    """Solve within the first reach that allows it.
+    """Solve within the first bound on the links' tr(P) (a reach) that has an acceptable optimum.
 
     Args:
         problem: constraints gathered.
@@ -173,7 +173,7 @@ def largest(conditions: FeasibleSet, size: float) -> float:
 
 
 def traces(conditions: FeasibleSet) -> Array:
-    """Rows tr(P_k) = m + tr(L)/2 per link, shape (links, parameters)."""
+    """Return the rows tr(P_k) = m + tr(L)/2 per link, shape (links, parameters)."""
     index = {name: column for column, name in enumerate(conditions.names)}
     links = [name[1:] for name in conditions.names if name.startswith("m") and name[1:].isdigit()]
     rows = np.zeros((len(links), len(index)))
@@ -184,7 +184,7 @@ def traces(conditions: FeasibleSet) -> Array:
 
 
 def pressing(conditions: FeasibleSet, duals: Sequence[Array]) -> tuple[str, ...]:
-    """Blocks with a multiplier that counts: relaxing them would let the optimum improve; the most decisive first."""
+    """Return the names of the active constraints, those with a large multiplier, the most decisive first."""
     weights = [float(np.abs(dual).max()) for dual in duals[: len(conditions.blocks)]]
     order = sorted(range(len(weights)), key=lambda i: -weights[i])
     floor = max(MULTIPLIER, 1e-3 * max(weights))
@@ -192,7 +192,7 @@ def pressing(conditions: FeasibleSet, duals: Sequence[Array]) -> tuple[str, ...]
 
 
 def project(delta: Array, conditions: FeasibleSet) -> Array:
-    """The nearest delta that fulfils the equalities to the last digit."""
+    """Return the nearest delta that fulfils the equalities to the last digit."""
     E, e = conditions.equality_rows()
     if len(e) == 0:
         return delta
@@ -205,7 +205,7 @@ def project(delta: Array, conditions: FeasibleSet) -> Array:
 
 
 def check(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> None:
-    """Refuse what does not belong together.
+    """Refuse base parameters, grouping and feasible set that do not belong together.
 
     Raises:
         ParameterError: shapes or names do not fit.

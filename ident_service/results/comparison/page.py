@@ -1,6 +1,6 @@
 """A comparison as one self-contained HTML page: no network, no script.
 
-Boundary: a comparison in, text out. Look and words of a page are the report's.
+Look and words of the page are those of the report.
 """
 
 from __future__ import annotations

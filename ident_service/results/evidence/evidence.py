@@ -1,7 +1,7 @@
 """What a person needs to see before believing an estimate, and what `parameters.json` does not say.
 
-Boundary: data. It is gathered in `making.py`, kept in `evidence.json` (`file.py`), and drawn by the
-report. The correlation of the parameters is not here, because the parameter file has their covariance.
+The data are gathered in `making.py`, kept in `evidence.json` (`file.py`), and drawn by the report. The correlation of
+the parameters is not here, because the parameter file has their covariance.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Long series made short in one pass and constant memory: envelopes, spectra, scatter.
-
-Boundary: numbers in, numbers out; nothing here knows what a torque is.
-"""
+"""Long series made short in one pass and constant memory: envelopes, spectra, scatter."""
 
 from __future__ import annotations
 

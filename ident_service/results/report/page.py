@@ -1,7 +1,4 @@
-"""The page: one self-contained HTML file, no network, that reads without a script and zooms with one.
-
-Boundary: evidence, parameters and hashes in, text out.
-"""
+"""The page: one self-contained HTML file, no network, that reads without a script and zooms with one."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""What stands against using an estimate, each by a rule that the page states: verdict and warnings say the same.
-
-Boundary: evidence and parameters to facts and sentences; nothing is drawn.
-"""
+"""What stands against using an estimate, each by a rule that the page states: verdict and warnings say the same."""
 
 from __future__ import annotations
 
