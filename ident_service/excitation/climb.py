@@ -72,7 +72,7 @@ def random_variables(problem: Problem, rng: np.random.Generator, safe: Array) ->
 def climbed(
     problem: Problem, x: Array, safe: Array, start: int, check: Callable[[], None], *, polish: bool = False
 ) -> Candidate:
-    """Improve a motion by local search.
+    """Improve a motion by local search, and return the best candidate that keeps all limits at the samples.
 
     Args:
         problem: of the search.

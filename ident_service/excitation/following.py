@@ -48,7 +48,7 @@ class FollowingError:
     """Predicted following error at many states, with derivatives of functions of it."""
 
     def __init__(self, model: ArmModel, limits: MotionLimits, friction: ExpectedFriction, creep: Array) -> None:
-        """Take the prior model.
+        """Build the inertia response of the prior model.
 
         Args:
             model: with prior parameters.

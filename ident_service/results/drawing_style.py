@@ -1,4 +1,4 @@
-"""What the kinds of shape look like, in light and in dark: one style sheet that travels inside every drawing.
+"""Style the kinds of shape in drawings, light and dark, by one sheet that travels inside every drawing.
 
 Colours follow Okabe and Ito, "Color Universal Design" (2008), so that no meaning hangs on telling red from green.
 """
@@ -107,12 +107,12 @@ _SHAPES = {
 
 
 def style() -> str:
-    """The sheet as an SVG element; who prefers dark gets it."""
+    """Return the style sheet as an SVG element; readers who prefer dark get the dark colours."""
     return f"<style>{sheet()}</style>"
 
 
 def sheet() -> str:
-    """The sheet as CSS, for a page that holds many drawings."""
+    """Return the style sheet as CSS, for a page that holds many drawings."""
 
     def rules(rows: Iterable[tuple[str, str]]) -> str:
         # Everything below one class: a style inside an SVG would otherwise reach the page around it.

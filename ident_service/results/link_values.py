@@ -1,4 +1,4 @@
-"""Say which link values no such link is likely to have: information, no verdict, as no torque depends on them.
+"""Name implausible link values, as information without a verdict: no torque depends on them.
 
 Motion shows base parameters; of the bodies behind them one near to likely bodies is chosen (`model/likely_bodies.py`).
 Where data press against the feasible set, little is left to choose from, and a link may come out as heavy as the arm or
@@ -24,7 +24,7 @@ WHAT_THEN = (
 
 
 def implausible_links(estimate: Estimate) -> tuple[str, ...]:
-    """Name the links whose chosen values are implausible: which value, and beside which bound.
+    """Return the links whose chosen values are implausible: which value, and beside which bound.
 
     Args:
         estimate: with link values; one without, or with values that a prior or custom knowledge asked for, has none

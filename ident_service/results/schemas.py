@@ -1,4 +1,4 @@
-"""The published JSON Schemas of the files that results are kept in; every writer and reader is held against them."""
+"""Validate result files against their published JSON Schemas, when written and when read."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _VALUES, _ENTRIES, _KEYS, _CHARACTERS = 20_000, 200, 1000, 1000
 
 
 def require_schema(content: Any, name: str, where: object, what: str) -> None:
-    """Hold a document against `NAME.schema.json`.
+    """Validate a document against `NAME.schema.json`.
 
     Args:
         content: JSON values.

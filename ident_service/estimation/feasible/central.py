@@ -152,7 +152,7 @@ def _length(changes: Array, away: Array, going: Array, decrement: float) -> floa
 
     `changes` are the mu below, and |N x| is that of `away` + s `going`.
 
-    There it is -sum log(1 + s mu) - log(1 - |N x|^2) and linear in s besides, with the slope -decrement^2 at 0.
+    There f is -sum log(1 + s mu) - log(1 - |N x|^2) and linear in s besides, with the slope -decrement^2 at 0.
     """
     c, b, a = float(away @ away), float(away @ going), float(going @ going)
 

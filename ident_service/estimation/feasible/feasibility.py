@@ -1,4 +1,4 @@
-"""Feasibility test (BPFT, eq. 51), correction (BPFC, eqs. 52-56) and constrained regression (FBPE-OLS, eq. 74).
+"""Solve the feasibility problems: test (BPFT, eq. 51), correction (BPFC, eqs. 52-56), regression (FBPE-OLS, eq. 74).
 
 All three look for delta, written as the pair (beta, delta_d) through the bijection of eqs. 42-49. Norms are
 second-order cones: the Schur complements of eqs. 54 and 73 say the same with many more entries.

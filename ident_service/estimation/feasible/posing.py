@@ -1,4 +1,4 @@
-"""Share the formulation of all feasibility problems: delta from (beta, delta_d), cones, bounds on far-off optima.
+"""Formulate the feasibility problems: delta from (beta, delta_d), blocks as cones, bounds on far-off optima.
 
 Where nothing bounds the mass of a link that hardly shows in beta, an optimum may only be approached as masses grow
 beyond all limits, and where a solver stops on that way depends on rounding, so on the processor. Every estimate

@@ -1,4 +1,4 @@
-"""How evenly samples were taken: from the loop's account of its cycles where a recording has one, else from stamps."""
+"""Measure how evenly samples were taken: from the loop's account of its cycles where there is one, else from stamps."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _GAP = 1.9  # of the usual step
 
 
 def timing(recording: Recording) -> Timing:
-    """How evenly a recording's samples were taken.
+    """Measure how evenly a recording's samples were taken.
 
     Args:
         recording: of two samples at least.
@@ -58,7 +58,7 @@ def timing(recording: Recording) -> Timing:
 
 
 def _stamps(recording: Recording) -> NDArray[np.int64]:
-    """Of the first few million samples [ns]."""
+    """Return the stamps of the first few million samples [ns]."""
     kept, count = [], 0
     for block in recording.blocks():
         kept.append(block.stamp_ns)
