@@ -26,7 +26,7 @@ _PARTS = 3
 
 # A choice is left at its usual value for less: held-out errors of so few parts differ by as much from chance.
 _WORTH = 0.99
-_SPREADS = 2.0  # standard deviations between thirds, that a gain of the model's must be
+_SPREADS = 2.0  # standard deviations between thirds that a gain must exceed
 
 
 @dataclass(frozen=True)

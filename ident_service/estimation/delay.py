@@ -4,7 +4,7 @@ A torque stamped d too late is `tau(t) = f(t - d)`, to first order `f(t) - d f'(
 needs. So d is the coefficient of one more column, minus the rate of the predicted torque, in the same least squares;
 a few rounds with the shifted torque make the first order exact.
 
-A delay that nobody asked for is taken where it predicts held-out thirds clearly better (`choices.py`). That is judged
+A delay that was not asked for is taken where it predicts held-out thirds clearly better (`choices.py`). That is judged
 by feasible estimates: without conditions the first order gives a KUKA 29 ms that are not there.
 """
 
@@ -32,7 +32,7 @@ from ident_service.record.recording import Recording
 _SETTLED = 1e-6  # s
 _MOST_ROUNDS = 30
 _STEP, _STEPS = 2e-3, 4  # s and number: least and most steps, of at least a sample, in the search for a delay
-_FINEST = 0.1  # steps; a smaller difference is none
+_FINEST = 0.1  # steps; smaller differences do not count
 _LARGEST = 0.2  # s; beyond this the channels do not belong together
 
 

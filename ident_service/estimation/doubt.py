@@ -34,14 +34,14 @@ if TYPE_CHECKING:
 
 Verdict = Literal["identified", "weak", "unidentified"]
 
-# Of a joint's torque over the motion, all root mean squares: a parameter that makes less is as good as zero.
+# Share of a joint's torque over the motion (root mean squares); a parameter with less effect is as good as zero.
 NEGLIGIBLE_TORQUE = 0.10
 IDENTIFIED_BELOW = 0.10
 WEAK_BELOW = 0.50
-_ALONE = 1.0 - 1e-4  # leverage of a direction that one block alone tells about
-_SEEN_ALONE = 1e-3  # share of a parameter's variance along such directions, from which its own is not known
+_ALONE = 1.0 - 1e-4  # leverage above which one block alone determines a direction
+_SEEN_ALONE = 1e-3  # share of a parameter's variance along such directions, above which it is unknown
 _MOST_DEGREES = 1e6
-_LONGER = (2, 4)  # blocks that are also taken as one
+_LONGER = (2, 4)  # numbers of neighbouring blocks that are also merged into one
 _LEAST_CLUSTERS = 5
 _NORMAL = 1.959963984540054  # 97.5 % of the normal distribution
 
@@ -217,5 +217,5 @@ def verdicts(beta: Array, deviations: Array, as_zero: Array) -> tuple[Verdict, .
 def shares(beta: Array, deviations: Array, as_zero: Array) -> Array:
     """Return each deviation as a share of the larger of the parameter's size and what is as good as zero."""
     sizes = np.maximum(np.maximum(np.abs(beta), as_zero), np.finfo(float).tiny)
-    # What no joint feels has neither size nor deviation.
+    # Parameters that no joint feels have infinite negligible sizes.
     return np.where(np.isfinite(deviations), deviations, np.inf) / np.where(np.isfinite(sizes), sizes, 1.0)

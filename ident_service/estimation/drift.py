@@ -51,7 +51,7 @@ RELEVANT_TORQUE = 0.01
 # says how well; model error does neither, and shows in the residual alone.
 RELEVANT_RESIDUAL = 0.25
 
-_NO_VARIANCE = 1e-10  # of an eigenvalue of the correlation matrix, against the largest
+_NO_VARIANCE = 1e-10  # smallest eigenvalue of the correlation matrix, as a share of the largest
 _ROUNDING = 8.0 * np.finfo(float).eps
 _KINDS: dict[str, Kind] = {
     **dict.fromkeys(INERTIAL[:6], "inertia"),
@@ -109,7 +109,7 @@ class Identified:
         values: unconstrained where known, SI units, shape (base,).
         covariance: of them, infinite on the diagonal where nothing was seen, shape (base, base).
         blocks: stretches of time that the covariance comes from; None where it is known exactly.
-        motion: of the recordings that were fitted to; None where nobody kept it.
+        motion: of the recordings that were fitted to; None where it was not kept.
     """
 
     leading: tuple[str, ...]
@@ -234,7 +234,7 @@ def drift(first: Identified, second: Identified) -> Drift:
     difference = second.values - first.values
     total = np.diag(first.covariance) + np.diag(second.covariance)
     seen = np.isfinite(total)
-    # Values are printed with rounding; what is known exactly is known to that.
+    # Values are printed with rounding, so even exactly known values are known to that rounding only.
     rounding = _ROUNDING * (np.abs(first.values) + np.abs(second.values)) + np.finfo(float).tiny
     deviations = np.where(seen, np.maximum(np.sqrt(np.where(seen, total, 0.0)), rounding), np.inf)
     singles = [difference_test(first, second, (place,)) for place in range(len(difference))]
@@ -326,7 +326,7 @@ def difference_test(first: Identified, second: Identified, places: Sequence[int]
     correlation = S / np.outer(scale, scale)
     correlation[exact, exact] = 1.0
     values, vectors = np.linalg.eigh(correlation)
-    # Largest variance first: what is left out is what the blocks cannot tell from exactly known.
+    # Largest variance first: directions left out are the best known, whose variances blocks cannot tell from zero.
     values, vectors = values[::-1], vectors[:, ::-1]
     rank = int(np.sum(values > _NO_VARIANCE * values[0]))
     whitening = (vectors[:, :rank] / np.sqrt(values[:rank])).T / scale

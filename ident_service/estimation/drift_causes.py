@@ -24,7 +24,7 @@ from ident_service.model.layout import INERTIAL, TERM_SYMBOLS
 
 CauseKind = Literal["friction", "drive inertia", "body"]
 
-_AS_GOOD = 0.02  # causes that explain as much but for this: the one with fewer parameters is the simpler story
+_AS_GOOD = 0.02  # causes that explain as much within this share; the one with fewer parameters is preferred
 _FRICTION = frozenset(TERM_SYMBOLS.values()) - {TERM_SYMBOLS["drive_inertia"]}
 _MEANINGS: Mapping[str, str] = {
     "higher": "lubrication that ages or is cold, worn seals or bearings, a brake that drags",

@@ -1,7 +1,8 @@
 """Turn recordings into information on the base parameters, in blocks of about a second, in one pass.
 
-Residuals of neighbouring samples are correlated, so doubt is computed from blocks (`doubt.py`). The number of blocks is
-bounded: when there are too many, neighbours merge in pairs and blocks become longer, so memory stays constant.
+Residuals of neighbouring samples are correlated, so uncertainty is computed from blocks (`doubt.py`). The number of
+blocks is bounded: when there are too many, neighbours merge in pairs and blocks become longer, so memory stays
+constant.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from ident_service.record.grid import grid
 from ident_service.record.recording import Recording
 
 MAX_BLOCKS = 256
-LEAST_BLOCKS = 12  # deviations from fewer are hardly known themselves
+LEAST_BLOCKS = 12  # with fewer blocks the deviations themselves are hardly known
 _CHUNK = 4096  # samples whose regressor is computed at once
 _DECAY = 28.0  # -ln(1e-12)
 

@@ -6,9 +6,9 @@ again, and so on, until an F-test says that what is left predicts worse than the
     F = (|omega - W_r beta_r|^2 - |omega - W beta|^2) / p  :  |omega - W beta|^2 / (N - n)
 
 with p parameters removed of n. Neighbouring residuals are alike, so N is not the number of rows but as many independent
-ones as would leave the same doubt: rows times the white variance (eq. 81) over the variance from blocks, the median
-over the parameters. Where neighbours are much more alike in some directions than in most, parameters there are kept
-that are within their own deviation: the test is on the careful side.
+ones as would leave the same uncertainty: rows times the white variance (eq. 81) over the variance from blocks, the
+median over the parameters. Where neighbours are much more alike in some directions than in most, parameters there are
+kept that are within their own deviation: the test is on the careful side.
 
 All of it happens in the n coordinates of the triangular factor, `rho_1 = R_1 beta + e` (eqs. 64-70), where the
 covariance of e is known from the blocks of the whole model: small matrices only, no look at the data.

@@ -36,7 +36,7 @@ from ident_service.model.layout import INERTIAL
 from ident_service.record.grid import grid
 from ident_service.record.recording import Recording
 
-SAME = 0.01  # of its deviation: a parameter that changes by less is as good as the same
+SAME = 0.01  # share of its deviation; a parameter that changes by less counts as unchanged
 
 
 @dataclass(frozen=True)
@@ -111,14 +111,14 @@ def prepare(
     """
     model, choices = _with_velocity(recordings, validation, model, base)
     delay, wanted = None, model.config.identification.delay
-    # Before the friction, whose turning round would take a delay for a longer way.
+    # The delay comes first: a friction fit would take a delay for a longer pre-sliding distance.
     if wanted == "estimate":
         delay = estimate_delay(recordings, model, base)
         model = with_delay(model, delay.seconds)
     trials = None
     if wanted == "choose":
         seconds = 0.0
-        # A period's derivatives are those of its harmonics, and its torque has no filter.
+        # For averaged periods (derivatives by harmonics, torque unfiltered) no delay is searched for.
         if model.config.identification.period is None:
             trials = friction_trials(recordings, model, base)
             period = min(grid(recording, model.config.recording).period_s for recording in recordings)
@@ -211,7 +211,7 @@ def unconstrained(
     delta = constrained_least_squares(fit, base, conditions).delta
     refined = instrumental_variables(recordings, model, base, conditions, fit, delta)
     moved = replace(fit, beta=refined.beta, rho1=fit.R1 @ refined.beta, standard_deviations=refined.standard_deviations)
-    # The instruments' variances come from as many blocks, each of which counts the same.
+    # The instrumental estimate's variances come from as many equally weighted blocks: same degrees of freedom.
     remarks = _unsettled("the instrumental estimate", refined.change, instruments.SETTLED)
     degrees = uncertainty(gathered, fit).degrees
     deviations = np.sqrt(np.diag(refined.covariance)) * widening(degrees)

@@ -1,6 +1,6 @@
 """Fit the nonlinear friction numbers, pre-sliding distance and Stribeck velocity, outside the convex problem.
 
-The way of pre-sliding x0 and the Stribeck velocity v_s belong to one drive each, and act on that drive's own rows. So
+The pre-sliding distance x0 and the Stribeck velocity v_s belong to one drive each, and act on that drive's own rows. So
 one value is tried for all drives at once, and each drive keeps the one that leaves it the smallest residual. Two
 searches begin differently, the numbers in turn or all their pairs at once, because the residual has several minima.
 Between their results decides what predicts better: the recordings are cut into thirds, and each third's torque is
@@ -39,7 +39,7 @@ _GRIDS: dict[str, Array] = {
     "presliding": np.array([0.0, *np.geomspace(3e-4, 0.05, 8)]),
     "stribeck_velocity": np.geomspace(0.02, 0.8, 8),
 }
-# What stands for none of it: nothing is left of Stribeck friction at a speed that is ever recorded.
+# Values that stand for absence: Stribeck friction with this velocity vanishes at any recorded speed.
 _NONE = {"presliding": 0.0, "stribeck_velocity": NO_STRIBECK}
 _FINER = np.array([0.6, 0.8, 1.0, 1.25, 1.6])
 _ROUNDS = 2
@@ -166,7 +166,7 @@ class _Search:
 
     def best(self, values: _Numbers, trials: Sequence[_Numbers], *, predicting: bool = False) -> _Numbers:
         """Return, per drive, the trial that leaves its joint the smallest residual, or predicts its torque best."""
-        # Joints weigh alike in all trials, as the values that were best so far have it.
+        # All trials use the joint weights of the best values so far.
         weights = self._moments(values)[0].weights()
         terms = _own_terms(self.model, self.base)
         left = []
@@ -222,7 +222,7 @@ def _unpredicted(thirds: Sequence[Moments], beta: Array, terms: NDArray[np.bool_
     total = np.zeros(len(thirds[0].products))
     for joint, support in enumerate(thirds[0].supports):
         own = np.flatnonzero(terms[support])
-        # What is left of the torque when the rest of the arm has had its share: columns of the joint's terms, and it.
+        # Columns: the joint's own terms, and the torque less the prediction of all other parameters.
         rest = np.zeros((len(support) + 1, len(own) + 1))
         rest[own, np.arange(len(own))] = 1.0
         rest[:-1, -1] = np.where(terms[support], 0.0, -beta[support])

@@ -32,7 +32,7 @@ from ident_service.record.recording import Recording
 FOLDS = 3
 _MOST_ROWS = 30_000  # samples that are kept; of longer recordings every second, every fourth ...
 _CHANGING: tuple[JointTerm, ...] = ("coulomb", "stribeck")
-_GAP = 1.5  # periods: what is longer is no step between neighbours
+_GAP = 1.5  # periods; a longer step is a gap
 
 
 @dataclass
@@ -156,7 +156,7 @@ class FrictionTrials:
     def _follow(self, recording: Recording, model: ArmModel, time: Array, rate: Array) -> None:
         for drive, travel in enumerate(self._travels):
             if model.config.identification.period is not None:
-                # Once round to know the direction that the period begins with.
+                # One pass over the period first, for the friction direction that it begins with.
                 step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
                 travel.follow(rate[:, drive], step, np.zeros(0, dtype=np.intp), fresh=True)
                 travel.follow(rate[:, drive], step, np.arange(len(time)), fresh=False)

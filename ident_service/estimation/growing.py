@@ -2,9 +2,9 @@
 
 New samples wait until they make a window long enough for the zero-phase filter; the window's equations are merged into
 the factor (`model/information.py`) and all but its end is forgotten. Work and memory of a step are bounded, whatever
-the length of the run. Deviations are those of eq. 81, which takes residuals for white: they show how doubt shrinks; the
-result's own come from blocks (`doubt.py`) and are larger. What is decided while the arm moves is decided by the larger
-of both, for which the information of each block is kept, too.
+the length of the run. Deviations are those of eq. 81, which takes residuals for white: they show how the uncertainty
+shrinks; the result's own come from blocks (`doubt.py`) and are larger. What is decided while the arm moves is decided
+by the larger of both, for which the information of each block is kept, too.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from ident_service.model.information import empty_information, information_of, s
 from ident_service.model.threads import one_blas_thread
 from ident_service.record.recording import BLOCK_SAMPLES, Block, Stamps, cut, join
 
-_FIRST = 2.0  # s; a filter that needs more says so, and gets it
+_FIRST = 2.0  # s, length of the first window; it grows where the filter needs more
 _LONGEST = 60.0  # s
 _MOST = 10.0  # s beyond the shortest window that are worked on in one step
 
@@ -75,7 +75,7 @@ class GrowingInformation:
         """
         options = model.config.identification
         smoothing = options.smoothing
-        if smoothing.cutoff == "choose":  # windows of a few seconds do not say what the motion is
+        if smoothing.cutoff == "choose":  # windows of a few seconds are too short to choose a cut-off from
             smoothing = smoothing.model_copy(update={"cutoff": USUAL})
         self._edge = EDGE / USUAL if options.edge == "choose" else options.edge
         options = options.model_copy(update={"period": None, "smoothing": smoothing, "edge": self._edge})

@@ -242,7 +242,7 @@ def identify(
         second = second_opinion(
             held[kind], found.fit, base, conditions, deviations, prior=prior, custom=custom, solver=solver
         )
-    # Of the bodies behind the same base parameters the central one may not be one that `custom` allows.
+    # Link values are centred only without custom knowledge or prior: `custom` may forbid the central body.
     nearest_to: Source | None = None
     if prior is None and custom is None:
         likely = likely_bodies(prepared.model)

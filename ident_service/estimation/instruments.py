@@ -48,13 +48,13 @@ from ident_service.record.grid import grid
 from ident_service.record.recording import BLOCK_SAMPLES, Block, Recording, Stamps, join
 from ident_service.record.segments import uniform
 
-SETTLED = 0.02  # of a standard deviation
+SETTLED = 0.02  # standard deviations; smaller changes count as settled
 _MOST_ROUNDS = 10
 _RANK_TOLERANCE = 1e-12
-_ORDER = 3  # of the low-pass on what is followed
-_SLOWEST = 2.0  # Hz, of it where that is measured; motions of arms are slower
+_ORDER = 3  # order of the low-pass on the followed positions
+_SLOWEST = 2.0  # Hz, least cut-off of that low-pass on measured positions; motions of arms are slower
 _STIFFNESS = 60.0  # rad/s, of the loop around an arm whose own is not known
-_LARGEST_STEP = 0.5  # of the velocity loop's time constant
+_LARGEST_STEP = 0.5  # largest integration step, as a share of the velocity loop's time constant
 _RUNAWAY = 1e4  # rad/s or m/s
 
 
@@ -237,7 +237,7 @@ def _solve(sums: Sequence[_Sums]) -> _Solved:
     scaled = np.linalg.solve(A, total.Zomega / left)
     covariance = np.zeros_like(A)
     for block in sums:
-        # The change that leaving this block out makes (`doubt.py`).
+        # Change of the estimate when this block is left out (`doubt.py`).
         part = block.ZW / left[:, None] / right
         step = np.linalg.solve(A - part, block.Zomega / left - part @ scaled)
         covariance += np.outer(step, step)

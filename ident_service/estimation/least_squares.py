@@ -16,7 +16,7 @@ from ident_service.model.chain import Array
 from ident_service.model.information import Information
 
 _RANK_TOLERANCE = 1e-10
-_LEAST_COLUMN = 1e-14  # of the longest
+_LEAST_COLUMN = 1e-14  # share of the longest column's length; a shorter column is rounding
 _SETTLED = 1e-9
 _MOST_ROUNDS = 500
 

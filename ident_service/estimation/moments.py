@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from ident_service.model.chain import Array
 
-_LEAST_COLUMN = 1e-14  # of the longest
-_RIDGE = 1e-12  # of a column's squared length: columns that are alike share what they explain
-_SETTLED = 1e-6  # of a weight
+_LEAST_COLUMN = 1e-14  # share of the longest column's length; a shorter column is rounding
+_RIDGE = 1e-12  # share of a column's squared length: collinear columns then share what they explain
+_SETTLED = 1e-6  # relative change of a weight
 _MOST_ROUNDS = 100
 
 

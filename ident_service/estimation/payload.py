@@ -7,8 +7,8 @@ A body x in the frame of the last link adds K_x x to the base parameters beta of
 
 is least squares for x; joints are weighted by their residuals. What W K_x cannot tell apart is grouped as base
 parameters are; what the motion does not show (inertia where it is slow) has infinite variance and is left out. The
-covariance of x has two parts: noise, from blocks of scores as in `doubt.py`, and the arm's own doubt, which on this
-motion looks like a payload: x depends on beta by -G = -(K_x^T W^T W K_x)^-1 K_x^T W^T W, so G cov(beta) G^T.
+covariance of x has two parts: noise, from blocks of scores as in `doubt.py`, and the arm's own uncertainty, which on
+this motion looks like a payload: x depends on beta by -G = -(K_x^T W^T W K_x)^-1 K_x^T W^T W, so G cov(beta) G^T.
 
 A body that was added has a pseudo-inertia >= 0, one that was taken off has the negative of one. Of both sets the point
 nearest to x in the metric of its covariance is sought, and told by its distance (`drift.probability`) and by the torque
@@ -58,8 +58,8 @@ Word = Literal["none", "added", "removed", "infeasible"]
 _ARM = 0.05  # m
 _LEAST_MASS = 0.1  # kg
 FAR = 4.0  # times the residual of the identification, as in `plausibility.py`
-_NO_VARIANCE = 1e-10  # of an eigenvalue of the correlations, against the largest
-_FELT = 1e-9  # of the arm's doubt in a parameter, below which a payload does not depend on it
+_NO_VARIANCE = 1e-10  # smallest eigenvalue of the correlations, as a share of the largest
+_FELT = 1e-9  # share of the largest dependence, below which a payload does not depend on an arm parameter
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class KnownArm:
         covariance: of them, infinite on the diagonal where nothing was seen, shape (base, base).
         blocks: that the covariance comes from; None where it is known exactly.
         residual: root mean square of what was left unexplained at each joint where it was identified [N m or N], over
-            all rows, shape (joints,); None where nobody knows.
+            all rows, shape (joints,); None where unknown.
     """
 
     model: ArmModel
@@ -122,7 +122,7 @@ class Payload:
         fit: the unconstrained least squares; `fit.beta` is b.
         noise: its covariance from this recording alone, shape (payload, payload).
         G: what b depends on the arm's beta by, with the sign turned, shape (payload, base of the arm).
-        covariance: of b, the arm's doubt included, infinite on the diagonal where nothing was seen.
+        covariance: of b, the arm's uncertainty included, infinite on the diagonal where nothing was seen.
         standard_deviations: its diagonal's root, shape (payload,).
         verdicts: one per base parameter of the payload.
         blocks: of time, that `noise` comes from.
@@ -316,7 +316,7 @@ def _body(
     sides: tuple[Identified, Identified],
 ) -> Body:
     metric = _metric(covariance)
-    # Offsets turn with the body, and back again.
+    # The sign applies to the offsets too, and is undone below.
     found = nearest(metric, sign * metric @ b, sign * b, base, conditions, "payload")
     p = probability(found.objective**2, max(whole.directions, 1), whole.degrees)
     moved = sign * found.beta

@@ -128,7 +128,7 @@ def _motion(
         near = widened(np.concatenate([near[-reach:], near, near[:reach]]), reach)[reach:-reach]
     shape = options.friction.presliding
     presliding = np.broadcast_to(np.asarray(0.0 if shape == "fit" else shape, dtype=float), (joints,))
-    # Once round to find the direction that the period begins with.
+    # One pass over the period first, for the friction direction that it begins with.
     once = direction(rate, step, presliding)
     return Motion(
         np.arange(length, dtype=np.float64) * step,

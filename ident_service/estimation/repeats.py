@@ -23,12 +23,12 @@ Mask = NDArray[np.bool_]
 Label = tuple[int, int]
 
 _STEP = 0.02  # s; a motion up to 2 Hz moves by a tenth of its range meanwhile, see _SAME
-_MOST = 1 << 17  # samples that are looked at
+_MOST = 1 << 17  # largest number of grid samples
 _SHORTEST = 1.0  # s
-_SAME = 0.04  # of a joint's range: what positions of the same motion may differ by
-_HARDLY = 0.05  # of the range of the joint that moves most: less is not looked at so closely
-_PART = 0.5  # of the way in common that has to be the same
-_LEAST = 0.2  # of a period that has to be repeated
+_SAME = 0.04  # share of a joint's range that positions of the same motion may differ by
+_HARDLY = 0.05  # share of the largest joint range: the least scale that joints are compared on
+_PART = 0.5  # share of the common path length that has to agree
+_LEAST = 0.2  # share of a period that has to be repeated
 _CANDIDATES = 40
 
 
@@ -117,7 +117,7 @@ def stretches(
     periods = [_period(positions) for positions in seen]
     motions: list[_Motion] = []
     found: dict[int, Stretches] = {}
-    # Motions that repeat themselves first, so that others are held against a whole period.
+    # Motions that repeat themselves first, so that others are compared with a whole period.
     for index in sorted(range(len(seen)), key=lambda one: (periods[one] is None, one)):
         positions, period = seen[index], periods[index]
         for motion in motions:
@@ -139,7 +139,7 @@ def _positions(recording: Recording, fmt: RecordingFormat) -> _Positions:
     step = max(_STEP, stamps.period_s, duration / _MOST)
     q = np.full((int(duration / step) + 1, recording.joints), np.nan)
     for piece in uniform(recording, fmt, stamps):
-        # Every sample writes where it is nearest, the last one stays: no more than half a step off.
+        # Every sample goes to its nearest grid time, the last of several stays: at most half a step off.
         q[np.rint((piece.block.stamp_ns - stamps.first_ns) * 1e-9 / step).astype(np.intp).clip(0, len(q) - 1)] = (
             piece.block.position
         )

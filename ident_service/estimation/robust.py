@@ -24,9 +24,9 @@ from ident_service.model.threads import one_blas_thread
 from ident_service.record.recording import Recording
 
 _TUNING = 1.345  # 95 % efficiency where the noise is normal after all
-_CONSISTENT = 1.4826  # of the median absolute deviation, for normal noise
+_CONSISTENT = 1.4826  # standard deviation over median absolute deviation, for normal noise
 _SPREAD = 5_000  # samples that the weights are found on
-SETTLED = 1e-3  # of a white standard deviation
+SETTLED = 1e-3  # white standard deviations; smaller changes count as settled
 _MOST_ROUNDS = 50
 _FOLDS = 3
 _FOLD_ROUNDS = 15
@@ -109,7 +109,7 @@ def held_out_errors(
 
 
 def _weights(residuals: Array, scales: Array) -> Array:
-    # A row counts with the square of what it is multiplied by; over the scale, so that joints are comparable.
+    # Rows are multiplied by the root of Huber's weight, and divided by the scale so that joints are comparable.
     size = np.abs(residuals) / scales
     return np.asarray(np.sqrt(np.minimum(1.0, _TUNING / np.maximum(size, 1e-12))) / scales)
 
@@ -165,7 +165,7 @@ class _Spread:
         return np.array([max(_CONSISTENT * float(np.median(np.abs(one))), 1e-9) for one in self.residuals(beta)])
 
     def _reweighted(self, beta: Array) -> Moments:
-        # The rows as often as their residuals allow.
+        # Weigh the rows by their residuals.
         products = []
         for table, residual, scale in zip(self.tables, self.residuals(beta), self.scales(beta), strict=True):
             rows = table * _weights(residual, scale)[:, None]

@@ -184,7 +184,7 @@ class _Smoother:
         near[1:] |= np.diff(np.signbit(rate), axis=0)
         reach = round(options.reversal.window / self._period)
         keep = ~(widened(near, reach) @ (self._coupling != 0.0))
-        # What the window before knew better, because it had both sides to look at, stands.
+        # Keep the directions that the window before computed here: its filter had samples on both sides.
         known = self._direction[:0] if opens else self._direction
         start = known[-1] if len(known) else None
         way = np.vstack([known, direction(rate[len(known) :], self._period, self._presliding, start)])

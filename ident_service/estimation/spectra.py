@@ -21,13 +21,13 @@ from ident_service.record.recording import Recording
 from ident_service.record.segments import uniform
 
 Array = NDArray[np.float64]
-USUAL = 8.0  # Hz; lower, and filtered friction would not turn round where the velocity does
-_MARGIN = 5.0  # of the motion's own bandwidth
-_LEAST_MARGIN = 2.0  # of it, however noisy the positions are
-_MOVING = 0.99  # of the velocity's energy is motion
-_ABOVE_NOISE = 3.0  # power that is no noise, of the noise's
-_NOISE = 1e-3  # of the acceleration's power; 3 % of its size
-_HIGHEST = 0.2  # of the sampling rate; above half of it there is nothing
+USUAL = 8.0  # Hz; below it, filtered friction would not reverse where the velocity does
+_MARGIN = 5.0  # cut-off over the motion's bandwidth
+_LEAST_MARGIN = 2.0  # the least of that ratio, however noisy the positions are
+_MOVING = 0.99  # share of the velocity's energy that is motion
+_ABOVE_NOISE = 3.0  # power over the noise's, above which it is not noise
+_NOISE = 1e-3  # noise power over the acceleration's power; 3 % of its size
+_HIGHEST = 0.2  # largest cut-off over the sampling rate, whose half is the Nyquist frequency
 _KEPT = 10.0  # samples a period of the cut-off
 EDGE = 2.0  # periods of the cut-off at the ends, where the filter has one side to look at
 _WINDOW_S = 20.0
@@ -121,7 +121,7 @@ def spectrum(recording: Recording, fmt: RecordingFormat, *, measured: bool = Fal
         if piece.end:
             waiting = waiting[:0]
     if windows == 0:
-        return Spectrum(1.0 / period, 0.0, 0.5 / period)  # what follows says that it is too short
+        return Spectrum(1.0 / period, 0.0, 0.5 / period)  # later steps report that it is too short
     frequency = np.fft.rfftfreq(length - 1, period)[1:]
     # A difference multiplies power by this, and white noise of positions is that of rates after one.
     difference = (2.0 * np.sin(np.pi * frequency * period)) ** 2

@@ -15,7 +15,7 @@ from ident_service.estimation.least_squares import ordinary_least_squares, weigh
 from ident_service.model.chain import Array
 from ident_service.model.information import Information
 
-_SETTLED = 1e-3  # of a share
+_SETTLED = 1e-3  # change of a share that counts as settled
 _MOST_ROUNDS = 100
 
 

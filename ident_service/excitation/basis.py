@@ -98,7 +98,7 @@ class PostureBasis:
 
     Attributes:
         postures: how many.
-        times: how long each way takes [s], there and back again: 2 (postures - 1) of them.
+        times: durations of the segments [s], there and back again: 2 (postures - 1) of them.
         dwell: how long the arm stands at each posture [s].
     """
 

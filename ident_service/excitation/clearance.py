@@ -25,7 +25,7 @@ from ident_service.model.collision import CollisionModel
 
 _FIRST_CELL, _SHORTEST_CELL = 0.02, 1e-4  # s
 _PARTS = 4
-_ROUNDING = 1e-6  # m, more than what coal's distances are wrong by
+_ROUNDING = 1e-6  # m, more than the error of coal's distances
 
 # From times [s] and half widths [s], shape (cells,), to positions and what each joint moves in a cell at most,
 # shape (cells, joints).

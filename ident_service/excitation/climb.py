@@ -28,7 +28,7 @@ _SQP_ROUNDS, _SQP_STEPS = 10, 60
 _NEAR, _NEARER = 0.5, 0.8  # share of a limit above which a peak of the first and of later motions counts
 _SETTLED = 2e-4  # change of the criterion in a round after which no further one is worth its time
 _HOPELESS = 0.3  # share of a limit that a third round leaves exceeded where no further one will mend it
-_SPREAD = 0.25  # of the scaled coefficients of a random start
+_SPREAD = 0.25  # standard deviation of the scaled coefficients of a random start
 _HALVINGS = 24
 
 
@@ -115,7 +115,7 @@ def climbed(
             if sharpness >= _ROUNDS[2][0] and here.worst > _HOPELESS:
                 break  # caught on the wrong side of an obstacle; another start will do better
     except Interrupted:
-        # Half a round may have left the limits far behind; where it came from may be worth more.
+        # An interrupted round may be far outside the limits; earlier points may be better.
         raise Stopped(_best_of([kept(problem, one, safe, start) for one in (*reached, *latest)])) from None
     return kept(problem, x, safe, start)
 

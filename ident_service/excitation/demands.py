@@ -54,7 +54,7 @@ class Demands:
 
     def violations(self, names: tuple[str, ...], limits: MotionLimits, supply: Supply | None = None) -> list[str]:
         """Return every limit that a bound exceeds, in words; empty when the arm may move so."""
-        # Asked for so that a bound that is no number counts as beyond every limit.
+        # Negated comparisons, so that a bound that is NaN counts as beyond every limit.
         found = []
         for k, name in enumerate(names):
             if not (self.lowest[k] >= limits.lower[k] and self.highest[k] <= limits.upper[k]):

@@ -33,7 +33,7 @@ from ident_service.model.collision import CollisionModel
 from ident_service.model.expected_friction import expected_friction
 
 _PER_HARMONIC = 50  # samples of a search per period of its highest harmonic
-_PER_WAY = 24  # samples of a search per way between postures
+_PER_WAY = 24  # samples of a search per segment between postures
 _MOST_SAMPLES = 2000
 
 
@@ -201,7 +201,7 @@ def design_motion(
     best: tuple[float, Array, Proof] | None = None
     for candidate in found.candidates:
         if best is not None and candidate.value >= best[0]:
-            break  # even without the loss that a proof may cost it is no better
+            break  # a proof can only make it worse, so it cannot beat the best
         result = largest_proven(basis, candidate.coefficients, basis.standing(safe), proven)
         if result is not None:
             value = criterion_of(task, basis.path(result[0]), base)

@@ -4,7 +4,7 @@ Drives are expected to take `f(w) = F_c s(w) + F_v w` at their velocity w. The l
 velocity of the reference (`FrictionFeedforward`). What is left, `d = (b - s_f) f` where friction is b times what is
 expected, computed torque (eq. 76) answers with the error `e = K_p^-1 M(q)^-1 d`, once it has settled. Where little
 inertia stands behind a joint, as behind the upper arm's rotation when the elbow is straight, little friction moves it
-far. Static, so a forecast and no bound; the guard keeps the limit itself.
+far. It is static, so a prediction and no bound; the safety monitor keeps the limit.
 
 Friction is the prior's where it has some, else a guess from the torque limits.
 """
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     import scipy.sparse
 
 # Where the inertia behind a joint changes, so does how far it falls behind, and its speed is another than asked for.
-TOLERATED = 1.05  # of the velocity limit; the guard stops at 1.2
-USABLE = 0.8  # of the limit: settling overshoots a little, and the forecast is static
+TOLERATED = 1.05  # share of the velocity limit; the safety monitor stops at 1.2
+USABLE = 0.8  # share of the limit: settling overshoots a little, and the prediction is static
 # Times the expected friction, between which an arm's own lies for a forecast: it changes by a third between a cold and
 # a warm drive (Bittencourt & Gunnarsson 2012, figure 5).
 DOUBT = (0.6, 1.4)

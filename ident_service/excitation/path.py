@@ -166,7 +166,7 @@ class PosturePath:
 
     Attributes:
         points: postures in the order they are visited [rad or m], shape (postures, joints).
-        times: how long each way takes [s], shape (postures - 1,).
+        times: durations of the segments [s], shape (postures - 1,).
         dwell: how long the arm stands at each posture [s].
     """
 

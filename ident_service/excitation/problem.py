@@ -35,11 +35,11 @@ from ident_service.model.regressor_gradient import RegressorGradient
 _RESERVE = 0.004  # of every limit, for what happens between two samples
 # Likewise for the forecast of the following error, which is static: the arm itself takes its time to settle.
 _TURNING = 0.5
-_CREEP = 0.05  # of the velocity limit: friction's direction turns round over so much, which gives it a gradient
+_CREEP = 0.05  # share of the velocity limit over which friction reverses, which gives its direction a gradient
 _DEPTH = 0.05  # m; a clearance missed by so much counts like another limit missed altogether
 _BETWEEN = 0.02  # m, the most that is kept free for what happens between two samples; the proof mends the rest
 _LINE = 25  # points on the way from home to where the motion begins
-_INSIDE = 0.0005  # by so much linear conditions are harder than the limits, so that rounding leaves none exceeded
+_INSIDE = 0.0005  # linear conditions are tighter than the limits by this, so that rounding leaves none exceeded
 Limits = dict[str, Array]
 Peak = tuple[int, int, int, bool]  # order of the derivative, sample, joint, and whether its upper limit is near
 LINEAR = ("position", "velocity", "acceleration", "jerk")  # limits that are linear in the variables
@@ -110,7 +110,7 @@ class Problem:
             self._rate_of = rate_of_change(times)
         self._capsules = CapsuleModel(model)
         step = float(np.median(np.diff(times)))
-        # What a point a metre away from an axis may do between two samples, beyond the straight line between them.
+        # Departure of a point, a metre from an axis, from the straight line between two samples.
         between = min(0.125 * float(limits.acceleration.max()) * step**2, _BETWEEN)
         self._clearance = model.config.workspace.clearance + between
         # The straight way from home to where the motion begins, for which only clearance matters.
@@ -241,7 +241,7 @@ class Problem:
             found["power"], power_slopes = self._power(torque, dq)
         if self._capsules.pairs:
             way = limits.home + self._line * (self._begin @ X.T - limits.home)
-            # The arm, which falls behind, and not its reference has to keep clear.
+            # Clearance is that of the arm, which lags behind its reference.
             where = q if self._following is None else q - behind
             found["clearance"] = (self._clearance - self._capsules.distances(np.concatenate([where, way])).T) / _DEPTH
         state = State(X, value, found)

@@ -29,7 +29,7 @@ class Proof:
         demands: on the joints and the supply.
         clearance: the smallest distance, None where the arm has no geometry.
         approach: the smallest distance on the straight way from home to where the motion begins and back, likewise.
-        ways: what calm ways from home and back ask, home itself included.
+        ways: peak bounds on the slow segments from home and back, home itself included.
         tracking: how a simulated arm follows the motion, None where nothing was simulated; clearances are the arm's
             then, and else the reference's.
     """
@@ -53,7 +53,7 @@ def proof_of(
     Args:
         path: the motion.
         model: of the arm.
-        limits: that the motion may use, also for home and for how fast the ways to and from it are.
+        limits: that the motion may use, also for home and for the speed of the segments to and from it.
         collision: geometry of the arm.
         torque_margin: share of the torque that the motion keeps free for what the model does not know; the
             description's when None.

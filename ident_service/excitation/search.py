@@ -26,7 +26,7 @@ from ident_service.excitation.task import Task
 from ident_service.model.chain import Array
 from ident_service.model.threads import one_blas_thread
 
-_KEPT = 8  # candidates
+_KEPT = 8  # best candidates
 _POLISHED = 4
 _STARTS_SHARE = 0.25
 _STARTS_TAKE = 0.5  # of all the time, where their number is given

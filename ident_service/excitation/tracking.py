@@ -26,7 +26,7 @@ from ident_service.model.chain import Array
 from ident_service.model.expected_friction import expected_friction, friction_feedforward
 from ident_service.model.rigid_body import ForwardDynamics, InverseDynamics
 
-# Shares of what the guard allows that a simulated arm may use: the guard stops at 1.0 times the following error allowed
+# Shares of the safety monitor's limits that a simulated arm may use: it stops at 1.0 times the following error allowed
 # and at 1.2 times the velocity limit, and an arm has noise that no case has.
 _ERROR_USED, _VELOCITY_USED = 0.85, 1.1
 _BIN = 0.02  # s, over which the tube around the reference has one width
@@ -169,7 +169,7 @@ def way_width(path: Path, model: ArmModel, margin: float) -> Callable[[Array, Ar
     way takes longer than a part; so that is added.
 
     Args:
-        path: the ways.
+        path: the segments.
         model: of the arm, with prior parameters.
         margin: as of `track`.
 

@@ -35,7 +35,7 @@ class Differentiable:
         gradients = [back.adjoints.get(symbol.index, 0.0) for symbol in inputs]
         self._kept = list(back.known)
         self._forward = Program(tape, [*outputs, *(Symbol(tape, index) for index in self._kept)])
-        # The seeds were made first, what is kept of the forward run whenever it was met.
+        # Its inputs are seeds and kept forward values, in the order in which the sweep made them.
         self._backward = Program(back.tape, gradients)
         self._gradients = len(inputs)
         self._order = back.order

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 WORLD = -1
 
 
-@dataclass(frozen=True, eq=False)  # identity is what a chain is compared and hashed by
+@dataclass(frozen=True, eq=False)  # chains are compared and hashed by identity
 class Chain:
     """Kinematic tree with joints numbered depth first, as pinocchio needs them: parents, then whole branches.
 

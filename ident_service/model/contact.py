@@ -67,7 +67,7 @@ class Contact:
         solids, found, rows = self._groups[self._turn]
         self._turn = (self._turn + 1) % self._turns
         nearest = pin.computeDistances(self._model, self._data, solids, found, position)
-        # Where no distance is a number, there is no nearest one.
+        # If all distances are NaN, there is no nearest pair.
         if nearest < len(solids.collisionPairs) and found.distanceResults[nearest].min_distance >= 0.0:
             return self._clear
         depths = self._clear.copy()

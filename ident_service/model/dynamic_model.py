@@ -32,7 +32,7 @@ class DynamicModel:
             armature, damping or friction of its own, and only the methods here know these terms.
         arm: the mechanism and its configuration.
         delta: link parameters, shape (arm.layout.size,).
-        presliding: way over which each drive's dry friction turns round [rad or m], shape (joints,). Where one is not
+        presliding: distance over which each drive's dry friction reverses [rad or m], shape (joints,). Where one is not
             zero, friction has a memory: carry a `direction` along with `turned`, or leave it out and have friction that
             turns round at once, which the parameters were not fitted with.
     """
@@ -63,7 +63,7 @@ class DynamicModel:
         _set_limits(self.model, arm)
         self._data = self.model.createData()
         inertia = layout.term_values("drive_inertia", delta)
-        # What armatures do not say: zero where every joint has its own drive.
+        # Drive inertia beyond the armatures: zero where every joint has its own drive.
         self._shared = chain.coupling.T @ (inertia[:, None] * chain.coupling) - np.diag(drives.armature)
 
     def turned(self, direction: Array, step: Array) -> Array:

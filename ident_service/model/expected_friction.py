@@ -14,11 +14,11 @@ from ident_service.config.limits import MotionLimits
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array, Chain
 
-# Of the velocity limit: over so much of the reference's velocity the Coulomb part fed forward turns round. A sign would
+# Share of the velocity limit over which the Coulomb feed-forward reverses. A sign function of the velocity would
 # step by twice the friction, and chatter where a reference stands.
 _TURNS = 0.02
-# Behind dry gears more: turning round at the acceleration limit changes the torque by this at most, half of what the
-# guard lets through (libfranka's 1000 N m/s), whose other half the errors at a reversal need.
+# Wider for much dry friction: reversing at the acceleration limit changes the torque at most at this rate, half of what
+# the safety monitor allows (libfranka's 1000 N m/s); errors at a reversal need the other half.
 _TURNING = 500.0  # N m/s or N/s
 
 

@@ -1,6 +1,6 @@
 """Estimate likely bodies of an arm's links: those of its prior, else rods of its geometry.
 
-Motion tells base parameters only, and many bodies move alike. Who looks at link values expects those of the arm: of all
+Motion shows base parameters only, and many bodies move alike. Readers of link values expect those of the arm: of all
 bodies behind the same base parameters the nearest to these is chosen (`estimation/feasible/central.py`). They are no
 knowledge: they change no base parameter by more than a hundredth of its deviation.
 """
@@ -70,7 +70,7 @@ def likely_bodies(model: ArmModel) -> LikelyBodies:
     masses = sum(float(delta[place][-1]) for place in guessed)
     known = sum(float(delta[layout.inertial(link)][-1]) for link in range(chain.joints)) - masses
     if guessed:
-        # Of a prior that is heavier than the arm may be, nothing is left for the others; so a tenth of a guess.
+        # Where prior links alone exceed the arm's total mass, the guessed ones get a tenth of their guess.
         left = np.inf if total.upper is None else total.upper - known
         wanted = float(np.clip(masses, total.lower - known, left)) if left > 0.0 else 0.1 * masses
         for place in guessed:

@@ -78,7 +78,7 @@ def read_mechanism(file: TextFile, kind: Kind, kinematics: Kinematics | None = N
         file: its name and text.
         kind: of the file.
         kinematics: which part of it is the arm; all of it when None.
-        own: whether this process has just written it, so that nobody else has a word in it.
+        own: whether this process has just written the file, so that its content is not foreign.
 
     Raises:
         ModelError: not such a file, beyond the limits, entities or includes in it, or a joint that is neither

@@ -18,7 +18,7 @@ from ident_service.errors import ModelError
 from ident_service.model.limited_process import answer_within
 from ident_service.model.mechanism_part import Mimic, Part, arm_part, mimics
 
-if TYPE_CHECKING:  # as there
+if TYPE_CHECKING:  # this process loads no configuration
     from ident_service.config.quantities import TextFile
 
 MOST_MEMORY: Final = 512 * 2**20  # bytes of addresses, of which the libraries take 230 MB

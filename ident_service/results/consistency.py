@@ -16,7 +16,7 @@ from ident_service.results.parameter_file import ParameterFile
 
 AGREEMENT = 1e-9
 """Largest difference between base values and those of the link values, relative to the largest base value."""
-_LARGEST = 1e30  # of any value in SI units; far beyond every arm, and squares of it are numbers still
+_LARGEST = 1e30  # largest value in SI units; far beyond every arm, and its square is still finite
 
 
 def require_consistent(file: ParameterFile, where: Path) -> None:

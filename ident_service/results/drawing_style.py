@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 
 STEPS = 8  # shades from early to late
 
-# What a browser shows where it knows no dark mode, and every other program.
+# Light colours, for every program without a dark mode.
 _LIGHT = {
     "ground": "fill:#ffffff",
     "ink": "fill:#1f2328",

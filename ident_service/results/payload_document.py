@@ -39,7 +39,7 @@ _WORDS: Mapping[Word, tuple[str, str]] = {
     ),
 }
 _ROUNDING = 1e-12  # of the largest value of a quantity; less is printed as zero
-# What no longer holds for an arm with a load, or is about other recordings.
+# Entries that no longer hold for an arm with a load, or are about other recordings.
 _OF_ARM_ALONE = (
     "white_standard_deviations",
     "noise_standard_deviations",

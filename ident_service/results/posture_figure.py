@@ -25,7 +25,7 @@ _MOST_POSTURES, _MOST_WAYPOINTS = 24, 3000  # more can neither be told apart nor
 def stick_figure(postures: Postures, title: str = "The arm along its motion") -> str:
     """Draw side view (x-z) and top view (x-y) of an arm along its motion.
 
-    Postures fade in from early to late; the tool's way is a thin line through all of them. The posture of smallest
+    Postures fade in from early to late; the tool's path is a thin line through all of them. The posture of smallest
     clearance stands out with the names of the pair and their distance. Half-spaces are drawn where they meet the
     vertical or horizontal plane through the base frame's origin.
 

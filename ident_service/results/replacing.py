@@ -15,7 +15,7 @@ from ident_service.errors import ParameterError, UsageError
 from ident_service.results.files import exchange_folders, staging_beside
 from ident_service.results.manifest import MANIFEST, file_sha256, named_files
 
-# Of identifications and payloads; never a recording, which is made once.
+# Endings of files of identifications and payloads; never of recordings, which are made once.
 _MADE = (".json", ".urdf", ".txt", ".html", ".py", ".dat-s")
 _TOLD = 3
 

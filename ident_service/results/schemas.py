@@ -13,8 +13,8 @@ import jsonschema_rs
 
 from ident_service.errors import ParameterError
 
-_MOST = 10  # mistakes that are told
-# Each mistake holds a copy of what is wrong: 16 MB of them took 5 GB. So they are looked for in so much of a document.
+_MOST = 10  # mistakes that are reported
+# Each mistake holds a copy of what is wrong: 16 MB of them took 5 GB. So only these parts of a document are checked.
 _VALUES, _ENTRIES, _KEYS, _CHARACTERS = 20_000, 200, 1000, 1000
 
 

@@ -37,9 +37,9 @@ from ident_service.model.likely_bodies import LikelyBodies
 _ITERATIONS = 200
 _CONVERGED = 1e-10  # Newton's decrement: the distance from the minimiser in the metric of f
 _QUADRATIC = 1e-2  # decrement from which Newton's method at least halves it with every step, unless rounding forbids
-_STEP = 0.99  # of the way to the boundary, at most
-_LONGEST = 10.0  # Newton's steps at a time
-_HALVINGS = 50  # of the part of a step that is looked at
+_STEP = 0.99  # largest share of the distance to the boundary in one step
+_LONGEST = 10.0  # largest multiple of Newton's step
+_HALVINGS = 50  # bisections of the step length
 _KEPT = 0.5  # share of the margin, at most the paper's, that is left where data press against the set
 
 

@@ -42,7 +42,7 @@ _OPTIONS: dict[str, tuple[dict[str, Any], ...]] = {
         | {"max_iter": 200, "max_threads": 1}
         for tolerance in (1e-9, 1e-8, 1e-7)
     ),
-    # Accelerated, SCS now and then wanders for as long as it is let, on one processor and not on another.
+    # With acceleration SCS sometimes does not converge, on one processor and not on another.
     "SCS": ({"eps_abs": 1e-7, "eps_rel": 1e-7, "max_iters": 100_000, "acceleration_lookback": 0},),
 }
 

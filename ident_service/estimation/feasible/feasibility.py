@@ -46,8 +46,8 @@ __all__ = [
     "feasibility_test",
 ]
 
-EQUALITY_TOLERANCE = 1e-6  # of an equality in a test, in units of its reference scale
-_LARGEST_MARGIN = 1e3  # where nothing in the table bounds the margin, any larger one says no more
+EQUALITY_TOLERANCE = 1e-6  # largest violation of an equality in a test, in units of its reference scale
+_LARGEST_MARGIN = 1e3  # bound of the margin, where nothing in the table bounds it
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.likely_bodies import LikelyBodies
 
-_AT_TARGET = 1e-8  # of the target's size: a distance that is none
+_AT_TARGET = 1e-8  # share of the target's size below which a distance is zero
 # Weights of the distance (in units of the largest column) in the objective, in turn. A solve that was hard may have
 # ended far from the optimum although the solver calls it one: then the others are tried, and the nearest point counts.
 _WEIGHTS = (8.0, 30.0, 1.0)

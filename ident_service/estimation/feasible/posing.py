@@ -21,9 +21,9 @@ from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 
-EPSILON = 1e-6  # eq. 21, the paper's margin, for links of about the size that the reference scales are of
-_LEAST_INSET = 1e-11  # what a solver can tell from the boundary
-MULTIPLIER = 1e-6  # smaller ones are the interior-point method's own distance from the boundary
+EPSILON = 1e-6  # eq. 21: the paper's margin, for links of about the size of the reference scales
+_LEAST_INSET = 1e-11  # smallest distance from the boundary that a solver resolves
+MULTIPLIER = 1e-6  # smaller multipliers are the interior-point method's own distance from the boundary
 # Bounds of tr(P) to try, in turn: kg and kg m^2, times the largest base parameter or bound if that is above 1.
 OF_TESTS = (np.inf, 1e4, 1e3, 1e2)
 OF_TABLES = (1e4, 1e3, 1e2)  # the nearest feasible table; the paper's table 1 takes masses of thousands of kg to print
@@ -150,7 +150,7 @@ def minimise(
         try:
             solution = bounded.minimise(objective, name, quadratic)
         except SolverError as error:
-            # Without a reach, that is about the problem itself.
+            # Without a bound, infeasibility is that of the problem itself.
             if error.status.endswith("Infeasible") and bounded is problem:
                 raise
             status = status or error.status

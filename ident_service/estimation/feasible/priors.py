@@ -34,7 +34,7 @@ from ident_service.model.chain import Array
 from ident_service.model.layout import INERTIAL
 from ident_service.model.likely_bodies import LikelyBodies
 
-_ROOM = 0.9  # of what base parameters may move, that the way to likely bodies may take
+_ROOM = 0.9  # share of the allowed change of base parameters that moving to likely bodies may use
 _TRIANGLE = [(i, j) for i in range(4) for j in range(i + 1)]  # entries of Z, row by row
 
 
@@ -159,7 +159,7 @@ def _towards_prior(
     residual[:, :n] = fit.R1 @ base.K * prior.scales / sigma
     residual[:, n : n + rows] = -np.eye(rows)
     problem.zero(residual, -fit.rho1 / sigma)
-    # Divided by 1 + weight, neither part overwhelms the solver's sense of scale.
+    # Divided by 1 + weight, so that the objective keeps its scale whatever the weight.
     data, known = 1.0 / (1.0 + prior.weight), prior.weight / (1.0 + prior.weight)
     objective, quadratic = np.zeros(variables), np.zeros(variables)
     quadratic[n : n + rows] = 2.0 * data
@@ -210,7 +210,7 @@ def roomier(
     Returns:
         `held` with other link values and nearly the same base parameters; `held` itself where the solver finds none.
     """
-    delta = held.delta.copy()  # friction is drawn to where it is
+    delta = held.delta.copy()  # friction keeps its value as prior
     links = np.array([name.rstrip("0123456789") in INERTIAL for name in conditions.names])
     delta[links] = likely.delta[links]
     delta = np.where(likely.drives > 0.0, likely.drives, delta)
@@ -229,7 +229,7 @@ def roomier(
 def _within(prior: Prior, base: BaseParameters, conditions: FeasibleSet, near: Near, inside: Array) -> Array:
     """Return link parameters of least divergence from the prior whose base parameters lie within `near`."""
     n, links = len(prior.names), prior.whitened
-    problem = ConicProblem(n + 14 * len(links), rough=True)  # where Newton's method begins
+    problem = ConicProblem(n + 14 * len(links), rough=True)  # seven digits are enough to start Newton's method
     to_delta = np.zeros((n, n + 14 * len(links)))
     to_delta[:, :n] = np.diag(prior.scales)
     hold(problem, conditions, to_delta, inside)

@@ -279,7 +279,7 @@ def _multipliers(statement: Statement, Z: Sequence[Sequence[Fraction]], y: Seque
         row = y[place : place + len(block.entries)]
         place += len(block.entries)
         if any(row):
-            # Of equalities it is E delta + e that is multiplied, as of blocks.
+            # Multipliers of equalities apply to E delta + e, as those of blocks do.
             texts[block.name] = [rational_text(-factor) for factor in row]
     return {"base": [rational_text(factor) for factor in y[: len(statement.K)]], "multipliers": texts}
 

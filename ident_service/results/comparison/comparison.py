@@ -4,7 +4,7 @@ Parameters are the same where their expressions are: two runs of one arm, or two
 has is listed and left out. Whether anything has changed is `estimation/drift.py`'s to say; where a side has no
 covariance, as tables in papers, there are differences and no verdict.
 
-The shape of friction (way of pre-sliding, Stribeck velocity) may be fitted to each recording. With another shape the
+The shape of friction (pre-sliding distance, Stribeck velocity) may be fitted to each recording. With another shape the
 same parameter is another quantity, and no covariance knows of it: friction of such a joint is not compared, and without
 it nothing is called unchanged.
 """

@@ -86,7 +86,7 @@ def z_figure(found: Drift, place: int) -> Figure:
     for k in range(size):
         x, y = float(axes.x(k + 1.0)), float(axes.y(shown[k]))
         beyond = found.p[k] < ALPHA
-        # Shape tells what colour tells.
+        # Shape repeats what colour shows.
         if beyond:
             canvas.rectangle("bad", x - 3.6, y - 3.6, 7.2, 7.2)
         else:

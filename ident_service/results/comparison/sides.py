@@ -26,7 +26,7 @@ from ident_service.results.information_document import information_from
 from ident_service.results.parameter_file import ParameterFile, read_parameters
 from ident_service.results.run_folder import PARAMETERS, read_results
 
-_DECIMALS = 9  # of a coefficient of an expression, in which two arms of one kind agree
+_DECIMALS = 9  # of coefficients; expressions that agree to these are the same parameter
 Key = tuple[tuple[str, float], ...]
 
 
@@ -90,7 +90,7 @@ class Side:
         size = self.file.base.size
         if len(rows) != size or any(len(row) != size for row in rows):
             raise ParameterError(f"{self.path}: covariance is not {size} by {size}")
-        # Where nothing was seen, what belongs to it is no number either.
+        # Covariances with an unseen parameter are null in the file, too.
         unseen = np.array([rows[k][k] is None for k in range(size)])
         matrix = np.array([[0.0 if value is None else value for value in row] for row in rows], dtype=float)
         matrix[unseen, :] = matrix[:, unseen] = 0.0

@@ -85,7 +85,7 @@ def ellipsoid(inertial: Array) -> tuple[float, Array, Array | None]:
         return m, np.zeros(3), None
     center = np.array([lx, ly, lz]) / m
     L = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    # About the origin; the centre's own share goes (Steiner).
+    # Shift from the origin to the centre of mass (Steiner).
     second = 0.5 * np.trace(L) * np.eye(3) - L - m * np.outer(center, center)
     values, vectors = np.linalg.eigh(second)
     if values[0] <= 0.0:

@@ -27,7 +27,7 @@ class Estimated:
         margin: of the feasibility test, whose sign is the verdict; None where it was not tested.
         identification: relative torque error on what was fitted to (eq. 84) [percent]; None where it was not computed.
         validation: likewise on every recording that was never fitted to.
-        moving: as `identification`, without rows of joints near standstill, whose friction nobody knows.
+        moving: as `identification`, without rows of joints near standstill, whose friction is unknown.
         moving_validation: likewise on every recording that was never fitted to.
         moving_joints: as `moving` and `moving_validation`, joint by joint, each in percent of the joint's own torque;
             one row for what was fitted to, then one per recording that was not; empty where it was not told.

@@ -31,7 +31,7 @@ from ident_service.results.strict_json import strict_json
 
 EVIDENCE = "evidence.json"
 MAX_BYTES = 64 * 2**20
-_LARGEST_LOG = 60.0  # ten to the power of
+_LARGEST_LOG = 60.0  # largest decimal logarithm
 
 
 def write_evidence(path: Path, evidence: Evidence) -> None:

@@ -67,7 +67,7 @@ def deviation_figure(parameters: ParameterFile) -> Figure | None:
         canvas.text("soft halo", LEFT + 4, y - 3, f"{100 * level:g} %", size=FONT)
     for place in range(size):
         kind = _KINDS.get(verdicts[place] if place < len(verdicts) else "", "good")
-        # Shape tells what colour tells: a ring would not be seen at this size, but a square is.
+        # Shape repeats what colour shows: a ring would not be seen at this size, but a square is.
         x, y = float(axes.x(place + 1)), float(axes.y(shown[place]))
         if kind == "good":
             canvas.circle(kind, x, y, 3.4)

@@ -96,7 +96,7 @@ def reservations(evidence: Evidence, parameters: ParameterFile) -> list[str]:
     if count := verdicts.count("unidentified"):
         found.append(f"{count} of {len(verdicts)} base parameters are unidentified: these recordings do not tell them.")
     fit = parameters.content.get("fit")
-    # A large number by itself is no reservation: it depends on units, and parameters may be identified in spite of it.
+    # A large number by itself is no limitation: it depends on units, and parameters may be identified in spite of it.
     if fit is not None and "unidentified" in verdicts and (fit["condition_number"] or np.inf) > ILL_CONDITIONED:
         size = "infinite" if fit["condition_number"] is None else number(fit["condition_number"])
         found.append(
