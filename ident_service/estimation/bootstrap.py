@@ -86,7 +86,7 @@ def bootstrap(
         fit: its weights per joint count for every replicate.
         base: grouping of the parameters.
         conditions: the feasible set.
-        replicates: how many; at least 2.
+        replicates: number of resampled recordings; at least 2.
         seed: of the draws; the same seed gives the same replicates.
         solve: from a replicate's least squares to base parameters of shape (base,); the constrained least squares
             (eq. 74) over `conditions` when None.

@@ -26,7 +26,7 @@ _WANTED = "return a list of cvxpy constraints, or a pair of such a list and a co
 
 
 class CustomError(ParameterError):
-    """Report that `constraints.custom` cannot be imported or called, or returns nothing convex."""
+    """Report that `constraints.custom` cannot be imported or called, or returns something that is not convex."""
 
 
 @dataclass(frozen=True)

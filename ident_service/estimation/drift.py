@@ -82,7 +82,7 @@ class Motion:
 
         Args:
             information: the equations.
-            beta: all base parameters of the one who was identified from them, SI units, shape (base,).
+            beta: all base parameters that were identified from them, SI units, shape (base,).
             places: which of them the responses are about, in their order; all when None.
         """
         wanted = np.arange(information.base) if places is None else np.array(places, dtype=np.intp)
@@ -155,9 +155,9 @@ class Effect:
     """Test result of one physical effect: friction or drive inertia of a joint, first moments or inertia of a link.
 
     Attributes:
-        kind: what it is.
+        kind: of effect.
         number: of the joint or link, from 1.
-        places: which parameters it has.
+        places: indices of its parameters.
         test: that they have not changed.
         p: of the test, after Holm.
         joint: the one whose torque changes most for its size, from 0; None where no motion is known.

@@ -83,7 +83,7 @@ def smoothed(
 
     Args:
         recording: to read.
-        options: how.
+        options: how to smooth.
         coupling: drive coordinates per joint coordinates, shape (joints, joints); the identity when None.
         fmt: what to trim, what a gap is, and the rate; the defaults when None.
 

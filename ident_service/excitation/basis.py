@@ -97,9 +97,9 @@ class PostureBasis:
     """Family of motions through postures and back, each segment forwards and backwards in its own time.
 
     Attributes:
-        postures: how many.
+        postures: number of postures.
         times: durations of the segments [s], there and back again: 2 (postures - 1) of them.
-        dwell: how long the arm stands at each posture [s].
+        dwell: time that the arm stands at each posture [s].
     """
 
     postures: int

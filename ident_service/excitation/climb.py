@@ -52,7 +52,7 @@ class Candidate:
 
 
 def random_variables(problem: Problem, rng: np.random.Generator, safe: Array) -> Array:
-    """Return the variables of a random motion about a random posture, or about the safe one every third time.
+    """Return the variables of a random motion about a posture between the safe one and a random one.
 
     Args:
         problem: of the search.

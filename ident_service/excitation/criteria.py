@@ -45,7 +45,7 @@ def criterion(
     """Evaluate a criterion and its gradient.
 
     Args:
-        kind: which.
+        kind: of criterion.
         G: information matrix, shape (base, base).
         sharpness: exponent of the condition number's power means.
         chosen: for `a_optimal`, which parameters; all when None.

@@ -66,7 +66,7 @@ class FourierPath:
 
     Attributes:
         series: the periodic motion.
-        periods: how often it repeats at full size.
+        periods: number of repetitions at full size.
         ramp: length of the swelling and of the dying down [s]; 0 for a motion that begins and ends moving.
     """
 
@@ -167,7 +167,7 @@ class PosturePath:
     Attributes:
         points: postures in the order they are visited [rad or m], shape (postures, joints).
         times: durations of the segments [s], shape (postures - 1,).
-        dwell: how long the arm stands at each posture [s].
+        dwell: time that the arm stands at each posture [s].
     """
 
     points: Array

@@ -156,8 +156,8 @@ class _Family:
     """Pairs of a capsule with one kind of solid.
 
     Attributes:
-        rows: which rows of all contacts they are.
-        capsules: how many capsules there are in all.
+        rows: their rows among all contacts.
+        capsules: number of all capsules.
     """
 
     def __init__(

@@ -97,7 +97,7 @@ def local_polynomial(values: Array, length: int, degree: int, derivative: int, p
         values: shape (samples, ...), at least `length` samples.
         length: samples of a window, odd and more than `degree`.
         degree: of the polynomial.
-        derivative: which, 0 for the value itself.
+        derivative: its order, 0 for the value itself.
         period: of the samples [s].
 
     Returns:

@@ -124,7 +124,7 @@ def write_payload(path: Path, document: Any) -> None:
 
 
 def payload_text(payload: Payload, arm: KnownArm) -> str:
-    """Return several lines of plain text, ending with a line break."""
+    """Describe a payload in several lines of plain text, ending with a line break."""
     word, meaning = _WORDS[payload.verdict]
     names, test = arm.model.chain.names, payload.test
     lines = [

@@ -50,7 +50,7 @@ class Block:
     """Named condition on delta: an affine map into a symmetric matrix or into numbers that must be positive.
 
     Attributes:
-        name: what it says, for people.
+        name: of the condition, for people.
         size: rows of the symmetric matrix; 0 for a list of numbers.
         F: affine map, shape (entries, parameters); entries of a matrix are its upper triangle, column by column.
         f: constant part, shape (entries,).

@@ -50,7 +50,7 @@ class Near:
     Attributes:
         origin: base parameters that they move from [SI], shape (base,).
         metric: N above, shape (rows, base).
-        moves: which of them may, shape (base,).
+        moves: which base parameters may move, shape (base,).
     """
 
     origin: Array
@@ -68,7 +68,7 @@ class _Matrix:
 
     Attributes:
         value: shape (size, size).
-        directions: which change it, shape (changing,).
+        directions: free directions that change the matrix, shape (changing,).
         slopes: its derivatives along them, shape (changing, size, size).
         bounded: whether its trace is part of f, as that of a link's inertia is.
     """

@@ -68,7 +68,7 @@ class ConicProblem:
     """Conic problem: constraints are added one by one, then it is solved.
 
     Attributes:
-        variables: how many.
+        variables: number of variables.
         rough: whether seven digits are enough, and a problem that is hard may stay unsolved.
     """
 

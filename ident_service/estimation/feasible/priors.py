@@ -43,7 +43,7 @@ class Prior:
     """Prior values of the link parameters, and their weight.
 
     Attributes:
-        kind: which divergence.
+        kind: of divergence.
         names: link parameters.
         delta: their values [SI], shape (parameters,).
         weight: of one unit of divergence against one residual variance; 0 for none.

@@ -26,7 +26,7 @@ class Rows:
     """Constraint `F x + f` in one cone.
 
     Attributes:
-        cone: which.
+        cone: kind of cone.
         F: shape (rows, variables).
         f: shape (rows,).
         size: rows of the matrix, for `semidefinite`; off-diagonal entries carry sqrt(2).

@@ -150,7 +150,7 @@ def repair(
         equations: coefficients by unknown.
         right: right-hand sides.
         values: what is nearly a solution.
-        weight: how readily an unknown may change.
+        weight: the larger, the sooner an unknown is changed.
 
     Returns:
         The values that solve the equations, or None where these contradict each other.

@@ -21,13 +21,13 @@ class Finding:
     """Description of one change, for a person.
 
     Attributes:
-        what: and of which joint or link.
+        what: name of the changed quantity, and of its joint or link.
         sigma: length of the change in standard deviations.
         joint: the one whose torque changes most for its size; empty where no motion is known.
         torque_share: of that joint's torque, by which its prediction changes; None likewise.
         residual_share: of what is unexplained of it; None likewise.
-        size: how much, in words; may be empty.
-        meaning: what it may mean.
+        size: of the change, in words; may be empty.
+        meaning: possible meaning, in words.
     """
 
     what: str

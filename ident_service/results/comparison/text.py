@@ -20,7 +20,7 @@ LEFT_OUT = (
 
 
 def comparison_text(comparison: Comparison) -> str:
-    """Return several lines of plain text, ending with a line break."""
+    """Describe a comparison in several lines of plain text, ending with a line break."""
     lines = [f"reference: {_called(comparison.reference)}"]
     for pair in comparison.pairs:
         lines += [f"compared:  {_called(pair.side)}", "", *_pair(comparison, pair)]

@@ -131,7 +131,7 @@ class Condition:
     """Margin of the link parameters in one condition of the feasible set.
 
     Attributes:
-        name: what it says.
+        name: of the condition, for people.
         links: the links that it is about, counted from 0.
         margin: its smallest eigenvalue or number, SI units.
         scaled: the same in units of its reference scales, comparable between conditions.
@@ -188,7 +188,7 @@ class Timing:
         largest: the largest lateness or distance from the usual step [s].
         compute: the longest time a cycle computed [s]; None where it is not known.
         gaps: per gap, seconds after the first sample and its length [s], the longest first, at most 100.
-        gap_count: how many gaps there are.
+        gap_count: number of gaps.
         lost: frames lost; None where it is not known.
         invalid: per joint, the cycles in which it did not answer; empty where it is not known.
         oldest: per joint, the most cycles that a position was old; empty where it is not known.

@@ -168,7 +168,7 @@ def spread(x: Array, y: Array, most: int = 400, bins: int = 50) -> tuple[Array, 
     Args:
         x: shape (points,).
         y: likewise.
-        most: how many to keep.
+        most: number of points to keep.
         bins: equal parts of the range of x, each with an equal right to points.
     """
     if len(x) <= most:

@@ -36,7 +36,7 @@ class Figure:
     Attributes:
         slug: name of its file, without an ending.
         title: what a screen reader says first.
-        description: what it shows, for who cannot see it.
+        description: content of the drawing, for readers who cannot see it.
         caption: what it says, what good looks like and what bad.
         canvas: the drawing.
         zoom: for time plots.
