@@ -1,1 +1,1 @@
-"""Estimation: from equations to parameters a real body could have, with their doubt."""
+"""Estimate parameters that a real body could have from equations, with their uncertainty."""

@@ -1,4 +1,4 @@
-"""Doubt of an estimate that is no linear function of the torques, by drawing the recording again.
+"""Estimate the uncertainty of estimates that are not linear in the torques, by a moving-block bootstrap.
 
 A feasible set bends the estimate where it binds, and no formula as eq. 81 follows it there. So runs of consecutive
 blocks of about a second are drawn with replacement (Kunsch 1989; wrapped around the end, Politis and Romano 1992) and
@@ -7,8 +7,6 @@ factors of the blocks that it contains, each times the root of how often it was 
 
 Where the true parameters lie on the boundary of the set itself, no bootstrap of this kind converges to their
 distribution (Andrews 2000): there it indicates, and intervals by percentiles at least stay inside the set's bounds.
-
-Boundary: pure computation, no I/O.
 """
 
 from __future__ import annotations
@@ -38,7 +36,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Bootstrap:
-    """How an estimate scatters over recordings that could have been made instead.
+    """Scatter of an estimate over resampled recordings.
 
     Attributes:
         betas: the estimate of each replicate in SI units, shape (replicates, base).
@@ -81,14 +79,14 @@ def bootstrap(
     level: float = 0.95,
     progress: Progress = lambda _done, _all: None,
 ) -> Bootstrap:
-    """Estimate again and again from blocks drawn with replacement.
+    """Repeat the estimate for recordings resampled from blocks drawn with replacement.
 
     Args:
         equations: what `fit` was fitted to, in blocks of time.
         fit: its weights per joint count for every replicate.
         base: grouping of the parameters.
         conditions: the feasible set.
-        replicates: how many; at least 2.
+        replicates: number of resampled recordings; at least 2.
         seed: of the draws; the same seed gives the same replicates.
         solve: from a replicate's least squares to base parameters of shape (base,); the constrained least squares
             (eq. 74) over `conditions` when None.
@@ -145,7 +143,7 @@ def constrained_intervals(
     replicates: int | None = None,
     seed: int = 0,
 ) -> Array:
-    """Find 95 % intervals of a constrained estimate where conditions bend it, by a parametric bootstrap in the set.
+    """Return 95 % intervals of a constrained estimate from a parametric bootstrap in the feasible set.
 
     Unconstrained estimates are drawn around the constrained one with the covariance of the unconstrained, and each is
     constrained again. There are few replicates, for a fraction of a second, so each side of an interval is Student's t
@@ -190,7 +188,7 @@ def constrained_intervals(
 
 
 def drawn(rng: np.random.Generator, count: int, length: int) -> NDArray[np.int64]:
-    """How often each of `count` blocks is drawn in runs of `length`, `count` in all, shape (count,)."""
+    """Return how often each of `count` blocks is drawn, in runs of `length` and `count` in all, shape (count,)."""
     starts = rng.integers(0, count, size=-(-count // length))
     chosen = ((starts[:, None] + np.arange(length)) % count).ravel()[:count]
     return np.bincount(chosen, minlength=count)
@@ -208,7 +206,7 @@ def _least_squares(
 
 
 def run_length(equations: Equations, fit: LeastSquares) -> int:
-    """Consecutive blocks to draw together, so that a run holds what neighbours have in common; at least 1.
+    """Return how many consecutive blocks to draw together so that correlated neighbours stay together; at least 1.
 
     The rule of Politis and White (2004, corrected by Patton, Politis and White 2009) for the circular block bootstrap,
     from the autocorrelation of what each block adds to the estimate, pooled over the parameters.

@@ -1,4 +1,4 @@
-"""Choose between ways to estimate by what predicts parts of the recordings that were held out.
+"""Choose between ways to estimate by the prediction error on held-out parts of the recordings.
 
 The recordings are cut into thirds; each third's torques are predicted from the other two, as a validation would do it.
 Nothing but the recordings that are fitted to is looked at.
@@ -26,12 +26,12 @@ _PARTS = 3
 
 # A choice is left at its usual value for less: held-out errors of so few parts differ by as much from chance.
 _WORTH = 0.99
-_SPREADS = 2.0  # standard deviations between thirds, that a gain of the model's must be
+_SPREADS = 2.0  # standard deviations between thirds that a gain must exceed
 
 
 @dataclass(frozen=True)
 class Choice:
-    """Record what was chosen for the estimate, and what the alternatives predict.
+    """Chosen value of one option, with the held-out errors of all alternatives.
 
     Attributes:
         option: key in the configuration's section `identification`.
@@ -56,7 +56,7 @@ def chosen(option: str, held_out: Mapping[str, float]) -> Choice:
 
 
 def clearly_chosen(option: str, held_out: Mapping[str, Array]) -> Choice:
-    """Choose the first, unless another predicts every third better, by more than the thirds differ.
+    """Choose the first alternative, unless another predicts every third better, by more than the thirds differ.
 
     Args:
         option: key in the configuration's section `identification`.
@@ -84,7 +84,7 @@ def clearly_chosen(option: str, held_out: Mapping[str, Array]) -> Choice:
 def held_out_thirds(
     parts: Sequence[Information], weights: Array, base: BaseParameters, conditions: FeasibleSet
 ) -> Array:
-    """Predict the torques of each part from the feasible estimate of the others.
+    """Return the torque error of each part, predicted from the feasible estimate of the other parts.
 
     Args:
         parts: equations of consecutive stretches of time.
@@ -113,7 +113,7 @@ def held_out_thirds(
 
 
 def held_out_error(blocks: Sequence[Information], weights: Array) -> float:
-    """Predict the torques of each third of the recordings from the other two.
+    """Return the torque error of the thirds of the recordings, each predicted from the other two.
 
     Args:
         blocks: equations of consecutive stretches of time.

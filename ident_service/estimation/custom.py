@@ -26,12 +26,12 @@ _WANTED = "return a list of cvxpy constraints, or a pair of such a list and a co
 
 
 class CustomError(ParameterError):
-    """`constraints.custom` cannot be imported or called, or returns what is no convex knowledge."""
+    """Report that `constraints.custom` cannot be imported or called, or returns something that is not convex."""
 
 
 @dataclass(frozen=True)
 class CustomFunction:
-    """A function that a description names.
+    """Python function that a description names in `constraints.custom`.
 
     Attributes:
         name: `module:function`.
@@ -48,7 +48,7 @@ class CustomFunction:
     def constraints(
         self, link: Mapping[str, cp.Expression], base: Mapping[str, cp.Expression]
     ) -> tuple[list[cp.Constraint], cp.Expression | None]:
-        """Call the function and check what it returns.
+        """Call the function and return its checked constraints and penalty.
 
         Args:
             link: link parameters in SI units by their names (`m7`).
@@ -145,7 +145,7 @@ def _importable(folder: Path) -> Iterator[None]:
 
 
 def _told(error: BaseException, file: str) -> str:
-    """Say an error in one line, with the last line of the user's own file that led to it."""
+    """Format an error in one line, with the last line of the user's own file that led to it."""
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if Path(frame.filename).name == file]
     place = f" ({file}, line {frames[-1].lineno})" if frames else ""
     text = " ".join(str(error).split())[:300]

@@ -1,10 +1,10 @@
-"""The delay between the position and the torque of a recording, to a fraction of a sample.
+"""Estimate the delay between the position and the torque of a recording, to a fraction of a sample.
 
 A torque stamped d too late is `tau(t) = f(t - d)`, to first order `f(t) - d f'(t)`, with f the torque that the motion
 needs. So d is the coefficient of one more column, minus the rate of the predicted torque, in the same least squares;
 a few rounds with the shifted torque make the first order exact.
 
-A delay that nobody asked for is taken where it predicts held-out thirds clearly better (`choices.py`). That is judged
+A delay that was not asked for is taken where it predicts held-out thirds clearly better (`choices.py`). That is judged
 by feasible estimates: without conditions the first order gives a KUKA 29 ms that are not there.
 """
 
@@ -32,13 +32,13 @@ from ident_service.record.recording import Recording
 _SETTLED = 1e-6  # s
 _MOST_ROUNDS = 30
 _STEP, _STEPS = 2e-3, 4  # s and number: least and most steps, of at least a sample, in the search for a delay
-_FINEST = 0.1  # steps; a smaller difference is none
+_FINEST = 0.1  # steps; smaller differences do not count
 _LARGEST = 0.2  # s; beyond this the channels do not belong together
 
 
 @dataclass(frozen=True)
 class Delay:
-    """How much later the torque's stamps are than the position's.
+    """Delay of the torque's stamps against the position's.
 
     Attributes:
         seconds: the estimate [s]; negative where the torque is stamped early.
@@ -50,7 +50,7 @@ class Delay:
 
 
 def with_delay(model: ArmModel, seconds: float) -> ArmModel:
-    """The same arm, its recordings' torque taken to be stamped `seconds` too late."""
+    """Return the arm with its recordings' torque taken to be stamped `seconds` [s] too late."""
     options = model.config.identification.model_copy(update={"delay": seconds})
     return replace(model, config=model.config.model_copy(update={"identification": options}))
 
@@ -92,7 +92,7 @@ def estimate_delay(recordings: Sequence[Recording], model: ArmModel, base: BaseP
 def choose_delay(
     trials: FrictionTrials, period: float, base: BaseParameters, conditions: FeasibleSet
 ) -> tuple[float, Choice | None]:
-    """Look for a delay of a few samples, common to all joints, and take none unless it is clearly better.
+    """Choose a delay of a few samples, common to all joints; zero unless a delay is clearly better.
 
     Args:
         trials: rows of the recordings that are fitted to.
@@ -132,7 +132,7 @@ def choose_delay(
 
 
 def _first_order(recordings: Sequence[Recording], model: ArmModel, base: BaseParameters) -> tuple[float, float]:
-    """The remaining delay, and its deviation, to first order."""
+    """Return the remaining delay [s] and its standard deviation [s], to first order."""
     fit = weighted_least_squares(equations(recordings, model, base).total)
     joint_supports = supports(model.chain, model.layout, base.base)
     factor: Array | None = None

@@ -1,4 +1,4 @@
-"""What Coulomb friction is multiplied by: the sign of the velocity, or what becomes of it near standstill.
+"""Compute the factor of Coulomb friction: the sign of the velocity, or Dahl's pre-sliding state near reversals.
 
 A drive that turns round does not change its friction at once: teeth and bearings give by some micrometres or
 milliradians first. The simplest law for that is Dahl's (1968),
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 
 def direction(rate: Array, period: float, presliding: Array, start: Array | None = None) -> Array:
-    """Direction of friction, between -1 and 1.
+    """Return the direction of friction of each drive, between -1 and 1.
 
     Args:
         rate: drive velocities [rad/s or m/s], shape (samples, drives).

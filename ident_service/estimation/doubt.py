@@ -1,4 +1,4 @@
-"""How sure an estimate is: covariance from blocks of scores, and a verdict per base parameter.
+"""Estimate parameter uncertainty: covariance from blocks of scores, and a verdict per base parameter.
 
 Eq. 81 takes residuals for independent from sample to sample; smoothing and unmodelled friction make neighbours alike.
 Here the variance of the score `W^T (omega - W beta)` is estimated from blocks of about a second (a cluster-robust
@@ -34,21 +34,21 @@ if TYPE_CHECKING:
 
 Verdict = Literal["identified", "weak", "unidentified"]
 
-# Of a joint's torque over the motion, all root mean squares: a parameter that makes less is as good as zero.
+# Share of a joint's torque over the motion (root mean squares); a parameter with less effect is as good as zero.
 NEGLIGIBLE_TORQUE = 0.10
 IDENTIFIED_BELOW = 0.10
 WEAK_BELOW = 0.50
-_ALONE = 1.0 - 1e-4  # leverage of a direction that one block alone tells about
-_SEEN_ALONE = 1e-3  # share of a parameter's variance along such directions, from which its own is not known
+_ALONE = 1.0 - 1e-4  # leverage above which one block alone determines a direction
+_SEEN_ALONE = 1e-3  # share of a parameter's variance along such directions, above which it is unknown
 _MOST_DEGREES = 1e6
-_LONGER = (2, 4)  # blocks that are also taken as one
+_LONGER = (2, 4)  # numbers of neighbouring blocks that are also merged into one
 _LEAST_CLUSTERS = 5
 _NORMAL = 1.959963984540054  # 97.5 % of the normal distribution
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """How sure an unconstrained estimate is.
+    """Covariance and standard deviations of an unconstrained estimate.
 
     Attributes:
         covariance: shape (base, base), SI units; infinite on the diagonal for what the data, or more than one block of
@@ -68,7 +68,7 @@ class Uncertainty:
 
 @one_blas_thread()
 def uncertainty(equations: Equations, fit: LeastSquares) -> Uncertainty:
-    """Estimate covariance and degrees of freedom from blocks.
+    """Estimate covariance, standard deviations and degrees of freedom from blocks.
 
     Args:
         equations: in blocks.
@@ -140,7 +140,7 @@ def jackknife(
 
 
 def _noise(clusters: Sequence[Sequence[Information]], fit: LeastSquares) -> Array | None:
-    """Give the variances by what differs between blocks of the same motion; None where most blocks have no other."""
+    """Return the variances from differences between blocks of the same motion; None where most blocks have no other."""
     differing = np.zeros((len(fit.beta), len(fit.beta)))
     repeated = rows = 0
     for cluster in clusters:
@@ -155,7 +155,7 @@ def _noise(clusters: Sequence[Sequence[Information]], fit: LeastSquares) -> Arra
 
 
 def widening(degrees: Array) -> Array:
-    """Give what deviations are multiplied by so that 1.96 of them are the 95 % of Student's t.
+    """Return the factors of standard deviations that make 1.96 of them the 95 % of Student's t, shape (base,).
 
     Args:
         degrees: of freedom, shape (base,).
@@ -166,7 +166,7 @@ def widening(degrees: Array) -> Array:
 
 
 def _degrees(lengths: Array, images: Array) -> Array:
-    """Satterthwaite's degrees tr(G)^2 / |G|^2 of each, of the quadratic form G of errors that its variance is.
+    """Return Satterthwaite's degrees of freedom tr(G)^2 / |G|^2 of each variance, the quadratic form G of the errors.
 
     With white errors, G_bc = [b = c] |g_b|^2 - m_b . m_c for blocks b and c: g_b is what the block's errors are
     multiplied by (squared lengths `lengths`, shape (blocks, asked)), m_b its image under the estimate (`images`, shape
@@ -181,12 +181,12 @@ def _degrees(lengths: Array, images: Array) -> Array:
 
 
 def block_covariance(equations: Equations, fit: LeastSquares) -> Array:
-    """Estimate the covariance alone, shape (base, base), see `Uncertainty`."""
+    """Return the covariance alone, shape (base, base), see `Uncertainty`."""
     return uncertainty(equations, fit).covariance
 
 
 def negligible(information: Information) -> Array:
-    """Give sizes below which parameters are as good as zero on a motion, shape (base,), SI units.
+    """Return the sizes below which parameters are as good as zero on a motion, shape (base,), SI units.
 
     A parameter of this size makes a tenth of the torque of some joint that feels it, and no more of any other's. So a
     deviation of a tenth of it, with which it is called identified, is a hundredth of the joint's torque.
@@ -201,7 +201,7 @@ def negligible(information: Information) -> Array:
 
 
 def verdicts(beta: Array, deviations: Array, as_zero: Array) -> tuple[Verdict, ...]:
-    """Give a word per parameter: its deviation against the larger of its size and what is as good as zero.
+    """Return a verdict per parameter: its deviation against the larger of its size and what is as good as zero.
 
     Args:
         beta: parameters, shape (base,).
@@ -215,7 +215,7 @@ def verdicts(beta: Array, deviations: Array, as_zero: Array) -> tuple[Verdict, .
 
 
 def shares(beta: Array, deviations: Array, as_zero: Array) -> Array:
-    """Give each deviation as a share of the larger of the parameter's size and what is as good as zero."""
+    """Return each deviation as a share of the larger of the parameter's size and what is as good as zero."""
     sizes = np.maximum(np.maximum(np.abs(beta), as_zero), np.finfo(float).tiny)
-    # What no joint feels has neither size nor deviation.
+    # Parameters that no joint feels have infinite negligible sizes.
     return np.where(np.isfinite(deviations), deviations, np.inf) / np.where(np.isfinite(sizes), sizes, 1.0)

@@ -1,4 +1,4 @@
-"""Has an arm changed between two identifications? The statistics of the difference of two parameter sets.
+"""Test whether an arm has changed between two identifications, by the difference of two parameter sets.
 
 With d the difference of the base parameters and S = S_1 + S_2 the sum of their covariances,
 
@@ -21,7 +21,7 @@ Constrained estimates: their covariance here is that of the unconstrained fit. P
 estimates closer together, not apart, so such a test is on the careful side. Where a file has its unconstrained values,
 those are compared, to which the covariance belongs.
 
-Boundary: pure computation, no I/O. What a change may mean is `drift_causes.py`.
+`drift_causes.py` explains what a change may mean.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ RELEVANT_TORQUE = 0.01
 # says how well; model error does neither, and shows in the residual alone.
 RELEVANT_RESIDUAL = 0.25
 
-_NO_VARIANCE = 1e-10  # of an eigenvalue of the correlation matrix, against the largest
+_NO_VARIANCE = 1e-10  # smallest eigenvalue of the correlation matrix, as a share of the largest
 _ROUNDING = 8.0 * np.finfo(float).eps
 _KINDS: dict[str, Kind] = {
     **dict.fromkeys(INERTIAL[:6], "inertia"),
@@ -63,7 +63,7 @@ _KINDS: dict[str, Kind] = {
 
 @dataclass(frozen=True)
 class Motion:
-    """What a recorded motion makes of base parameters.
+    """Torque response of a recorded motion to changes of the base parameters.
 
     Attributes:
         responses: per joint a matrix whose product with a difference of parameters has as its length the root mean
@@ -78,11 +78,11 @@ class Motion:
 
     @classmethod
     def of(cls, information: Information, beta: Array, places: Sequence[int] | None = None) -> Motion:
-        """From the equations of a recording.
+        """Return the torque response of a recording from its equations.
 
         Args:
             information: the equations.
-            beta: all base parameters of the one who was identified from them, SI units, shape (base,).
+            beta: all base parameters that were identified from them, SI units, shape (base,).
             places: which of them the responses are about, in their order; all when None.
         """
         wanted = np.arange(information.base) if places is None else np.array(places, dtype=np.intp)
@@ -96,20 +96,20 @@ class Motion:
         return cls(tuple(responses), np.sqrt(torque) / rows, np.sqrt(residual) / rows)
 
     def change(self, difference: Array) -> Array:
-        """Root mean square of each joint's change of torque [N m or N], shape (joints,)."""
+        """Return the root mean square of each joint's change of torque [N m or N], shape (joints,)."""
         return np.array([float(np.linalg.norm(response @ difference)) for response in self.responses])
 
 
 @dataclass(frozen=True)
 class Identified:
-    """What one identification says of the base parameters that two have in common.
+    """Values and covariance, from one identification, of the base parameters that two identifications share.
 
     Attributes:
         leading: the link parameter that each base parameter is named after, `fv2` for example.
         values: unconstrained where known, SI units, shape (base,).
         covariance: of them, infinite on the diagonal where nothing was seen, shape (base, base).
         blocks: stretches of time that the covariance comes from; None where it is known exactly.
-        motion: of the recordings that were fitted to; None where nobody kept it.
+        motion: of the recordings that were fitted to; None where it was not kept.
     """
 
     leading: tuple[str, ...]
@@ -128,7 +128,7 @@ class Identified:
 
 @dataclass(frozen=True)
 class Test:
-    """A test that some parameters have not changed.
+    """Result of a test that some parameters have not changed.
 
     Attributes:
         statistic: T^2, the squared length of the difference in deviations.
@@ -146,18 +146,18 @@ class Test:
 
     @property
     def sigma(self) -> float:
-        """Length of the difference in deviations; |z| of a single parameter."""
+        """Return the length of the difference in standard deviations; |z| of a single parameter."""
         return float(np.sqrt(self.statistic))
 
 
 @dataclass(frozen=True)
 class Effect:
-    """One effect that may have changed.
+    """Test result of one physical effect: friction or drive inertia of a joint, first moments or inertia of a link.
 
     Attributes:
-        kind: what it is.
+        kind: of effect.
         number: of the joint or link, from 1.
-        places: which parameters it has.
+        places: indices of its parameters.
         test: that they have not changed.
         p: of the test, after Holm.
         joint: the one whose torque changes most for its size, from 0; None where no motion is known.
@@ -179,7 +179,7 @@ class Effect:
 
 @dataclass(frozen=True)
 class Drift:
-    """The difference of two identifications.
+    """Difference of two identifications, tested per parameter, per effect and as a whole.
 
     Attributes:
         difference: second less first, shape (base,).
@@ -207,14 +207,14 @@ class Drift:
 
     @property
     def shares(self) -> tuple[Array, Array] | None:
-        """What all differences together change, as `torque_shares` has it; None without a motion."""
+        """Return the torque changes of all differences together, as `torque_shares` does; None without a motion."""
         if self.torque_share is None or self.residual_share is None:
             return None
         return self.torque_share, self.residual_share
 
     @cached_property
     def changes(self) -> tuple[Effect, ...]:
-        """The effects that have changed, the largest change of torque first."""
+        """Return the effects that have changed, the largest change of torque first."""
         found = [effect for effect in self.effects if effect.changed]
         return tuple(sorted(found, key=lambda effect: (-(effect.residual_share or 0.0), effect.p)))
 
@@ -234,7 +234,7 @@ def drift(first: Identified, second: Identified) -> Drift:
     difference = second.values - first.values
     total = np.diag(first.covariance) + np.diag(second.covariance)
     seen = np.isfinite(total)
-    # Values are printed with rounding; what is known exactly is known to that.
+    # Values are printed with rounding, so even exactly known values are known to that rounding only.
     rounding = _ROUNDING * (np.abs(first.values) + np.abs(second.values)) + np.finfo(float).tiny
     deviations = np.where(seen, np.maximum(np.sqrt(np.where(seen, total, 0.0)), rounding), np.inf)
     singles = [difference_test(first, second, (place,)) for place in range(len(difference))]
@@ -268,7 +268,7 @@ def drift(first: Identified, second: Identified) -> Drift:
 
 
 def holm(p: Sequence[float]) -> list[float]:
-    """Probabilities adjusted for their number (Holm 1979), in the order they came."""
+    """Return the probabilities adjusted for multiple tests (Holm 1979), in the order given."""
     order = np.argsort(p, kind="stable")
     adjusted = np.empty(len(p))
     adjusted[order] = np.maximum.accumulate(np.arange(len(p), 0, -1) * np.asarray(p, dtype=float)[order])
@@ -276,7 +276,7 @@ def holm(p: Sequence[float]) -> list[float]:
 
 
 def torque_shares(first: Identified, second: Identified, difference: Array) -> tuple[Array, Array] | None:
-    """What a difference of parameters does to the predicted torques, on the later motion that is known.
+    """Return the relative change of predicted torques for a change of parameters, on the later known motion.
 
     Returns:
         Per joint, root mean square of the change over that of the torque, and over that of what the parameters
@@ -290,7 +290,7 @@ def torque_shares(first: Identified, second: Identified, difference: Array) -> t
 
 
 def relevant(shares: tuple[Array, Array] | None) -> bool:
-    """Whether some joint's torque changes by enough of itself and of what is unexplained anyway."""
+    """Return whether some joint's torque changes by a relevant share of both the torque and its residual."""
     if shares is None:
         return True
     return bool(np.any((shares[0] >= RELEVANT_TORQUE) & (shares[1] >= RELEVANT_RESIDUAL)))
@@ -305,7 +305,7 @@ def _groups(leading: Sequence[str]) -> dict[tuple[Kind, int], tuple[int, ...]]:
 
 
 def difference_test(first: Identified, second: Identified, places: Sequence[int]) -> Test:
-    """Test that these parameters are the same in both.
+    """Test that these parameters are the same in both identifications.
 
     Args:
         first: one set.
@@ -326,7 +326,7 @@ def difference_test(first: Identified, second: Identified, places: Sequence[int]
     correlation = S / np.outer(scale, scale)
     correlation[exact, exact] = 1.0
     values, vectors = np.linalg.eigh(correlation)
-    # Largest variance first: what is left out is what the blocks cannot tell from exactly known.
+    # Largest variance first: directions left out are the best known, whose variances blocks cannot tell from zero.
     values, vectors = values[::-1], vectors[:, ::-1]
     rank = int(np.sum(values > _NO_VARIANCE * values[0]))
     whitening = (vectors[:, :rank] / np.sqrt(values[:rank])).T / scale
@@ -340,7 +340,7 @@ def difference_test(first: Identified, second: Identified, places: Sequence[int]
 
 
 def probability(statistic: float, directions: int, degrees: float) -> float:
-    """How often a larger T^2 comes about by chance, with `degrees` of freedom of its covariances."""
+    """Return the probability of a larger T^2 by chance, with `degrees` of freedom of its covariances."""
     if np.isinf(degrees):
         return float(scipy.special.chdtrc(directions, statistic))
     below = max(degrees - directions + 1.0, 1.0)
@@ -348,7 +348,7 @@ def probability(statistic: float, directions: int, degrees: float) -> float:
 
 
 def _degrees(parts: Sequence[Array], blocks: Sequence[int | None]) -> float:
-    """Degrees of freedom of a sum of covariances, each in the coordinates in which the sum is 1."""
+    """Return the degrees of freedom of a sum of covariances, each in the coordinates in which the sum is 1."""
     below = 0.0
     for part, count in zip(parts, blocks, strict=True):
         if count is not None:

@@ -1,4 +1,4 @@
-"""What a change of parameters may mean: the single cause that explains most of it, and words for a person at the arm.
+"""Find the single cause that explains most of a change of parameters, and describe it for a person at the arm.
 
 Base parameters group the parameters of neighbouring links, so a tool on the last link moves the base parameters of all
 links before it. A cause is a few link parameters (friction of a joint, drive inertia of a joint, the body of a link)
@@ -8,8 +8,6 @@ in units of its residual:
     1 - min_x |R (d - C x)|^2 / |R d|^2
 
 It describes, it does not test: whether anything has changed is for `drift.py` to say.
-
-Boundary: pure computation, no I/O.
 """
 
 from __future__ import annotations
@@ -26,7 +24,7 @@ from ident_service.model.layout import INERTIAL, TERM_SYMBOLS
 
 CauseKind = Literal["friction", "drive inertia", "body"]
 
-_AS_GOOD = 0.02  # causes that explain as much but for this: the one with fewer parameters is the simpler story
+_AS_GOOD = 0.02  # causes that explain as much within this share; the one with fewer parameters is preferred
 _FRICTION = frozenset(TERM_SYMBOLS.values()) - {TERM_SYMBOLS["drive_inertia"]}
 _MEANINGS: Mapping[str, str] = {
     "higher": "lubrication that ages or is cold, worn seals or bearings, a brake that drags",
@@ -58,7 +56,7 @@ class Cause:
 
 
 def causes(difference: Array, K: Array, names: Sequence[str], motion: Motion) -> list[Cause]:
-    """Every single cause, the best explanation first.
+    """Return every possible single cause of a difference, the best explanation first.
 
     Args:
         difference: of base parameters, SI units, shape (base,).
@@ -91,7 +89,7 @@ def causes(difference: Array, K: Array, names: Sequence[str], motion: Motion) ->
 
 
 def meaning_of_cause(cause: Cause, links: int) -> str:
-    """What it may mean, in words.
+    """Return the possible meaning of a cause, in words for a person at the arm.
 
     Args:
         cause: to explain.
@@ -103,14 +101,14 @@ def meaning_of_cause(cause: Cause, links: int) -> str:
 
 
 def meaning_of_effect(effect: Effect, found: Drift, leading: Sequence[str], links: int) -> str:
-    """As `meaning_of_cause`, of an effect that no single cause explains."""
+    """Return the possible meaning of an effect that no single cause explains, in words for a person at the arm."""
     if effect.kind == "friction":
         return _MEANINGS[_direction({leading[place]: float(found.difference[place]) for place in effect.places})]
     return _MEANINGS["last" if effect.number == links and effect.kind != "drive inertia" else effect.kind]
 
 
 def friction_ratio(first: Identified, second: Identified, joint: int) -> tuple[float, float] | None:
-    """Friction of a joint, second over first, at the root mean square of its speed.
+    """Return the friction of a joint, second over first, at the root mean square of its speed.
 
     Args:
         first: the reference.

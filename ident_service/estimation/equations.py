@@ -1,7 +1,8 @@
-"""One pass over a recording: smoothed samples become information, in blocks of about a second.
+"""Turn recordings into information on the base parameters, in blocks of about a second, in one pass.
 
-Residuals of neighbouring samples are correlated, so doubt is computed from blocks (`doubt.py`). The number of blocks is
-bounded: when there are too many, neighbours merge in pairs and blocks become longer, so memory stays constant.
+Residuals of neighbouring samples are correlated, so uncertainty is computed from blocks (`doubt.py`). The number of
+blocks is bounded: when there are too many, neighbours merge in pairs and blocks become longer, so memory stays
+constant.
 """
 
 from __future__ import annotations
@@ -30,14 +31,14 @@ from ident_service.record.grid import grid
 from ident_service.record.recording import Recording
 
 MAX_BLOCKS = 256
-LEAST_BLOCKS = 12  # deviations from fewer are hardly known themselves
+LEAST_BLOCKS = 12  # with fewer blocks the deviations themselves are hardly known
 _CHUNK = 4096  # samples whose regressor is computed at once
 _DECAY = 28.0  # -ln(1e-12)
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Equations of consecutive samples.
+    """Equations of consecutive samples: regressor and torque.
 
     Attributes:
         time: [s] since the recording's first sample, shape (samples,).
@@ -63,7 +64,7 @@ RowWeights = Callable[[Rows], Array]
 
 @dataclass(frozen=True)
 class Equations:
-    """What recordings say about the base parameters.
+    """Information of recordings on the base parameters, in blocks of time.
 
     Attributes:
         blocks: information of consecutive stretches of time, rows near standstill apart.
@@ -79,7 +80,7 @@ class Equations:
 
     @cached_property
     def clusters(self) -> tuple[tuple[Information, ...], ...]:
-        """Blocks that show the same motion, in the order in which each motion was first seen.
+        """Return the blocks grouped by motion, in the order in which each motion was first seen.
 
         What the model lacks errs by the same torque in all blocks of a cluster: they are no independent evidence.
         """
@@ -91,26 +92,26 @@ class Equations:
 
     @cached_property
     def total(self) -> Information:
-        """All blocks together."""
+        """Return the information of all blocks together."""
         return Information.sum(self.blocks)
 
     @cached_property
     def left_out(self) -> Information | None:
-        """All rows near standstill together, where they are apart."""
+        """Return the information of all rows near standstill, where they are apart; else None."""
         return Information.sum(self.near) if self.near else None
 
     @cached_property
     def everything(self) -> Information:
-        """All rows, those near standstill too: what an estimate is judged on (eq. 84)."""
+        """Return the information of all rows, near standstill too, which an estimate is judged on (eq. 84)."""
         return self.total if self.left_out is None else self.total.merged(self.left_out)
 
     @property
     def moving(self) -> Information:
-        """All rows in motion, or all rows where the motion turns round too often for any."""
+        """Return the information of all rows in motion, or of all rows where the motion reverses too often for any."""
         return self.total if self.total.rows.any() else self.everything
 
     def with_torques_times(self, scales: Array) -> Equations:
-        """The same equations with each joint's torque multiplied, `scales` of shape (joints,)."""
+        """Return the equations with each joint's torque multiplied by `scales`, shape (joints,)."""
         blocks, near = (tuple(one.with_torques_times(scales) for one in part) for part in (self.blocks, self.near))
         return replace(self, blocks=blocks, near=near)
 
@@ -129,7 +130,7 @@ def equations(
     base: BaseParameters,
     row_weights: RowWeights | None = None,
 ) -> Equations:
-    """Read recordings once and keep what they know.
+    """Read recordings once and return their equations in blocks.
 
     Args:
         recordings: to read, one or several.
@@ -207,7 +208,7 @@ def _gathered(
 
 
 def _block_seconds(recording: Recording, model: ArmModel) -> float:
-    """Give the length of a block [s]: shorter than asked for where a short recording would have too few."""
+    """Return the length of a block [s]: shorter than asked for where a short recording would have too few."""
     options = model.config.identification
     if options.period is not None:
         seconds = float(options.period)
@@ -218,7 +219,7 @@ def _block_seconds(recording: Recording, model: ArmModel) -> float:
 
 
 def equation_rows(recording: Recording, model: ArmModel, base: BaseParameters) -> Iterator[Rows]:
-    """The equations themselves, in chunks, for what needs more than one pass.
+    """Yield the equations themselves, in chunks, for methods that need more than one pass.
 
     Raises:
         RecordingError: the recording does not fit the arm or cannot be smoothed.
@@ -260,7 +261,7 @@ def _regressor(motion: Motion, model: ArmModel, base: BaseParameters, out: Array
 
 
 def _filtered_rows(recording: Recording, model: ArmModel, base: BaseParameters, cutoff: float) -> Iterator[Rows]:
-    """Both sides of eq. 59 through the same zero-phase low-pass, so that what it does to one it does to the other."""
+    """Yield rows with both sides of eq. 59 through the same zero-phase low-pass, so that both change alike."""
     options = model.config.identification
     slowest = 2.0 * np.pi * cutoff * np.sin(np.pi / (2 * options.smoothing.order))
     step, offset = int(options.smoothing.decimate), 0
@@ -317,6 +318,6 @@ def _pairs(labels: Sequence[Label]) -> list[tuple[int, int | None]]:
 
 
 def kept_motion(recording: Recording, options: Identification, coupling: Array | None = None) -> Motion:
-    """All smoothed samples of a recording at once, for scoring and drawing short recordings."""
+    """Return all smoothed samples of a recording at once, for scoring and drawing short recordings."""
     parts = list(smoothed(recording, options, coupling))
     return Motion(*(np.concatenate([getattr(part, name) for part in parts]) for name in Motion.__dataclass_fields__))

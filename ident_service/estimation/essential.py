@@ -1,4 +1,4 @@
-"""Essential parameters: the smallest model that predicts as well (Pham and Gautier 1991; Gautier 1997).
+"""Reduce a model to essential parameters: the smallest that predicts as well (Pham and Gautier 1991; Gautier 1997).
 
 From all base parameters, the one whose size is the smallest share of its own deviation leaves, the others are fitted
 again, and so on, until an F-test says that what is left predicts worse than the whole model did:
@@ -6,17 +6,15 @@ again, and so on, until an F-test says that what is left predicts worse than the
     F = (|omega - W_r beta_r|^2 - |omega - W beta|^2) / p  :  |omega - W beta|^2 / (N - n)
 
 with p parameters removed of n. Neighbouring residuals are alike, so N is not the number of rows but as many independent
-ones as would leave the same doubt: rows times the white variance (eq. 81) over the variance from blocks, the median
-over the parameters. Where neighbours are much more alike in some directions than in most, parameters there are kept
-that are within their own deviation: the test is on the careful side.
+ones as would leave the same uncertainty: rows times the white variance (eq. 81) over the variance from blocks, the
+median over the parameters. Where neighbours are much more alike in some directions than in most, parameters there are
+kept that are within their own deviation: the test is on the careful side.
 
 All of it happens in the n coordinates of the triangular factor, `rho_1 = R_1 beta + e` (eqs. 64-70), where the
 covariance of e is known from the blocks of the whole model: small matrices only, no look at the data.
 
 A removed parameter is one that this motion cannot tell from zero: what is left predicts motions like this one, and
 need not be feasible.
-
-Boundary: pure computation, no I/O.
 """
 
 from __future__ import annotations
@@ -37,7 +35,7 @@ from ident_service.model.threads import one_blas_thread
 
 @dataclass(frozen=True)
 class Elimination:
-    """One parameter less.
+    """Removal of one base parameter, with the F-test that judged it.
 
     Attributes:
         parameter: which base parameter, counted from 0.
@@ -54,7 +52,7 @@ class Elimination:
 
 @dataclass(frozen=True)
 class Essential:
-    """The model that is left.
+    """Reduced model: the base parameters that are kept, fitted again.
 
     Attributes:
         kept: base parameters that stay, increasing.
@@ -87,7 +85,7 @@ class Essential:
 def essential_parameters(
     equations: Equations, fit: LeastSquares, *, level: float = 0.05, covariance: Array | None = None
 ) -> Essential:
-    """Remove what the data do not need.
+    """Remove the base parameters that the data do not need, one by one, until an F-test refuses.
 
     Args:
         equations: what `fit` was fitted to.
@@ -144,7 +142,7 @@ def essential_parameters(
 
 
 def effective_samples(fit: LeastSquares, covariance: Array, rows: int) -> float:
-    """As many independent rows as would leave the same doubt; at least one more than there are parameters.
+    """Return the number of independent rows with the same uncertainty; at least one more than there are parameters.
 
     Args:
         fit: the estimate, with its white standard deviations (eq. 81).
@@ -158,7 +156,7 @@ def effective_samples(fit: LeastSquares, covariance: Array, rows: int) -> float:
 
 
 def _refit(fit: LeastSquares, spread: Array, kept: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Values of the kept parameters and their standard deviations, the others being 0."""
+    """Return the values of the kept parameters and their standard deviations, the others being 0."""
     Q, R = np.linalg.qr(fit.R1[:, kept])
     inverse = np.linalg.solve(R, Q.T)
     variances = np.einsum("ik,kl,il->i", inverse, spread, inverse, optimize=True)

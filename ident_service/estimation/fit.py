@@ -1,4 +1,4 @@
-"""From recordings to an unconstrained fit: what has to be found before, the estimator, and its covariance.
+"""Fit unconstrained parameters to recordings: filter, delay, friction shape, torque constants, estimator, covariance.
 
 Order: the filter, the delay between the channels, the shape of the friction, the equations, the factors of the torque
 constants, the estimator. Each step looks at the recordings that are fitted to, never at those that validate.
@@ -36,12 +36,12 @@ from ident_service.model.layout import INERTIAL
 from ident_service.record.grid import grid
 from ident_service.record.recording import Recording
 
-SAME = 0.01  # of its deviation: a parameter that changes by less is as good as the same
+SAME = 0.01  # share of its deviation; a parameter that changes by less counts as unchanged
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """Recordings turned into equations.
+    """Equations of recordings, with the nonlinear quantities that were found first.
 
     Attributes:
         model: the arm, with the friction's shape and the delay as numbers.
@@ -60,7 +60,7 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Fit:
-    """An unconstrained estimate and its doubt.
+    """Unconstrained estimate with its uncertainty.
 
     Attributes:
         fit: the least squares whose factors constrained estimates use.
@@ -95,7 +95,7 @@ def prepare(
     conditions: FeasibleSet,
     validation: Sequence[Recording] = (),
 ) -> Prepared:
-    """Find what has to be known before the equations are linear, and gather them.
+    """Find delay, friction shape and torque constants, which make the equations linear, and gather the equations.
 
     Args:
         recordings: to fit to.
@@ -111,14 +111,14 @@ def prepare(
     """
     model, choices = _with_velocity(recordings, validation, model, base)
     delay, wanted = None, model.config.identification.delay
-    # Before the friction, whose turning round would take a delay for a longer way.
+    # The delay comes first: a friction fit would take a delay for a longer pre-sliding distance.
     if wanted == "estimate":
         delay = estimate_delay(recordings, model, base)
         model = with_delay(model, delay.seconds)
     trials = None
     if wanted == "choose":
         seconds = 0.0
-        # A period's derivatives are those of its harmonics, and its torque has no filter.
+        # For averaged periods (derivatives by harmonics, torque unfiltered) no delay is searched for.
         if model.config.identification.period is None:
             trials = friction_trials(recordings, model, base)
             period = min(grid(recording, model.config.recording).period_s for recording in recordings)
@@ -142,7 +142,7 @@ def prepare(
 def _with_velocity(
     recordings: Sequence[Recording], validation: Sequence[Recording], model: ArmModel, base: BaseParameters
 ) -> tuple[ArmModel, tuple[Choice, ...]]:
-    """Choose whose velocities to use, and the filter with them.
+    """Choose between measured and differentiated velocities, and the filter with them.
 
     Our own recordings have the velocities of the loop, which lag behind the positions.
     """
@@ -173,7 +173,7 @@ def _with_velocity(
 
 
 def gather(recordings: Sequence[Recording], model: ArmModel, base: BaseParameters) -> Equations:
-    """The equations of several recordings."""
+    """Return the equations of several recordings."""
     return equations(recordings, model, base)
 
 
@@ -184,7 +184,7 @@ def unconstrained(
     base: BaseParameters,
     conditions: FeasibleSet,
 ) -> Fit:
-    """The estimate of a method, or of the one of `wls` and `huber` that predicts held-out thirds better.
+    """Return the estimate of a method, or of the one of `wls` and `huber` that predicts held-out thirds better.
 
     Raises:
         RecordingError: a recording cannot be used.
@@ -211,7 +211,7 @@ def unconstrained(
     delta = constrained_least_squares(fit, base, conditions).delta
     refined = instrumental_variables(recordings, model, base, conditions, fit, delta)
     moved = replace(fit, beta=refined.beta, rho1=fit.R1 @ refined.beta, standard_deviations=refined.standard_deviations)
-    # The instruments' variances come from as many blocks, each of which counts the same.
+    # The instrumental estimate's variances come from as many equally weighted blocks: same degrees of freedom.
     remarks = _unsettled("the instrumental estimate", refined.change, instruments.SETTLED)
     degrees = uncertainty(gathered, fit).degrees
     deviations = np.sqrt(np.diag(refined.covariance)) * widening(degrees)
@@ -233,7 +233,7 @@ def _doubted(method: Method, fit: LeastSquares, equations: Equations, shares: Ar
 
 
 def as_good_as_the_same(fit: LeastSquares, base: BaseParameters, deviations: Array, beta: Array) -> Near | None:
-    """Give N of `central.py`: changes of the links' base parameters by less than a hundredth of their deviations.
+    """Return N of `central.py`: base-parameter changes of the links below a hundredth of their deviations.
 
     In the metric of eq. 81 a change of length 1 moves each parameter by at most its white deviation, which is no
     larger than the one that is told; so no torque changes by what could be seen. Friction does not move.

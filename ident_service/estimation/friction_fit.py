@@ -1,6 +1,6 @@
-"""The numbers in the friction that are not linear, fitted outside the convex problem.
+"""Fit the nonlinear friction numbers, pre-sliding distance and Stribeck velocity, outside the convex problem.
 
-The way of pre-sliding x0 and the Stribeck velocity v_s belong to one drive each, and act on that drive's own rows. So
+The pre-sliding distance x0 and the Stribeck velocity v_s belong to one drive each, and act on that drive's own rows. So
 one value is tried for all drives at once, and each drive keeps the one that leaves it the smallest residual. Two
 searches begin differently, the numbers in turn or all their pairs at once, because the residual has several minima.
 Between their results decides what predicts better: the recordings are cut into thirds, and each third's torque is
@@ -39,7 +39,7 @@ _GRIDS: dict[str, Array] = {
     "presliding": np.array([0.0, *np.geomspace(3e-4, 0.05, 8)]),
     "stribeck_velocity": np.geomspace(0.02, 0.8, 8),
 }
-# What stands for none of it: nothing is left of Stribeck friction at a speed that is ever recorded.
+# Values that stand for absence: Stribeck friction with this velocity vanishes at any recorded speed.
 _NONE = {"presliding": 0.0, "stribeck_velocity": NO_STRIBECK}
 _FINER = np.array([0.6, 0.8, 1.0, 1.25, 1.6])
 _ROUNDS = 2
@@ -47,7 +47,7 @@ _RATE = 125.0  # Hz; friction changes slowly enough to be fitted on fewer rows
 
 
 def with_friction(model: ArmModel, shape: FrictionShape) -> ArmModel:
-    """The same arm with these numbers in its friction; what is still to be fitted stands at a middling value."""
+    """Return the arm with these friction numbers; those still to be fitted stand at a middling value."""
     options = model.config.identification.model_copy(update={"friction": shape})
     config = model.config.model_copy(update={"identification": options})
     velocity = 0.1 if shape.stribeck_velocity == "fit" else shape.stribeck_velocity
@@ -68,7 +68,7 @@ def friction_trials(recordings: Sequence[Recording], model: ArmModel, base: Base
 
 
 def to_be_fitted(model: ArmModel) -> tuple[str, ...]:
-    """Name the numbers of the friction's shape that are left to be fitted, and mean something for this arm."""
+    """Return the names of the friction numbers that are left to be fitted and apply to this arm."""
     shape, terms = model.config.identification.friction, set(model.layout.terms)
     if not {"coulomb", "stribeck"} & terms:
         return ()
@@ -113,7 +113,7 @@ def fit_friction(
 
 
 def at_the_edge(shape: FrictionShape, joints: Sequence[str], terms: Sequence[str]) -> tuple[str, ...]:
-    """Say which fitted numbers end where the search does: what they describe may lie beyond, or not be there.
+    """Describe the fitted numbers that lie at an end of the search: the true value may lie beyond, or not exist.
 
     Args:
         shape: fitted.
@@ -142,14 +142,14 @@ class _Search:
     base: BaseParameters
 
     def in_turn(self, values: _Numbers, wanted: Sequence[str]) -> _Numbers:
-        """One number after the other over its whole grid."""
+        """Search one number after the other over its whole grid."""
         for key in wanted:
             trials = [{key: np.full(self.model.chain.joints, value)} for value in _GRIDS[key]]
             values = self.best(values, trials)
         return values
 
     def pairs(self, values: _Numbers, wanted: Sequence[str]) -> _Numbers:
-        """Every combination of the grids' values."""
+        """Search every combination of the grids' values."""
         joints = self.model.chain.joints
         grids = product(*(_GRIDS[key].tolist() for key in wanted))
         return self.best(
@@ -158,15 +158,15 @@ class _Search:
         )
 
     def finer(self, values: _Numbers, wanted: Sequence[str]) -> _Numbers:
-        """Around the values, inside the grids."""
+        """Search around the values, inside the grids."""
         for key in [*wanted] * _ROUNDS:
             low, high = _GRIDS[key][0], _GRIDS[key][-1]
             values = self.best(values, [{key: np.clip(values[key] * factor, low, high)} for factor in _FINER])
         return values
 
     def best(self, values: _Numbers, trials: Sequence[_Numbers], *, predicting: bool = False) -> _Numbers:
-        """Per drive, the trial that leaves its joint the smallest residual, or predicts its torque best."""
-        # Joints weigh alike in all trials, as the values that were best so far have it.
+        """Return, per drive, the trial that leaves its joint the smallest residual, or predicts its torque best."""
+        # All trials use the joint weights of the best values so far.
         weights = self._moments(values)[0].weights()
         terms = _own_terms(self.model, self.base)
         left = []
@@ -186,7 +186,7 @@ class _Search:
     def chosen(
         self, start: _Numbers, fitted: _Numbers, wanted: Sequence[str], conditions: FeasibleSet
     ) -> tuple[_Numbers, list[Choice]]:
-        """Leave out each kind, the others fitted anew, and see whether held-out thirds are clearly better without."""
+        """Leave out each kind, refit the others, and keep it out where held-out thirds are clearly better without."""
         values, choices = fitted, []
         gathered = self._equations(fitted)
         shares = standstill_shares(gathered)
@@ -213,16 +213,16 @@ class _Search:
 
 
 def _own_terms(model: ArmModel, base: BaseParameters) -> NDArray[np.bool_]:
-    """Which base parameters are joint terms, shape (base,)."""
+    """Return whether each base parameter is a joint term, shape (base,)."""
     return np.asarray(base.base % model.layout.per_link >= len(INERTIAL))
 
 
 def _unpredicted(thirds: Sequence[Moments], beta: Array, terms: NDArray[np.bool_]) -> Array:
-    """Per joint, the squared errors of each third as predicted from the other two, shape (joints,)."""
+    """Return per joint the squared errors of each third as predicted from the other two, shape (joints,)."""
     total = np.zeros(len(thirds[0].products))
     for joint, support in enumerate(thirds[0].supports):
         own = np.flatnonzero(terms[support])
-        # What is left of the torque when the rest of the arm has had its share: columns of the joint's terms, and it.
+        # Columns: the joint's own terms, and the torque less the prediction of all other parameters.
         rest = np.zeros((len(support) + 1, len(own) + 1))
         rest[own, np.arange(len(own))] = 1.0
         rest[:-1, -1] = np.where(terms[support], 0.0, -beta[support])

@@ -1,4 +1,4 @@
-"""Equations of the same motion for many shapes of its friction, without reading or smoothing anything again.
+"""Build equations of one motion for many friction shapes, without reading or smoothing the recording again.
 
 A shape changes two columns per drive: the direction of its Coulomb friction and that direction times the Stribeck
 curve. All others, and the torque, are kept as a table X with products `X^T X`, per joint and third of the samples.
@@ -32,12 +32,12 @@ from ident_service.record.recording import Recording
 FOLDS = 3
 _MOST_ROWS = 30_000  # samples that are kept; of longer recordings every second, every fourth ...
 _CHANGING: tuple[JointTerm, ...] = ("coulomb", "stribeck")
-_GAP = 1.5  # periods: what is longer is no step between neighbours
+_GAP = 1.5  # periods; a longer step is a gap
 
 
 @dataclass
 class _Travel:
-    """How one drive moved: distances between its reversals, and each kept sample's since the last.
+    """Distances that one drive travels: between its reversals, and of each kept sample since the last reversal.
 
     Attributes:
         signs: of the motion that each reversal begins, the first one included.
@@ -54,7 +54,7 @@ class _Travel:
     fresh: set[int] = field(default_factory=set)
 
     def follow(self, rate: Array, period: float, wanted: NDArray[np.intp], fresh: bool) -> None:
-        """Travel on with the velocities of consecutive samples; `wanted` are those that are kept."""
+        """Add the velocities of consecutive samples; `wanted` are those that are kept."""
         signs = np.sign(rate)
         moving = np.flatnonzero(signs)
         if fresh or not self.signs:
@@ -77,7 +77,7 @@ class _Travel:
         self.distances += (ends[1:] - reached[1:]).tolist()
 
     def direction(self, presliding: float) -> Array:
-        """Direction of Coulomb friction at the kept samples, shape (samples,), as `direction.direction` has it."""
+        """Return the direction of Coulomb friction at the kept samples, shape (samples,), as `direction.direction`."""
         segments, signs = np.concatenate(self.segments), np.array(self.signs)
         if presliding <= 0.0:
             return signs[segments]
@@ -150,13 +150,13 @@ class FrictionTrials:
 
     @property
     def joints(self) -> int:
-        """Number of joints."""
+        """Return the number of joints."""
         return len(self._tables)
 
     def _follow(self, recording: Recording, model: ArmModel, time: Array, rate: Array) -> None:
         for drive, travel in enumerate(self._travels):
             if model.config.identification.period is not None:
-                # Once round to know the direction that the period begins with.
+                # One pass over the period first, for the friction direction that it begins with.
                 step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
                 travel.follow(rate[:, drive], step, np.zeros(0, dtype=np.intp), fresh=True)
                 travel.follow(rate[:, drive], step, np.arange(len(time)), fresh=False)
@@ -176,7 +176,7 @@ class FrictionTrials:
     def moments(
         self, presliding: Array, stribeck_velocity: Array, parts: Sequence[slice] | None = None
     ) -> list[Moments]:
-        """Give the products of the equations for one shape of the friction.
+        """Return the products of the equations for one shape of the friction.
 
         Args:
             presliding: x0 per drive [rad or m], shape (drives,).
@@ -206,7 +206,7 @@ class FrictionTrials:
         ]
 
     def _kept_products(self, joint: int, part: slice) -> Array:
-        """Give X^T X of a joint's kept columns and torque, computed once for each part."""
+        """Return X^T X of a joint's kept columns and torque, computed once for each part."""
         key = (joint, part.start, part.stop)
         if key not in self._products:
             rows = self._tables[joint][part]
@@ -215,7 +215,7 @@ class FrictionTrials:
 
     @one_blas_thread()
     def equations(self, presliding: Array, stribeck_velocity: Array) -> Equations:
-        """Give the equations for one shape of the friction, in `FOLDS` blocks, rows near standstill apart.
+        """Return the equations for one shape of the friction, in `FOLDS` blocks, rows near standstill apart.
 
         Args:
             presliding: x0 per drive [rad or m], shape (drives,).
@@ -232,7 +232,7 @@ class FrictionTrials:
 
     @one_blas_thread()
     def later_torques(self, stribeck_velocity: Array) -> Callable[[float], tuple[Information, ...]]:
-        """Give the rows in motion, per third, as a function of how much later [s] the torque is stamped.
+        """Return a function of the torque's delay [s] that returns the rows in motion, per third.
 
         The torque between its samples is that of its first two derivatives: good for delays that are short beside the
         period of the filter's cut-off. Where a joint turns round friction looks like a delay; those rows are left out.
@@ -286,7 +286,7 @@ class FrictionTrials:
         )
 
     def _places_of(self, joint: int) -> tuple[NDArray[np.intp], list[tuple[JointTerm, int, float]], NDArray[np.intp]]:
-        """Say where in a joint's rows the kept columns and the torque stand, which are new, and where those stand."""
+        """Return places of the kept columns and torque in a joint's rows, the new columns, and their places."""
         support = self._supports[joint]
         fixed = np.append(np.searchsorted(support, self._kept_columns[joint]), len(support))
         new, places = [], []
@@ -298,7 +298,7 @@ class FrictionTrials:
         return fixed, new, np.array(places, dtype=np.intp)
 
     def _rows_of(self, joint: int, used: dict[JointTerm, Array], part: slice) -> Array:
-        """Give a joint's columns and its torque as the last, shape (rows, k + 1)."""
+        """Return a joint's columns and its torque as the last, shape (rows, k + 1)."""
         fixed, new, places = self._places[joint]
         rows = np.empty((part.stop - part.start, len(self._supports[joint]) + 1), order="F")
         rows[:, fixed] = self._tables[joint][part]
@@ -312,7 +312,7 @@ class FrictionTrials:
 
 
 def _full_rate(recording: Recording, model: ArmModel) -> Iterator[tuple[Array, Array]]:
-    """Times [s] and drive velocities of all samples, also at the edges of stretches, in consecutive parts."""
+    """Yield times [s] and drive velocities of all samples, also at the edges of stretches, in consecutive parts."""
     options, last = model.config.identification, -np.inf
     for window in windows(recording, options, model.chain.coupling, model.config.recording):
         low, high, _ = window.inner.indices(len(window.motion.time))
@@ -380,7 +380,7 @@ def _joined(parts: Sequence[_Part], every: int) -> _Part:
 
 
 def _filter(model: ArmModel, time: Array) -> tuple[int, float, float] | None:
-    """Order, cut-off and rate [Hz] of the low-pass on both sides of the equations, where there is one that matters."""
+    """Return order, cut-off and rate [Hz] of the low-pass on both sides of the equations; None where there is none."""
     smoothing = model.config.identification.smoothing
     if smoothing.regressor_cutoff is None or len(time) < 2:
         return None

@@ -1,10 +1,10 @@
-"""Information that grows while an arm moves: the R factor of what was recorded so far, and the doubt that is left.
+"""Estimate sequentially while an arm moves: the R factor of the samples so far, and the remaining uncertainty.
 
 New samples wait until they make a window long enough for the zero-phase filter; the window's equations are merged into
 the factor (`model/information.py`) and all but its end is forgotten. Work and memory of a step are bounded, whatever
-the length of the run. Deviations are those of eq. 81, which takes residuals for white: they show how doubt shrinks; the
-result's own come from blocks (`doubt.py`) and are larger. What is decided while the arm moves is decided by the larger
-of both, for which the information of each block is kept, too.
+the length of the run. Deviations are those of eq. 81, which takes residuals for white: they show how the uncertainty
+shrinks; the result's own come from blocks (`doubt.py`) and are larger. What is decided while the arm moves is decided
+by the larger of both, for which the information of each block is kept, too.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from ident_service.model.information import empty_information, information_of, s
 from ident_service.model.threads import one_blas_thread
 from ident_service.record.recording import BLOCK_SAMPLES, Block, Stamps, cut, join
 
-_FIRST = 2.0  # s; a filter that needs more says so, and gets it
+_FIRST = 2.0  # s, length of the first window; it grows where the filter needs more
 _LONGEST = 60.0  # s
 _MOST = 10.0  # s beyond the shortest window that are worked on in one step
 
 
 @dataclass(frozen=True)
 class Doubt:
-    """What is left of it.
+    """Parameter uncertainty after the samples processed so far.
 
     Attributes:
         seconds: of motion that went in [s].
@@ -59,14 +59,14 @@ class Doubt:
 
 
 class GrowingInformation:
-    """The information of one run.
+    """Sequential least squares over the samples of one run.
 
     Attributes:
         base: the grouping of the parameters.
     """
 
     def __init__(self, model: ArmModel, *, in_blocks: bool = False, period: float | None = None) -> None:
-        """Nothing is known yet.
+        """Start without samples.
 
         Args:
             model: of the arm; averaging over periods and trimming, which need a whole recording, are left out.
@@ -75,7 +75,7 @@ class GrowingInformation:
         """
         options = model.config.identification
         smoothing = options.smoothing
-        if smoothing.cutoff == "choose":  # windows of a few seconds do not say what the motion is
+        if smoothing.cutoff == "choose":  # windows of a few seconds are too short to choose a cut-off from
             smoothing = smoothing.model_copy(update={"cutoff": USUAL})
         self._edge = EDGE / USUAL if options.edge == "choose" else options.edge
         options = options.model_copy(update={"period": None, "smoothing": smoothing, "edge": self._edge})
@@ -92,12 +92,12 @@ class GrowingInformation:
         self._need, self._done_ns, self._seconds = _FIRST, -1, 0.0
 
     def add(self, block: Block) -> None:
-        """New samples, consecutive to those before."""
+        """Queue new samples, consecutive to those before."""
         self._waiting.append(block)
 
     @one_blas_thread()
     def step(self) -> bool:
-        """Work on what waits, a bounded part of it; whether anything has become known."""
+        """Process a bounded part of the queued samples; return whether the information grew."""
         if not self._waiting:
             return False
         whole = join(self._waiting)
@@ -136,7 +136,7 @@ class GrowingInformation:
         return found
 
     def _kept(self, before: Equations, rows: Rows, time_ns: Stamps, new: NDArray[np.bool_]) -> Equations:
-        """The same equations by stretches of time, as `equations.py` has them of a whole recording."""
+        """Return the equations with new rows added by stretches of time, as `equations.py` does for a recording."""
         blocks, labels = list(before.blocks), list(before.labels)
         if self._origin_ns < 0:
             self._origin_ns = int(time_ns[new][0])
@@ -154,7 +154,7 @@ class GrowingInformation:
 
     @one_blas_thread()
     def doubt(self) -> Doubt | None:
-        """What is left of it; None before anything is known."""
+        """Return the parameter uncertainty so far; None before there are more rows than parameters."""
         information = self._information
         if int(information.rows.sum()) <= self.base.size:
             return None
@@ -173,7 +173,7 @@ class GrowingInformation:
 
 
 class _Window:
-    """Samples behind the protocol of a recording; ours hold their torque from stamp to stamp."""
+    """Samples that implement the recording protocol; torques are held from stamp to stamp."""
 
     torque_held, torn, sha256 = True, False, ""
     path = Path("the run so far")
@@ -182,6 +182,6 @@ class _Window:
         self._block, self.joint_names, self.joints = block, names, len(names)
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
-        """As the protocol says."""
+        """Yield the samples in order, at most `samples` at a time."""
         for start in range(0, len(self._block.stamp_ns), samples):
             yield cut(self._block, start, min(start + samples, len(self._block.stamp_ns)))

@@ -1,4 +1,4 @@
-"""From recordings to one estimate with its doubt, and the other estimates of the paper beside it (tables 6 and 8)."""
+"""Identify one estimate with its uncertainty from recordings, and the paper's other estimates (tables 6 and 8)."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Scored:
 
 @dataclass(frozen=True)
 class Candidate:
-    """One of the paper's estimates.
+    """One of the paper's estimates, with its torque errors.
 
     Attributes:
         name: for tables.
@@ -83,7 +83,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class CustomKnowledge:
-    """Record the function of `constraints.custom` and the torque errors with and without it.
+    """Function of `constraints.custom`, and the torque errors with and without it.
 
     Attributes:
         function: that was called.
@@ -100,7 +100,7 @@ class CustomKnowledge:
 
 @dataclass(frozen=True)
 class Estimate:
-    """An identified parameter set with everything needed to doubt it.
+    """Identified parameter set with the evidence to judge it by.
 
     Attributes:
         model: the arm, with what the recordings said of its friction's shape.
@@ -175,7 +175,7 @@ class Estimate:
 
     @property
     def feasible(self) -> bool:
-        """Whether a real body could have these parameters."""
+        """Return whether a real body could have these parameters."""
         return self.margin > 0.0
 
 
@@ -243,7 +243,7 @@ def identify(
         second = second_opinion(
             held[kind], found.fit, base, conditions, deviations, prior=prior, custom=custom, solver=solver
         )
-    # Of the bodies behind the same base parameters the central one may not be one that `custom` allows.
+    # Link values are centred only without custom knowledge or prior: `custom` may forbid the central body.
     nearest_to: Source | None = None
     if prior is None and custom is None:
         likely = likely_bodies(prepared.model)
@@ -369,7 +369,7 @@ def _unseen(recording: Recording, prepared: Prepared, base: BaseParameters) -> E
 
 
 def _prior(model: ArmModel, found: Fit, base: BaseParameters, conditions: FeasibleSet) -> Prior | None:
-    """What the configuration asks constrained estimates to be drawn to."""
+    """Return the prior that the configuration asks constrained estimates to be drawn to; None for none."""
     pull = model.config.identification.prior
     if pull.kind == "none":
         return None

@@ -1,4 +1,4 @@
-"""Instrumental variables against noise that goes round the loop (Janot, Vandanjon and Gautier 2014, IDIM-IV).
+"""Estimate with instrumental variables against closed-loop noise (Janot, Vandanjon and Gautier 2014, IDIM-IV).
 
 In a closed loop what disturbs the torque also moves the arm, and what disturbs the measured position is in the
 regressor: its columns and the residual are then not independent, and least squares is biased however long one measures.
@@ -19,8 +19,6 @@ second derivative falls with the fifth power of the cut-off. What the noise of t
 in the instruments then, and its bias stays. Around a motion that has been followed once already, and for an arm
 without prior or gains, the loop is inverse dynamics with the simulated parameters themselves, stiff and critically
 damped, so that errors of following do not come twice.
-
-Boundary: pure computation over the protocol of a recording; dynamics are `rigid_body.py`.
 """
 
 from __future__ import annotations
@@ -50,19 +48,19 @@ from ident_service.record.grid import grid
 from ident_service.record.recording import BLOCK_SAMPLES, Block, Recording, Stamps, join
 from ident_service.record.segments import uniform
 
-SETTLED = 0.02  # of a standard deviation
+SETTLED = 0.02  # standard deviations; smaller changes count as settled
 _MOST_ROUNDS = 10
 _RANK_TOLERANCE = 1e-12
-_ORDER = 3  # of the low-pass on what is followed
-_SLOWEST = 2.0  # Hz, of it where that is measured; motions of arms are slower
+_ORDER = 3  # order of the low-pass on the followed positions
+_SLOWEST = 2.0  # Hz, least cut-off of that low-pass on measured positions; motions of arms are slower
 _STIFFNESS = 60.0  # rad/s, of the loop around an arm whose own is not known
-_LARGEST_STEP = 0.5  # of the velocity loop's time constant
+_LARGEST_STEP = 0.5  # largest integration step, as a share of the velocity loop's time constant
 _RUNAWAY = 1e4  # rad/s or m/s
 
 
 @dataclass(frozen=True)
 class InstrumentalEstimate:
-    """What the instruments say.
+    """Estimate by instrumental variables, with its covariance and convergence.
 
     Attributes:
         beta: base parameters in SI units, not constrained, shape (base,).
@@ -103,7 +101,7 @@ def instrumental_variables(
     cutoff: float | None = None,
     progress: Callable[[int, float], None] = lambda _round, _change: None,
 ) -> InstrumentalEstimate:
-    """Refine an estimate.
+    """Refine an estimate by instrumental variables from simulated motions.
 
     Args:
         recordings: what `fit` was fitted to.
@@ -161,7 +159,7 @@ def instrumental_variables(
 
 @dataclass(frozen=True)
 class _Sums:
-    """One stretch's Z^T W, shape (base, base), Z^T omega, and the squares of the columns of Z and W, shape (base,)."""
+    """Sums of one stretch: Z^T W, shape (base, base), Z^T omega, squared columns of Z and W, shape (base,)."""
 
     ZW: Array
     Zomega: Array
@@ -217,7 +215,7 @@ def _sums(measured: Rows, made: Rows, part: slice, joint_supports: Sequence[NDAr
 
 
 def _bounded(sums: dict[Label, _Sums]) -> dict[Label, _Sums]:
-    """Merge neighbours, but for the last one, which may not be complete."""
+    """Merge neighbouring stretches, but for the last one, which may not be complete."""
     while len(sums) > MAX_BLOCKS:
         labels = list(sums)
         pairs = {one: sums[one] + sums[other] for one, other in zip(labels[:-1:2], labels[1:-1:2], strict=False)}
@@ -239,7 +237,7 @@ def _solve(sums: Sequence[_Sums]) -> _Solved:
     scaled = np.linalg.solve(A, total.Zomega / left)
     covariance = np.zeros_like(A)
     for block in sums:
-        # The change that leaving this block out makes (`doubt.py`).
+        # Change of the estimate when this block is left out (`doubt.py`).
         part = block.ZW / left[:, None] / right
         step = np.linalg.solve(A - part, block.Zomega / left - part @ scaled)
         covariance += np.outer(step, step)
@@ -247,10 +245,10 @@ def _solve(sums: Sequence[_Sums]) -> _Solved:
 
 
 class SimulatedRecording:
-    """A recording with simulated positions; its stamps, its torques and all else stay."""
+    """Recording with simulated positions; stamps, torques and all else are the measured ones."""
 
     def __init__(self, measured: Recording, stretches: Sequence[tuple[Stamps, Array]]) -> None:
-        """Put motions in the place of measurements.
+        """Replace measured positions by simulated motions.
 
         Args:
             measured: the recording.
@@ -261,7 +259,7 @@ class SimulatedRecording:
         self._measured, self._stretches = measured, tuple(stretches)
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
-        """Read in order, `samples` at a time."""
+        """Yield the samples in order, `samples` at a time."""
         for block in self._measured.blocks(samples):
             position = block.position.copy()
             for stamps, motion in self._stretches:
@@ -276,7 +274,7 @@ class SimulatedRecording:
 def simulated(
     recording: Recording, reference: Recording, model: ArmModel, delta: Array, cutoff: float, *, commanded: bool
 ) -> SimulatedRecording:
-    """The recording as the arm would have made it without noise.
+    """Return the recording as the arm would have made it without noise.
 
     Args:
         recording: whose stamps and torques to keep.
@@ -310,7 +308,7 @@ def simulated(
 
 
 class _Loop:
-    """A simulated arm under control, without noise and without delay."""
+    """Simulated arm under control, without noise and without delay."""
 
     def __init__(self, model: ArmModel, delta: Array, period: float, commanded: bool) -> None:
         # Pinocchio is loaded by those who simulate only.
@@ -336,7 +334,7 @@ class _Loop:
             self._friction = self._plant.friction
 
     def follow(self, reference: Array) -> Array:
-        """Positions that the arm takes, shape (samples, joints), following `reference` of the same shape."""
+        """Return the positions that the arm takes, shape (samples, joints), following `reference` of the same shape."""
         velocity = np.gradient(reference, self._period, axis=0)
         acceleration = np.gradient(velocity, self._period, axis=0)
         wanted = np.stack([reference, velocity, acceleration], axis=1)

@@ -1,4 +1,4 @@
-"""Least squares from triangular factors, with the paper's standard deviations (eqs. 59-70, 81-84).
+"""Solve least squares from triangular factors, with the paper's standard deviations (eqs. 59-70, 81-84).
 
 Ordinary least squares gives every joint's equations the same weight; weighted least squares divides them by the joint's
 own residual (Gautier 1997), which needs no second look at the data, because factors are kept per joint.
@@ -16,14 +16,14 @@ from ident_service.model.chain import Array
 from ident_service.model.information import Information
 
 _RANK_TOLERANCE = 1e-10
-_LEAST_COLUMN = 1e-14  # of the longest
+_LEAST_COLUMN = 1e-14  # share of the longest column's length; a shorter column is rounding
 _SETTLED = 1e-9
 _MOST_ROUNDS = 500
 
 
 @dataclass(frozen=True)
 class LeastSquares:
-    """An unconstrained estimate.
+    """Unconstrained least-squares estimate with its factors.
 
     Attributes:
         beta: estimate in SI units, shape (base,); zero along directions that the data do not see.
@@ -49,7 +49,7 @@ class LeastSquares:
 
 
 def weighted_least_squares(information: Information) -> LeastSquares:
-    """Each joint's equations divided by its own residual's deviation, repeated until neither changes.
+    """Solve with each joint's equations divided by its residual's deviation, repeated until neither changes.
 
     Raises:
         ModelError: the weights do not settle, which means that some joint's residual vanishes.
@@ -104,7 +104,7 @@ def ordinary_least_squares(information: Information, weights: Array | None = Non
 
 
 def unit_columns(matrix: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Give what to divide each column by so that it has unit length, and which columns are more than rounding.
+    """Return what to divide each column by so that it has unit length, and which columns are more than rounding.
 
     The Stribeck column of rows that are all fast underflows; divided by its length it would be rounding of unit length.
     """
@@ -115,7 +115,7 @@ def unit_columns(matrix: Array) -> tuple[Array, NDArray[np.bool_]]:
 
 @dataclass(frozen=True)
 class TorqueError:
-    """How well parameters explain torques: eq. 84 in percent, and root mean square [N m or N]; whole and per joint."""
+    """Torque prediction error: eq. 84 in percent, and root mean square [N m or N]; whole and per joint."""
 
     relative_percent: float
     rms: float
@@ -124,7 +124,7 @@ class TorqueError:
 
 
 def torque_error(information: Information, beta: Array) -> TorqueError:
-    """Torque error of `beta` on the equations of `information`."""
+    """Return the torque error of `beta` on the equations of `information`."""
     errors, torques = information.squared_residuals(beta), information.squared_torques()
     rows = np.maximum(information.rows, 1)
     return TorqueError(

@@ -1,4 +1,4 @@
-"""Least squares from products of columns, for comparing many trials of the same motion.
+"""Solve least squares from products of columns, for comparing many trials of the same motion.
 
 Products lose half the digits of orthogonal factors, and cost a tenth. Which trial leaves the smaller residual is the
 same; estimates themselves come from factors (`least_squares.py`).
@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from ident_service.model.chain import Array
 
-_LEAST_COLUMN = 1e-14  # of the longest
-_RIDGE = 1e-12  # of a column's squared length: columns that are alike share what they explain
-_SETTLED = 1e-6  # of a weight
+_LEAST_COLUMN = 1e-14  # share of the longest column's length; a shorter column is rounding
+_RIDGE = 1e-12  # share of a column's squared length: collinear columns then share what they explain
+_SETTLED = 1e-6  # relative change of a weight
 _MOST_ROUNDS = 100
 
 
@@ -36,11 +36,11 @@ class Moments:
     base: int
 
     def solved(self, weights: Array) -> Array:
-        """Minimise the squared residuals, each joint's equations multiplied by its weight; shape (base,)."""
+        """Return the least-squares estimate, each joint's equations multiplied by its weight; shape (base,)."""
         return ridge(*self._normal(weights))
 
     def estimate(self) -> tuple[Array, Array]:
-        """Minimise the squared residuals; give the estimate and its deviations (eq. 81), shape (base,) each."""
+        """Return the least-squares estimate and its deviations (eq. 81), shape (base,) each."""
         total, right = self._normal(np.ones(len(self.products)))
         beta = ridge(total, right)
         variance = float(self.squared_residuals(beta).sum()) / max(int(self.rows.sum()) - self.base, 1)
@@ -56,7 +56,7 @@ class Moments:
         return total, right
 
     def weights(self) -> Array:
-        """Give what the joints' equations are multiplied by so that their residuals are alike, shape (joints,)."""
+        """Return the factors of the joints' equations that make their residuals alike, shape (joints,)."""
         torques = np.array([product[-1, -1] for product in self.products])
         floor = 1e-9 * np.sqrt(torques / np.maximum(self.rows, 1))
         weights = np.ones(len(self.products))
@@ -69,14 +69,14 @@ class Moments:
         return weights
 
     def squared_residuals(self, beta: Array) -> Array:
-        """Per joint, the sum of squared torque errors of `beta` [N^2 m^2 or N^2], shape (joints,)."""
+        """Return per joint the sum of squared torque errors of `beta` [N^2 m^2 or N^2], shape (joints,)."""
         tried = [np.append(-beta[support], 1.0) for support in self.supports]
         found = [one @ product @ one for one, product in zip(tried, self.products, strict=True)]
         return np.maximum(found, 0.0)
 
 
 def ridge(products: Array, right: Array) -> Array:
-    """Solve normal equations of columns that may be alike, or unseen: those get no more than they need, or zero.
+    """Solve normal equations by ridge regression: columns may be alike, unseen ones get zero.
 
     Args:
         products: of the columns, shape (columns, columns).

@@ -1,4 +1,4 @@
-"""Tool or load of an arm that is already identified: ten parameters of a body that moves with the last link.
+"""Identify the tool or load of an identified arm: ten parameters of a body that moves with the last link.
 
 A body x in the frame of the last link adds K_x x to the base parameters beta of the arm, with K_x the ten columns of K
 (eq. 38) of that link. On a second recording
@@ -7,8 +7,8 @@ A body x in the frame of the last link adds K_x x to the base parameters beta of
 
 is least squares for x; joints are weighted by their residuals. What W K_x cannot tell apart is grouped as base
 parameters are; what the motion does not show (inertia where it is slow) has infinite variance and is left out. The
-covariance of x has two parts: noise, from blocks of scores as in `doubt.py`, and the arm's own doubt, which on this
-motion looks like a payload: x depends on beta by -G = -(K_x^T W^T W K_x)^-1 K_x^T W^T W, so G cov(beta) G^T.
+covariance of x has two parts: noise, from blocks of scores as in `doubt.py`, and the arm's own uncertainty, which on
+this motion looks like a payload: x depends on beta by -G = -(K_x^T W^T W K_x)^-1 K_x^T W^T W, so G cov(beta) G^T.
 
 A body that was added has a pseudo-inertia >= 0, one that was taken off has the negative of one. Of both sets the point
 nearest to x in the metric of its covariance is sought, and told by its distance (`drift.probability`) and by the torque
@@ -18,8 +18,6 @@ is easily lost in it, and the arm does not move as it was identified.
 
 A parameter's verdict compares its deviation with the larger of its size and what is as good as zero: what makes 1 % of
 a joint's torque on this motion, or what a body of this mass, at least 100 g, has 5 cm from the frame, if that is less.
-
-Boundary: pure computation, no I/O.
 """
 
 from __future__ import annotations
@@ -60,13 +58,13 @@ Word = Literal["none", "added", "removed", "infeasible"]
 _ARM = 0.05  # m
 _LEAST_MASS = 0.1  # kg
 FAR = 4.0  # times the residual of the identification, as in `plausibility.py`
-_NO_VARIANCE = 1e-10  # of an eigenvalue of the correlations, against the largest
-_FELT = 1e-9  # of the arm's doubt in a parameter, below which a payload does not depend on it
+_NO_VARIANCE = 1e-10  # smallest eigenvalue of the correlations, as a share of the largest
+_FELT = 1e-9  # share of the largest dependence, below which a payload does not depend on an arm parameter
 
 
 @dataclass(frozen=True)
 class KnownArm:
-    """An arm that has been identified.
+    """Arm that has been identified: model, base parameters and covariance.
 
     Attributes:
         model: with its friction's shape and delay as numbers.
@@ -75,7 +73,7 @@ class KnownArm:
         covariance: of them, infinite on the diagonal where nothing was seen, shape (base, base).
         blocks: that the covariance comes from; None where it is known exactly.
         residual: root mean square of what was left unexplained at each joint where it was identified [N m or N], over
-            all rows, shape (joints,); None where nobody knows.
+            all rows, shape (joints,); None where unknown.
     """
 
     model: ArmModel
@@ -95,7 +93,7 @@ class KnownArm:
 
 @dataclass(frozen=True)
 class Body:
-    """The body nearest to an estimate among those that were added, or among those that were taken off.
+    """Body nearest to an estimate among those that were added, or among those that were taken off.
 
     Attributes:
         delta: its ten parameters in the last link's frame (eq. 13), positive mass, and the offsets, shape (names,).
@@ -116,7 +114,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Payload:
-    """What a second recording says of a body on, or missing from, the last link.
+    """Payload estimate: a body added to, or missing from, the last link, found from a second recording.
 
     Attributes:
         base: grouping of the ten parameters in the last link's frame, and of the offsets if they were refitted.
@@ -124,7 +122,7 @@ class Payload:
         fit: the unconstrained least squares; `fit.beta` is b.
         noise: its covariance from this recording alone, shape (payload, payload).
         G: what b depends on the arm's beta by, with the sign turned, shape (payload, base of the arm).
-        covariance: of b, the arm's doubt included, infinite on the diagonal where nothing was seen.
+        covariance: of b, the arm's uncertainty included, infinite on the diagonal where nothing was seen.
         standard_deviations: its diagonal's root, shape (payload,).
         verdicts: one per base parameter of the payload.
         blocks: of time, that `noise` comes from.
@@ -155,7 +153,7 @@ class Payload:
     excess: Array | None = None
 
     def far(self) -> tuple[int, ...]:
-        """Find joints whose residual is far above that of the identification, and matters beside their torque."""
+        """Return joints whose residual is far above that of the identification, and matters beside their torque."""
         if self.excess is None:
             return ()
         matters = self.fitted.joint_relative_percent > 100.0 * RELEVANT_TORQUE
@@ -164,7 +162,7 @@ class Payload:
 
 @one_blas_thread()
 def identify_payload(arm: KnownArm, recorded: Equations, *, refit_offsets: bool = False) -> Payload:
-    """Identify what an arm carries from a recording with it.
+    """Identify the payload of an arm from a recording with it.
 
     Args:
         arm: as it was identified, with another load or none.
@@ -234,7 +232,7 @@ def identify_payload(arm: KnownArm, recorded: Equations, *, refit_offsets: bool 
 
 
 def loaded_covariance(arm: KnownArm, payload: Payload) -> Array:
-    """Covariance of the base parameters of the arm with its payload, shape (base, base)."""
+    """Return the covariance of the base parameters of the arm with its payload, shape (base, base)."""
     unseen = ~np.isfinite(np.diag(arm.covariance))
     M = np.eye(arm.base.size) - payload.T @ payload.G
     known = np.where(unseen[:, None] | unseen[None, :], 0.0, arm.covariance)
@@ -248,7 +246,7 @@ def loaded_covariance(arm: KnownArm, payload: Payload) -> Array:
 
 
 def _columns(arm: KnownArm, refit_offsets: bool) -> tuple[BaseParameters, Array, list[int]]:
-    """Grouping of what may move, what it adds to beta, and which of the groups are the body's own."""
+    """Return the grouping of payload parameters, their effect on beta, and which groups are the body's own."""
     layout = arm.model.layout
     columns = list(range(*layout.inertial(layout.joints - 1).indices(layout.size)))
     if refit_offsets:
@@ -263,7 +261,7 @@ def _columns(arm: KnownArm, refit_offsets: bool) -> tuple[BaseParameters, Array,
 
 
 def _reduced(recorded: Equations, beta: Array, T: Array) -> Equations:
-    """The same equations with the arm's torques taken off and the payload's parameters as unknowns."""
+    """Return the equations less the arm's torques, with the payload's parameters as unknowns."""
 
     def one(information: Information) -> Information:
         factors = []
@@ -289,7 +287,7 @@ def _as_zero(motion: Motion, base: BaseParameters, beta: Array) -> Array:
 
 
 def _dependence(information: Information, T: Array, fit: LeastSquares) -> Array:
-    """G, shape (payload, base of the arm)."""
+    """Return G, shape (payload, base of the arm)."""
     normal = np.zeros((T.shape[1], len(T)))
     for weight, support, factor in zip(fit.weights, information.supports, information.factors, strict=True):
         W = factor[:, :-1]
@@ -298,7 +296,7 @@ def _dependence(information: Information, T: Array, fit: LeastSquares) -> Array:
 
 
 def _with_doubt(arm: KnownArm, noise: Array, G: Array) -> tuple[Array, Array]:
-    """Covariance of the payload, and the part of it that is the arm's doubt."""
+    """Return the covariance of the payload, and the part of it that comes from the arm's uncertainty."""
     unseen = ~np.isfinite(np.diag(arm.covariance))
     known = np.where(unseen[:, None] | unseen[None, :], 0.0, arm.covariance)
     doubt = G @ known @ G.T
@@ -318,7 +316,7 @@ def _body(
     sides: tuple[Identified, Identified],
 ) -> Body:
     metric = _metric(covariance)
-    # Offsets turn with the body, and back again.
+    # The sign applies to the offsets too, and is undone below.
     found = nearest(metric, sign * metric @ b, sign * b, base, conditions, "payload")
     p = probability(found.objective**2, max(whole.directions, 1), whole.degrees)
     moved = sign * found.beta
@@ -331,7 +329,10 @@ def _body(
 
 
 def _smallest(delta: Array, base: BaseParameters, conditions: FeasibleSet) -> Array:
-    """The body of the same base parameters with the least tr(P) = m + tr(L) / 2: what no motion shows stays small."""
+    """Return the body of the same base parameters with the least tr(P) = m + tr(L) / 2.
+
+    What no motion shows stays small.
+    """
     if not len(base.dependent):
         return delta
     lift = Lift(base)
@@ -351,7 +352,7 @@ def _smallest(delta: Array, base: BaseParameters, conditions: FeasibleSet) -> Ar
 
 
 def _metric(covariance: Array) -> Array:
-    """Rows whose product with a difference has its length in deviations; what was not seen counts nothing."""
+    """Return rows whose product with a difference has its length in deviations; what was not seen counts nothing."""
     seen = np.flatnonzero(np.isfinite(np.diag(covariance)))
     part = covariance[np.ix_(seen, seen)]
     scale = np.sqrt(np.maximum(np.diag(part), np.finfo(float).tiny))
@@ -363,7 +364,7 @@ def _metric(covariance: Array) -> Array:
 
 
 def center_of_mass(payload: Payload) -> tuple[Array, Array] | None:
-    """Centre of mass in the last link's frame and its standard deviations [m], each of shape (3,).
+    """Return the centre of mass in the last link's frame and its standard deviations [m], each of shape (3,).
 
     Unconstrained, so that the deviations belong to it; None where mass or a first moment is not shown on its own.
     """

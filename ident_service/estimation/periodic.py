@@ -1,4 +1,4 @@
-"""One period out of many: averaging a periodic motion before it is differenced (Swevers et al. 1997).
+"""Average a periodic motion over its periods before it is differentiated (Swevers et al. 1997).
 
 Averaging n periods divides the noise by the square root of n without touching the motion, and what is left between
 periods is an honest estimate of the noise. Derivatives of a periodic signal are exact in the frequency domain; only
@@ -30,7 +30,7 @@ _APERIODIC = 0.05  # of a joint's range: what periods may differ by and still be
 
 @dataclass(frozen=True)
 class Averaged:
-    """The mean period of a recording.
+    """Mean period of a recording.
 
     Attributes:
         motion: one period.
@@ -52,7 +52,7 @@ def averaged(
     coupling: Array | None = None,
     fmt: RecordingFormat | None = None,
 ) -> Averaged:
-    """Average a recording over its periods; memory for one period.
+    """Average a recording over its periods, in memory for one period.
 
     Args:
         recording: of a periodic motion; whatever is not (approach, return) trimmed by `fmt`.
@@ -128,7 +128,7 @@ def _motion(
         near = widened(np.concatenate([near[-reach:], near, near[:reach]]), reach)[reach:-reach]
     shape = options.friction.presliding
     presliding = np.broadcast_to(np.asarray(0.0 if shape == "fit" else shape, dtype=float), (joints,))
-    # Once round to find the direction that the period begins with.
+    # One pass over the period first, for the friction direction that it begins with.
     once = direction(rate, step, presliding)
     return Motion(
         np.arange(length, dtype=np.float64) * step,

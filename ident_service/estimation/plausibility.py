@@ -1,4 +1,4 @@
-"""Reasons why an estimate cannot be right: data in wrong units, swapped columns, wrong signs, another arm's geometry.
+"""Find reasons why an estimate cannot be right: wrong units or signs, swapped columns, another arm's geometry.
 
 A set of parameters can be physically feasible, and its regression well conditioned, and still describe nothing: the
 recording may be in degrees, or of other joints. Each rule here compares with what any arm, or this arm by its
@@ -23,23 +23,23 @@ from ident_service.record.quality import JointQuality
 LARGEST_ERROR = 30.0  # percent of the torque (eq. 84): a controller is better off without such a model
 MUCH_WORSE, WORSE_FROM = 4.0, 10.0  # times the error on what was fitted to, and percent from which that counts
 CONSTRAINED_WORSE, CONSTRAINED_FROM = 1.8, 2.0  # times the unconstrained error, and percent from which that counts
-WRONG_SIGN = 8.0  # deviations by which friction is negative
-CONSTRAINED_WORSE_WITH_SIGN, PERHAPS_WRONG_SIGN = 1.3, 4.0  # both together
-MIRRORED_FROM, MIRRORED_WORSE = 20.0, 1.4  # percent, and times the unconstrained error, from which a joint is turned
-MIRRORED = 1.3  # times smaller is its error with the torque negated, and again near the unconstrained one
+WRONG_SIGN = 8.0  # standard deviations by which friction must be negative
+CONSTRAINED_WORSE_WITH_SIGN, PERHAPS_WRONG_SIGN = 1.3, 4.0  # error factor and deviations, only together
+MIRRORED_FROM, MIRRORED_WORSE = 20.0, 1.4  # percent and error factor, to try a negated torque
+MIRRORED = 1.3  # factor by which the error must shrink with the torque negated
 ENOUGH_MOTION, UNKNOWN_OF_LITTLE_MOTION = 10.0, 0.2  # s, and share of the base parameters
-_OUTSIDE = 0.1  # of a joint's range: what limits of a description may be off
-_NOISE = 1e-3  # of a joint's range: what an encoder's noise at a limit may be
+_OUTSIDE = 0.1  # share of a joint's range by which a description's limits may be off
+_NOISE = 1e-3  # share of a joint's range that encoder noise at a limit may reach
 _TURNS = 100.0  # rad, for joints without limits
 _TOO_FAST, _TOO_STRONG = 4.0, 4.0  # times the limit of the description
 _JUMP = 20.0  # times the usual step between samples
 _LEAST_JUMP = 0.02  # rad or m
 _DENSITY = 1000.0  # kg for an arm of one metre, growing with its volume
-_SAMPLES_OF_A_JUMP = 100  # fewer say nothing about what is usual
+_SAMPLES_OF_A_JUMP = 100  # with fewer samples the usual step is unknown
 
 
 def reasons_against(estimate: Estimate) -> tuple[str, ...]:
-    """Say why an estimate must not be used, by its errors; empty where nothing does.
+    """Return the reasons not to use an estimate, from its errors; empty where there are none.
 
     The words name the most likely cause where the numbers tell one.
     """
@@ -48,7 +48,7 @@ def reasons_against(estimate: Estimate) -> tuple[str, ...]:
 
 
 def reasons_in_length(estimate: Estimate, seconds: float) -> tuple[str, ...]:
-    """Say why so short a motion tells too little, as that before a fault; empty where it tells enough.
+    """Return the reasons why a short motion tells too little, as one before a fault; empty where it tells enough.
 
     A short motion that leaves much unidentified predicts itself and nothing else. Where other recordings validate the
     estimate, their errors judge it.
@@ -78,7 +78,7 @@ def reasons_in_length(estimate: Estimate, seconds: float) -> tuple[str, ...]:
 
 
 def reasons_in_recording(recording: str, joints: Sequence[JointQuality], model: ArmModel) -> tuple[str, ...]:
-    """Say why a recording cannot be of this arm in SI units; empty where nothing does.
+    """Return the reasons why a recording cannot be of this arm in SI units; empty where there are none.
 
     Args:
         recording: its name, for the words.
@@ -94,7 +94,7 @@ def reasons_in_recording(recording: str, joints: Sequence[JointQuality], model: 
 
 
 def remarks_on_limits(recording: str, joints: Sequence[JointQuality], model: ArmModel) -> tuple[str, ...]:
-    """Name joints that leave their position limits by less than what makes a recording unusable.
+    """Return remarks on joints that leave their position limits by less than what makes a recording unusable.
 
     Args:
         recording: its name, for the words.
@@ -147,7 +147,7 @@ def _errors(own: Candidate) -> Iterator[str]:
 def _against_the_unconstrained(estimate: Estimate) -> Iterator[str]:
     free, own = estimate.candidates[0], estimate.candidates[estimate.chosen]
     before, after = free.moving.relative_percent, own.moving.relative_percent
-    # A prior and custom knowledge may be as strong as a person likes.
+    # With a prior or custom knowledge a larger error is the user's choice.
     held = estimate.constrained and estimate.prior is None and estimate.custom is None
     much = held and after > CONSTRAINED_FROM and after > CONSTRAINED_WORSE * before
     worse = held and after > CONSTRAINED_WORSE_WITH_SIGN * before
@@ -170,7 +170,7 @@ def _against_the_unconstrained(estimate: Estimate) -> Iterator[str]:
 
 
 def _mirrored(estimate: Estimate) -> str:
-    """Name the joint whose torques the conditions of a real body allow better with the other sign; none is empty."""
+    """Return the name of a joint whose torques fit the feasible set better with the other sign; else empty."""
     free, own = (estimate.candidates[place].moving.joint_relative_percent for place in (0, estimate.chosen))
     information, weights = estimate.information, estimate.fit.weights
     for joint, name in enumerate(estimate.model.chain.names):
@@ -191,12 +191,12 @@ def _mirrored(estimate: Estimate) -> str:
 
 
 def _driving_friction(estimate: Estimate, deviations: float) -> list[tuple[str, float, float]]:
-    """Find drives whose unconstrained friction adds energy: name, friction at the usual speed, its deviation.
+    """Return drives whose unconstrained friction adds energy: name, friction at the usual speed, its deviation.
 
     Coulomb, Stribeck and viscous terms explain each other's torque, so only their sum at a speed has a sign. The usual
     speed is the root mean square of the velocity, which is the viscous column's, of the rows that were fitted to.
     """
-    # Not those that were fitted: a robust method multiplies their rows.
+    # Use the plain equations, not the fitted ones, whose rows a robust method multiplies.
     layout, base, total = estimate.model.layout, estimate.base, estimate.prepared.equations.moving
     place = {int(column): index for index, column in enumerate(base.base)}
     coupling = estimate.model.chain.coupling
@@ -266,9 +266,9 @@ def _of_joint(name: str, seen: JointQuality, model: ArmModel, *, revolute: bool)
 
 
 def _weight(joints: Sequence[JointQuality], model: ArmModel) -> Iterator[str]:
-    """Compare the largest torque with what could hold an arm of this size."""
+    """Yield reasons where the largest torque does not fit what could hold an arm of this size."""
     chain = model.chain
-    # Where the first joint stands is not part of the arm.
+    # The offset from the base to the first joint does not count as reach.
     offsets = np.concatenate([chain.translation[1:], chain.link_translation])
     reach = float(np.linalg.norm(offsets, axis=1).sum())
     gravity = float(np.linalg.norm(chain.gravity))

@@ -23,18 +23,18 @@ Mask = NDArray[np.bool_]
 Label = tuple[int, int]
 
 _STEP = 0.02  # s; a motion up to 2 Hz moves by a tenth of its range meanwhile, see _SAME
-_MOST = 1 << 17  # samples that are looked at
+_MOST = 1 << 17  # largest number of grid samples
 _SHORTEST = 1.0  # s
-_SAME = 0.04  # of a joint's range: what positions of the same motion may differ by
-_HARDLY = 0.05  # of the range of the joint that moves most: less is not looked at so closely
-_PART = 0.5  # of the way in common that has to be the same
-_LEAST = 0.2  # of a period that has to be repeated
+_SAME = 0.04  # share of a joint's range that positions of the same motion may differ by
+_HARDLY = 0.05  # share of the largest joint range: the least scale that joints are compared on
+_PART = 0.5  # share of the common path length that has to agree
+_LEAST = 0.2  # share of a period that has to be repeated
 _CANDIDATES = 40
 
 
 @dataclass(frozen=True)
 class Stretches:
-    """Cut a recording into stretches of time.
+    """Division of a recording into stretches of time, labelled by the motion they show.
 
     Attributes:
         length: of each [s].
@@ -51,7 +51,7 @@ class Stretches:
     recording: int = 0
 
     def label(self, number: int) -> Label:
-        """Give the label of a stretch; of its own where nothing is known to repeat."""
+        """Return the label of a stretch; one of its own where nothing is known to repeat."""
         place = number - self.first
         return self.labels[place] if 0 <= place < len(self.labels) else (self.recording, number)
 
@@ -67,7 +67,7 @@ class _Positions:
 
 @dataclass(frozen=True)
 class _Motion:
-    """A motion that others are held against: one period, or a whole recording where it does not repeat itself.
+    """Reference motion: one period, or a whole recording where it does not repeat itself.
 
     Attributes:
         q: positions every `step` seconds, NaN where they are not known, shape (samples, joints).
@@ -86,7 +86,7 @@ class _Motion:
     number: int
 
     def shown(self, positions: _Positions, offset: float) -> Mask:
-        """Tell where a recording shows it, when its time plus `offset` [s] is that of the motion."""
+        """Return where a recording shows the motion, when its time plus `offset` [s] is that of the motion."""
         time = np.arange(len(positions.q)) * positions.step + offset
         place = np.rint((time if self.period is None else time % self.period) / self.step).astype(np.intp)
         place = place if self.period is None else place % len(self.q)
@@ -117,7 +117,7 @@ def stretches(
     periods = [_period(positions) for positions in seen]
     motions: list[_Motion] = []
     found: dict[int, Stretches] = {}
-    # Motions that repeat themselves first, so that others are held against a whole period.
+    # Motions that repeat themselves first, so that others are compared with a whole period.
     for index in sorted(range(len(seen)), key=lambda one: (periods[one] is None, one)):
         positions, period = seen[index], periods[index]
         for motion in motions:
@@ -139,7 +139,7 @@ def _positions(recording: Recording, fmt: RecordingFormat) -> _Positions:
     step = max(_STEP, stamps.period_s, duration / _MOST)
     q = np.full((int(duration / step) + 1, recording.joints), np.nan)
     for piece in uniform(recording, fmt, stamps):
-        # Every sample writes where it is nearest, the last one stays: no more than half a step off.
+        # Every sample goes to its nearest grid time, the last of several stays: at most half a step off.
         q[np.rint((piece.block.stamp_ns - stamps.first_ns) * 1e-9 / step).astype(np.intp).clip(0, len(q) - 1)] = (
             piece.block.position
         )
@@ -148,7 +148,7 @@ def _positions(recording: Recording, fmt: RecordingFormat) -> _Positions:
 
 
 def _period(positions: _Positions) -> float | None:
-    """Find the shortest time [s] after which a recording shows what it has shown before."""
+    """Return the shortest time [s] after which a recording repeats its motion; None where it does not."""
     q, scale = positions.q, positions.scale
     for lag in _candidates(q, q, scale, round(_SHORTEST / positions.step)):
         same = _same(q[lag:], q[:-lag], scale)
@@ -158,7 +158,7 @@ def _period(positions: _Positions) -> float | None:
 
 
 def _refined(positions: _Positions, lag: int) -> float:
-    """Find the period in steps from the largest multiple of it that the recording shows."""
+    """Return the period in steps, refined by the largest multiple of it that the recording shows."""
     q, scale, period = positions.q, positions.scale, float(lag)
     for times in range(1, len(q) // lag + 1):
         about = round(times * period)
@@ -176,7 +176,7 @@ def _refined(positions: _Positions, lag: int) -> float:
 
 
 def _vertex(values: Sequence[float], place: int) -> float:
-    """Give where the parabola through a smallest value and its neighbours is least, from that place."""
+    """Return the offset from `place` to the vertex of the parabola through the value there and its neighbours."""
     if not 0 < place < len(values) - 1:
         return 0.0
     before, here, after = values[place - 1 : place + 2]
@@ -204,7 +204,7 @@ def _motion(positions: _Positions, period: float | None, length: float, number: 
 
 
 def _offset(motion: _Motion, positions: _Positions) -> float | None:
-    """Find what to add to a recording's time to have that of a motion [s]; None where it shows another."""
+    """Return what to add to a recording's time [s] to have that of a motion; None where it shows another."""
     step, q = motion.step, positions.q
     if abs(positions.step - step) > 1e-3 * step:
         q = q[np.rint(np.arange(0.0, len(q) - 0.5, step / positions.step)).astype(np.intp).clip(0, len(q) - 1)]
@@ -235,7 +235,7 @@ def _cut(positions: _Positions, motion: _Motion, offset: float, recording: int) 
 
 
 def _candidates(reference: Array, q: Array, scale: Array, least: int | None) -> Iterator[int]:
-    """Lags at which `reference[lag:]` is most like `q`: those from `least` on in order, or the best of all first."""
+    """Yield lags at which `reference[lag:]` is most like `q`: those from `least` on in order, or the best first."""
     size = len(reference) + len(q)
     length = 1 << (size - 1).bit_length()
 
@@ -267,6 +267,6 @@ def _same(one: Array, other: Array, scale: Array) -> Mask:
 
 
 def _enough(q: Array, same: Mask, scale: Array, step: float) -> bool:
-    """Tell whether what is the same is most of the way, not a rest that every motion has."""
+    """Return whether the samples that agree make up most of the travelled distance, not only a rest."""
     way = np.nansum(np.abs(np.diff(q, axis=0)) / scale, axis=1)
     return bool(same.sum() * step >= _SHORTEST) and float(way @ same[1:]) >= _PART * float(way.sum()) > 0.0

@@ -1,4 +1,4 @@
-"""Robust regression: equations that fit badly count less (Huber 1964), by iteratively reweighted least squares.
+"""Fit robustly: equations with large residuals count less (Huber 1964), by iteratively reweighted least squares.
 
 The weights are found on a spread of rows that is kept, so that memory does not grow with the recording; then each row
 gets its weight in one more reading. The scale of a joint's residuals is the median of their absolute values, which bad
@@ -24,9 +24,9 @@ from ident_service.model.threads import one_blas_thread
 from ident_service.record.recording import Recording
 
 _TUNING = 1.345  # 95 % efficiency where the noise is normal after all
-_CONSISTENT = 1.4826  # of the median absolute deviation, for normal noise
+_CONSISTENT = 1.4826  # standard deviation over median absolute deviation, for normal noise
 _SPREAD = 5_000  # samples that the weights are found on
-SETTLED = 1e-3  # of a white standard deviation
+SETTLED = 1e-3  # white standard deviations; smaller changes count as settled
 _MOST_ROUNDS = 50
 _FOLDS = 3
 _FOLD_ROUNDS = 15
@@ -41,7 +41,7 @@ def huber(
     torque_scales: Array | None = None,
     shares: Array | None = None,
 ) -> tuple[LeastSquares, Equations, float]:
-    """Find Huber's estimate, the reweighted equations that it solves, and by how much the last round changed it.
+    """Return Huber's estimate, the reweighted equations that it solves, and the last round's change of it.
 
     Where the weights do not settle in the rounds that there are, the one that changed least is the answer: a change
     above `SETTLED` says so.
@@ -80,7 +80,7 @@ def held_out_errors(
     torque_scales: Array,
     shares: Array,
 ) -> dict[str, float]:
-    """Predict each third of the torques from estimates of the other two, with and without Huber's weights.
+    """Return the torque errors of each third, predicted from the other two, with and without Huber's weights.
 
     Args:
         recordings: to fit to; each is read once.
@@ -109,21 +109,21 @@ def held_out_errors(
 
 
 def _weights(residuals: Array, scales: Array) -> Array:
-    # A row counts with the square of what it is multiplied by; over the scale, so that joints are comparable.
+    # Rows are multiplied by the root of Huber's weight, and divided by the scale so that joints are comparable.
     size = np.abs(residuals) / scales
     return np.asarray(np.sqrt(np.minimum(1.0, _TUNING / np.maximum(size, 1e-12))) / scales)
 
 
 @dataclass(frozen=True)
 class _Spread:
-    """Per joint, the columns of rows that count, with the torque as the last; evenly spread over the recordings."""
+    """Rows spread evenly over the recordings: per joint the columns of rows that count, the torque as the last."""
 
     supports: tuple[NDArray[np.intp], ...]
     base: int
     tables: tuple[Array, ...]
 
     def huber(self, beta: Array, rounds: int) -> tuple[Array, float]:
-        """Reweight in so many rounds; give the estimate that changed least, and by how many white deviations."""
+        """Reweight for `rounds` rounds; return the estimate that changed least, and its change in white deviations."""
         best = (beta, np.inf)
         for _ in range(rounds):
             better, deviations = self._reweighted(beta).estimate()
@@ -136,19 +136,19 @@ class _Spread:
         return best
 
     def moments(self) -> Moments:
-        """The rows, each once."""
+        """Return the products of the rows, each counted once."""
         return self._of([table.T @ table for table in self.tables])
 
     def squared_residuals(self, beta: Array) -> Array:
-        """Per joint, the sum of squared residuals, shape (joints,)."""
+        """Return per joint the sum of squared residuals, shape (joints,)."""
         return np.array([float(one @ one) for one in self.residuals(beta)])
 
     def only(self, part: int) -> _Spread:
-        """One third of the rows."""
+        """Return one third of the rows."""
         return self._with([np.array_split(table, _FOLDS)[part] for table in self.tables])
 
     def without(self, part: int) -> _Spread:
-        """The other two thirds."""
+        """Return the other two thirds of the rows."""
         return self._with(
             [
                 np.concatenate([one for number, one in enumerate(np.array_split(table, _FOLDS)) if number != part])
@@ -161,11 +161,11 @@ class _Spread:
         return [table[:, -1] - table[:, :-1] @ beta[support] for table, support in pairs]
 
     def scales(self, beta: Array) -> Array:
-        """Robust standard deviation of each joint's residuals [N m or N], shape (joints,)."""
+        """Return the robust standard deviation of each joint's residuals [N m or N], shape (joints,)."""
         return np.array([max(_CONSISTENT * float(np.median(np.abs(one))), 1e-9) for one in self.residuals(beta)])
 
     def _reweighted(self, beta: Array) -> Moments:
-        # The rows as often as their residuals allow.
+        # Weigh the rows by their residuals.
         products = []
         for table, residual, scale in zip(self.tables, self.residuals(beta), self.scales(beta), strict=True):
             rows = table * _weights(residual, scale)[:, None]
@@ -183,7 +183,7 @@ class _Spread:
 def _spread(
     recordings: Sequence[Recording], model: ArmModel, base: BaseParameters, times: Array, shares: Array
 ) -> _Spread:
-    """Read every recording once; of long ones every second, every fourth ... sample is kept.
+    """Read every recording once and return its rows; of long ones every second, every fourth ... sample is kept.
 
     Raises:
         RecordingError: a recording cannot be used.

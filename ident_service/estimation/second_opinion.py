@@ -1,4 +1,4 @@
-"""Solve the constrained problem of an estimate a second time, posed and solved by others, and compare.
+"""Solve the constrained problem of an estimate a second time, with another formulation and solver, and compare.
 
 What is compared is the optimum, not the link values: of these, many are behind the same base parameters.
 """
@@ -23,7 +23,7 @@ AGREED_BELOW = 0.1  # percent of the torques that the fit is about
 
 @dataclass(frozen=True)
 class SecondOpinion:
-    """Two solutions of one problem.
+    """Comparison of two solutions of one problem.
 
     Attributes:
         solvers: of the first and of the second solution; the first is `ident` where the problem was not posed in cvxpy.
@@ -45,12 +45,12 @@ class SecondOpinion:
 
     @property
     def agrees(self) -> bool:
-        """Tell if the two predict the same torques, to a thousandth."""
+        """Return whether the two solutions predict the same torques, to a thousandth."""
         return self.torque_percent < AGREED_BELOW
 
     @property
     def conclusive(self) -> bool:
-        """Tell if the second solver reached its optimum; one that stopped early disproves nothing."""
+        """Return whether the second solver reached its optimum; one that stopped early disproves nothing."""
         return self.agrees or (self.status == "optimal" and self.margin > 0.0)
 
 

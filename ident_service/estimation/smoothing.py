@@ -1,4 +1,4 @@
-"""From positions to positions, velocities and accelerations, without phase (5.2.2).
+"""Smooth positions and differentiate them to velocities and accelerations, without phase (5.2.2).
 
 Third-order Butterworth forwards and backwards, then central differences (five points, fourth order, twice for the
 acceleration); filtering and differencing commute, so their order does not matter. Or local polynomials
@@ -35,7 +35,7 @@ _DECAY = 28.0  # -ln(1e-12)
 
 @dataclass(frozen=True)
 class Motion:
-    """Smoothed samples and which of their equations count.
+    """Smoothed samples, with a mask of those whose equations count.
 
     Attributes:
         time: [s] since the recording's first sample, shape (samples,).
@@ -54,7 +54,7 @@ class Motion:
     direction: Array | None = None
 
     def __getitem__(self, part: slice | NDArray[np.intp]) -> Motion:
-        """Some of the samples."""
+        """Return some of the samples."""
         return Motion(
             self.time[part],
             self.position[part],
@@ -68,7 +68,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Window:
-    """Smoothed samples of which only `inner` counts; the rest is there for filters to look at."""
+    """Smoothed samples of which only `inner` counts; the others are the filter's margin."""
 
     motion: Motion
     inner: slice
@@ -80,11 +80,11 @@ def smoothed(
     coupling: Array | None = None,
     fmt: RecordingFormat | None = None,
 ) -> Iterator[Motion]:
-    """Smoothed samples of a recording, block by block; the edges of every stretch without a gap are left out.
+    """Yield smoothed samples of a recording, block by block, without the edges of every stretch without a gap.
 
     Args:
         recording: to read.
-        options: how.
+        options: how to smooth.
         coupling: drive coordinates per joint coordinates, shape (joints, joints); the identity when None.
         fmt: what to trim, what a gap is, and the rate; the defaults when None.
 
@@ -108,7 +108,7 @@ def windows(
     fmt: RecordingFormat | None = None,
     extra_margin: float = 0.0,
 ) -> Iterator[Window]:
-    """Smoothed samples in windows that overlap by the filter's memory and `extra_margin` [s] on both sides.
+    """Yield smoothed samples in windows that overlap by the filter's memory and `extra_margin` [s] on both sides.
 
     Raises:
         RecordingError: as for `smoothed`.
@@ -299,7 +299,7 @@ class _Way:
 
 
 def _overlapping(pieces: Iterable[Piece], margin: int) -> Iterator[tuple[Block, int, int, bool, bool]]:
-    """Windows of one stretch after the other: block, inner start and stop, whether it opens or closes a stretch."""
+    """Yield windows of the stretches in order: block, inner start and stop, whether it opens or closes a stretch."""
     held: list[Block] = []
     length, left, opens = 0, 0, True
     for piece in pieces:

@@ -37,7 +37,7 @@ _SAMPLES = 16384
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Keep the frequencies that end the motion and begin the noise of a recording.
+    """Frequencies of a recording at which its motion ends and its noise begins.
 
     Attributes:
         rate: of the samples [Hz].
@@ -51,7 +51,7 @@ class Spectrum:
 
     @property
     def cutoff(self) -> float:
-        """Cut-off [Hz] of a filter that passes the motion and stops the noise."""
+        """Return the cut-off [Hz] of a filter that passes the motion and stops the noise."""
         wanted = max(_MARGIN * self.motion, USUAL)
         return min(wanted, max(self.noise, _LEAST_MARGIN * self.motion), _HIGHEST * self.rate)
 
@@ -59,7 +59,7 @@ class Spectrum:
 def with_filter(
     recordings: Sequence[Recording], options: Identification, fmt: RecordingFormat | None = None
 ) -> Identification:
-    """Put numbers where the filter is left to be chosen; the cut-off is the largest that a recording asks for.
+    """Return the options with the filter's free settings chosen; the cut-off is the largest that a recording needs.
 
     Args:
         recordings: read once where there is something to choose.
@@ -84,7 +84,7 @@ def with_filter(
 
 
 def settled(model: ArmModel, recordings: Sequence[Recording]) -> ArmModel:
-    """Give the arm with numbers where its filter is left to be chosen.
+    """Return the arm with its filter's free settings chosen from the recordings.
 
     Raises:
         RecordingError: a recording cannot be read.
@@ -120,7 +120,7 @@ def remarks_on_noise(recordings: Sequence[Recording], model: ArmModel) -> tuple[
 
 
 def spectrum(recording: Recording, fmt: RecordingFormat, *, measured: bool = False) -> Spectrum:
-    """Look at the spectra of a recording's positions, in windows of about 20 s.
+    """Return where motion ends and noise begins in the spectra of a recording's positions, in windows of about 20 s.
 
     Args:
         recording: to look at.
@@ -148,7 +148,7 @@ def spectrum(recording: Recording, fmt: RecordingFormat, *, measured: bool = Fal
         if piece.end:
             waiting = waiting[:0]
     if windows == 0:
-        return Spectrum(1.0 / period, 0.0, 0.5 / period)  # what follows says that it is too short
+        return Spectrum(1.0 / period, 0.0, 0.5 / period)  # later steps report that it is too short
     frequency = np.fft.rfftfreq(length - 1, period)[1:]
     # A difference multiplies power by this, and white noise of positions is that of rates after one.
     difference = (2.0 * np.sin(np.pi * frequency * period)) ** 2
@@ -170,7 +170,7 @@ def _ends(
     difference: NDArray[np.floating],
     white: NDArray[np.floating],
 ) -> tuple[float, float]:
-    """Give the frequencies [Hz] that a joint's motion ends at and its noise matters from; `power` is of its rates."""
+    """Return the frequencies [Hz] that a joint's motion ends at and its noise matters from; `power` is of its rates."""
     flat = power / white
     high = (frequency > 0.25 / period) & (frequency < 0.475 / period)
     # The mean of an exponential distribution from its median.

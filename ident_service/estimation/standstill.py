@@ -15,12 +15,12 @@ from ident_service.estimation.least_squares import ordinary_least_squares, weigh
 from ident_service.model.chain import Array
 from ident_service.model.information import Information
 
-_SETTLED = 1e-3  # of a share
+_SETTLED = 1e-3  # change of a share that counts as settled
 _MOST_ROUNDS = 100
 
 
 def standstill_shares(gathered: Equations) -> Array:
-    """Find what rows near standstill are to be multiplied by, shape (joints,), at most one.
+    """Return the factors of the rows near standstill, shape (joints,), at most one.
 
     Args:
         gathered: equations with their rows near standstill apart.

@@ -1,4 +1,4 @@
-"""When what a run is for has been learned: the target of `ident run --until`.
+"""Decide when a run has learned enough: the target of `ident run --until`.
 
 A parameter is reached when its deviation is at most the target's share of the larger of its size and what is as good
 as zero, as in its verdict (`doubt.py`): a parameter that is as good as zero need not be known to a share of itself.
@@ -6,8 +6,6 @@ The deviation is the larger of eq. 81 and of what blocks say, as few blocks can 
 before there are some, nor before the motion has lasted for its first period: before, its design has not been made.
 Every base parameter counts where none is chosen. Not only the essential ones: early on, what is not known yet cannot
 be told from what is not there. Decision 0041.
-
-Boundary: pure computation.
 """
 
 from __future__ import annotations
@@ -30,7 +28,7 @@ LEAST_BLOCKS = 10
 
 @dataclass(frozen=True)
 class Target:
-    """What is to be known, and how well.
+    """Required accuracy of chosen base parameters.
 
     Attributes:
         share: largest deviation as a share of the parameter, between 0 and 1.
@@ -41,7 +39,7 @@ class Target:
     parameters: tuple[str, ...] = ()
 
     def places(self, base: BaseParameters, arm: str) -> NDArray[np.intp]:
-        """Which base parameters are chosen.
+        """Return the indices of the chosen base parameters, shape (chosen,).
 
         Raises:
             UsageError: one is none of the arm's.
@@ -54,7 +52,7 @@ class Target:
 
 
 def worst_share(doubt: Doubt, places: NDArray[np.intp]) -> float:
-    """The largest share of the chosen ones; infinite before there are enough blocks to say."""
+    """Return the largest relative deviation of the chosen parameters; infinite before there are enough blocks."""
     if doubt.blocks < LEAST_BLOCKS:
         return np.inf
     worst = float(shares(doubt.beta, doubt.deviations, doubt.negligible)[places].max())

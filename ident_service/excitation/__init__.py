@@ -1,1 +1,1 @@
-"""Excitation: motions that teach, and what they ask of the arm."""
+"""Design excitation motions, and prove what they demand of the arm."""

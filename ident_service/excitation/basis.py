@@ -1,4 +1,4 @@
-"""Motions as linear functions of coefficients, which is what a search varies.
+"""Parametrise motions as linear functions of coefficients, which a search varies.
 
 Every joint has the same basis functions of time and coefficients of its own: `q_k(t) = sum_c X[k, c] B_c(t)`, likewise
 for all derivatives. The last coefficient of a Fourier basis is the middle; the coefficients of ways between postures
@@ -20,32 +20,32 @@ from ident_service.model.chain import Array
 
 
 class Basis(Protocol):
-    """A family of motions."""
+    """Family of motions, linear in its coefficients."""
 
     @property
     def size(self) -> int:
-        """Coefficients per joint."""
+        """Return the number of coefficients per joint."""
 
     @property
     def moving(self) -> NDArray[np.bool_]:
-        """Which coefficients move the arm away from standing still, shape (size,)."""
+        """Return which coefficients move the arm away from standing still, shape (size,)."""
 
     def path(self, coefficients: Array) -> FourierPath | PosturePath:
-        """The motion with coefficients of shape (joints, size)."""
+        """Return the motion with coefficients of shape (joints, size)."""
 
     def standing(self, posture: Array) -> Array:
-        """Coefficients of standing still at a posture of shape (joints,), shape (joints, size)."""
+        """Return the coefficients of standing still at a posture of shape (joints,), shape (joints, size)."""
 
     def still(self, coefficients: Array) -> Array:
-        """Coefficients of standing at the middle of a motion, shape (joints, size)."""
+        """Return the coefficients of standing at the middle of a motion, shape (joints, size)."""
 
     def samples(self, per_period: int) -> tuple[Array, Array]:
-        """Times [s] at which limits are looked at, and how much time of information each of them stands for [s]."""
+        """Return times [s] to check limits at, and the time of information that each of them stands for [s]."""
 
 
 @dataclass(frozen=True)
 class FourierBasis:
-    """Fourier series (eq. 78) in a window; coefficients are a, b, q0."""
+    """Family of windowed Fourier series (eq. 78); coefficients are a, b, q0."""
 
     base_frequency: float
     harmonics: int
@@ -54,30 +54,30 @@ class FourierBasis:
 
     @property
     def size(self) -> int:
-        """Coefficients per joint."""
+        """Return the number of coefficients per joint."""
         return 2 * self.harmonics + 1
 
     @cached_property
     def moving(self) -> NDArray[np.bool_]:
-        """All but the middle."""
+        """Return True for all coefficients but the middle position, shape (size,)."""
         return np.arange(self.size) < 2 * self.harmonics
 
     def path(self, coefficients: Array) -> FourierPath:
-        """The motion with coefficients of shape (joints, size)."""
+        """Return the motion with coefficients of shape (joints, size)."""
         n = self.harmonics
         a, b, q0 = coefficients[:, :n].copy(), coefficients[:, n : 2 * n].copy(), coefficients[:, -1].copy()
         return FourierPath(FourierSeries(self.base_frequency, a, b, q0), self.periods, self.ramp)
 
     def standing(self, posture: Array) -> Array:
-        """Coefficients of standing still."""
+        """Return the coefficients of standing still."""
         return np.column_stack([np.zeros((len(posture), 2 * self.harmonics)), posture])
 
     def still(self, coefficients: Array) -> Array:
-        """Coefficients of standing at the middle."""
+        """Return the coefficients of standing at the middle."""
         return self.standing(coefficients[:, -1])
 
     def samples(self, per_period: int) -> tuple[Array, Array]:
-        """One period, which counts for all of them, and both ramps, which do not count."""
+        """Return times in one period, which count for all periods, and in both ramps, which have no weight."""
         period = 1.0 / self.base_frequency
         step = period / per_period
         times = np.asarray(self.ramp + step * np.arange(per_period))
@@ -94,12 +94,12 @@ class FourierBasis:
 
 @dataclass(frozen=True)
 class PostureBasis:
-    """Ways through postures and back again, each way forwards and backwards in its own time.
+    """Family of motions through postures and back, each segment forwards and backwards in its own time.
 
     Attributes:
-        postures: how many.
-        times: how long each way takes [s], there and back again: 2 (postures - 1) of them.
-        dwell: how long the arm stands at each posture [s].
+        postures: number of postures.
+        times: durations of the segments [s], there and back again: 2 (postures - 1) of them.
+        dwell: time that the arm stands at each posture [s].
     """
 
     postures: int
@@ -108,34 +108,34 @@ class PostureBasis:
 
     @property
     def size(self) -> int:
-        """Coefficients per joint."""
+        """Return the number of coefficients per joint."""
         return self.postures
 
     @cached_property
     def moving(self) -> NDArray[np.bool_]:
-        """All: the arm stands still where all postures are one."""
+        """Return True for all coefficients: the arm stands still where all postures are one."""
         return np.ones(self.postures, dtype=bool)
 
     def path(self, coefficients: Array) -> PosturePath:
-        """The motion with coefficients of shape (joints, postures)."""
+        """Return the motion with coefficients of shape (joints, postures)."""
         order = [*range(self.postures), *range(self.postures - 2, -1, -1)]
         return PosturePath(coefficients.T[order].copy(), np.array(self.times), self.dwell)
 
     def standing(self, posture: Array) -> Array:
-        """Coefficients of standing still."""
+        """Return the coefficients of standing still."""
         return np.repeat(posture[:, None], self.postures, axis=1)
 
     def still(self, coefficients: Array) -> Array:
-        """Coefficients of standing at the mean posture."""
+        """Return the coefficients of standing at the mean posture."""
         return self.standing(coefficients.mean(axis=1))
 
     def samples(self, per_period: int) -> tuple[Array, Array]:
-        """The whole motion."""
+        """Return times [s] over the whole motion, with equal weights [s]."""
         duration = self.dwell * (len(self.times) + 1) + sum(self.times)
         step = duration / per_period
         return np.asarray(step * (np.arange(per_period) + 0.5)), np.full(per_period, step, dtype=float)
 
 
 def maps(basis: Basis, times: Array) -> tuple[Array, Array, Array, Array]:
-    """Values of all basis functions and of their first three derivatives, each of shape (samples, size)."""
+    """Return the values of all basis functions and of their first three derivatives, each of shape (samples, size)."""
     return basis.path(np.eye(basis.size)).at(times)

@@ -1,12 +1,10 @@
-"""Tell which limits hold a motion back, and what each of them costs.
+"""Find the limits that constrain a motion, and the cost of each of them.
 
 At the best motion the criterion's gradient is balanced by those of the limits that are reached, `g + A' lambda = 0`
 with `lambda >= 0` (Karush-Kuhn-Tucker). A limit L whose share is `c = |s| / L - 1` then costs
 `lambda = -df / d(log L)`. A criterion that is the logarithm of something changes that by the factor `r^lambda` where
 the limit is r times as wide.
 That is the slope at this motion, which far away from it is no more than a guess.
-
-Boundary: looks at a motion that has been found; nothing is searched.
 """
 
 from __future__ import annotations
@@ -22,9 +20,9 @@ from ident_service.excitation.problem import Multipliers, Problem
 from ident_service.excitation.task import Task
 from ident_service.model.chain import Array
 
-_REACHED = 0.05  # share of a limit that may be left where it still counts as reached; proofs take a little
-_NO_FORCE = -1e6  # a multiplier at which a limit does not press, however far it is exceeded
-_WORTH_TELLING = 0.03  # of lambda; below, twice the limit gives two hundredths more
+_REACHED = 0.05  # share of a limit that may be unused where it counts as reached; proofs shrink motions a little
+_NO_FORCE = -1e6  # a multiplier so low that a limit has no effect, however far it is exceeded
+_WORTH_TELLING = 0.03  # least lambda to report; below, twice the limit gains 2 %
 _MOST_TOLD = 6
 _GAINS = {
     "d_optimal": "{:.2g} times the information per parameter",
@@ -35,7 +33,7 @@ _GAINS = {
 
 @dataclass(frozen=True)
 class Binding:
-    """One limit that is reached.
+    """Active limit of a motion, with its multiplier.
 
     Attributes:
         limit: its name among those of `Problem`.
@@ -49,7 +47,7 @@ class Binding:
 
 
 def binding(task: Task, coefficients: Array, per_period: int) -> tuple[Binding, ...]:
-    """Return the limits that hold a motion back, the costliest first.
+    """Return the limits that constrain a motion, the costliest first.
 
     Args:
         task: what was searched.
@@ -67,7 +65,7 @@ def binding(task: Task, coefficients: Array, per_period: int) -> tuple[Binding, 
         peaks = (found >= np.roll(found, 1, axis=0)) & (found >= np.roll(found, -1, axis=0)) & (found > -_REACHED)
         for sample, column in np.argwhere(peaks):
             values = {key: one if key != name else one.copy() for key, one in silent.items()}
-            values[name][sample, column] = 1.0 - float(found[sample, column])  # with weight 1: a force of one
+            values[name][sample, column] = 1.0 - float(found[sample, column])  # with weight 1, its force is 1
             slopes.append(problem.value_and_gradient(x, sharpness, Multipliers(values, 1.0))[1] - alone)
             owners.append((name, None if name in ("power", "clearance") else int(column)))
     if not slopes:
@@ -84,7 +82,7 @@ def binding(task: Task, coefficients: Array, per_period: int) -> tuple[Binding, 
 def binding_words(
     found: Sequence[Binding], task: Task, limits: MotionLimits, velocity: Array, lengths: Sequence[str]
 ) -> list[str]:
-    """Say what holds a motion back and what it costs.
+    """Describe the active limits of a motion and their cost, one sentence each.
 
     Args:
         found: the limits.
@@ -100,7 +98,7 @@ def binding_words(
         gain = "would give about " + _GAINS[task.criterion].format(2.0**one.exponent)
         if one.joint is None:
             what = "the supply's power" if one.limit == "power" else "clearance"
-            # A clearance is measured in its own depth, of which twice means nothing.
+            # Clearance is scaled by a depth, so that the gain for twice the limit has no meaning.
             lines.append(f"{what} holds it back" + (f"; twice as much {gain}" if one.limit == "power" else ""))
             continue
         name, k = names[one.joint], one.joint

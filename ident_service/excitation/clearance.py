@@ -1,4 +1,4 @@
-"""How close a motion ever brings the arm to itself and to its surroundings, proven for all time.
+"""Prove, for all time, the smallest distance of a moving arm to itself and to its surroundings.
 
 In a cell of half width h about the time t_i, joint k moves no farther from q_k(t_i) than
 
@@ -8,8 +8,6 @@ with M the path's bound of its fifth derivative, and a pair's distance falls by 
 (`model/reach.py`). Cells end at the path's seams, where the fourth derivative may jump. Cells whose bound is too low
 are divided until it is proven, a sample disproves it, or they are shorter than 0.1 ms. An arm that is up to e_k away
 from the path in a cell (`tracking.py`) is nearer than the path by no more than `sum_k L_k e_k`.
-
-Boundary: judges motions, makes none.
 """
 
 from __future__ import annotations
@@ -27,7 +25,7 @@ from ident_service.model.collision import CollisionModel
 
 _FIRST_CELL, _SHORTEST_CELL = 0.02, 1e-4  # s
 _PARTS = 4
-_ROUNDING = 1e-6  # m, more than what coal's distances are wrong by
+_ROUNDING = 1e-6  # m, more than the error of coal's distances
 
 # From times [s] and half widths [s], shape (cells,), to positions and what each joint moves in a cell at most,
 # shape (cells, joints).
@@ -38,7 +36,7 @@ Tube = Callable[[Array, Array], Array]
 
 @dataclass(frozen=True)
 class Clearance:
-    """How close a motion comes.
+    """Proven and sampled smallest distance of a motion.
 
     Attributes:
         required: the distance asked for [m].
@@ -56,12 +54,12 @@ class Clearance:
 
     @property
     def proven(self) -> bool:
-        """Whether the required distance is kept at all times."""
+        """Return whether the required distance is proven to be kept at all times."""
         return self.lower_bound >= self.required
 
 
 def certified_clearance(collision: CollisionModel, path: Path, clearance: float, tube: Tube | None = None) -> Clearance:
-    """Prove, or disprove, that a path keeps every pair apart.
+    """Prove, or disprove, that a path keeps the bodies of every pair apart.
 
     Args:
         collision: the pairs.
@@ -96,7 +94,7 @@ def certified_along(
     duration: float,
     clearance: float,
 ) -> Clearance:
-    """As `certified_clearance`, for any motion whose speed is bounded.
+    """Prove, or disprove, the clearance of any motion of bounded speed, as `certified_clearance` does for a path.
 
     Args:
         collision: the pairs.
@@ -114,7 +112,7 @@ def certified_along(
 
 
 def posture_clearance(collision: CollisionModel, position: Array) -> tuple[float, str | None]:
-    """The smallest distance in one posture [m] and the pair it belongs to.
+    """Return the smallest distance in one posture [m] and the pair it belongs to.
 
     Args:
         collision: the pairs.
@@ -158,7 +156,7 @@ def _certified(
 
 
 def _cells(stretches: Sequence[tuple[float, float]]) -> tuple[Array, Array]:
-    """Middles and half widths of the first cells."""
+    """Return the middles and half widths of the first cells [s]."""
     times, halves = [], []
     for begin, end in stretches:
         count = max(int(np.ceil((end - begin) / _FIRST_CELL)), 1)

@@ -1,4 +1,4 @@
-"""One start of the search: from a random motion to a good one that keeps every limit at the samples.
+"""Run one start of the search: from a random motion to a good one that keeps every limit at the samples.
 
 A start is an augmented Lagrangian in a few rounds of L-BFGS, the criterion sharpened and the limits hardened from round
 to round. What is good already is polished by sequential quadratic programming (SLSQP, Kraft 1988): limits of position
@@ -7,7 +7,7 @@ adds new ones; all other limits stay in the augmented Lagrangian. What comes out
 standing still to the result that keeps the limits. Standing still in a good posture always does, so that there is a
 result however the rounds went.
 
-Boundary: one process, no clock of its own; whoever calls decides when to stop.
+It runs in one process and has no clock of its own; the caller decides when to stop.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ _SQP_ROUNDS, _SQP_STEPS = 10, 60
 _NEAR, _NEARER = 0.5, 0.8  # share of a limit above which a peak of the first and of later motions counts
 _SETTLED = 2e-4  # change of the criterion in a round after which no further one is worth its time
 _HOPELESS = 0.3  # share of a limit that a third round leaves exceeded where no further one will mend it
-_SPREAD = 0.25  # of the scaled coefficients of a random start
+_SPREAD = 0.25  # standard deviation of the scaled coefficients of a random start
 _HALVINGS = 24
 
 
 class Interrupted(Exception):
-    """Somebody asked the search to stop."""
+    """Report that the search was asked to stop."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A motion that keeps every limit at the samples it was searched on.
+    """Motion that keeps every limit at the samples it was searched on.
 
     Attributes:
         start: number of the random start that it came from.
@@ -52,7 +52,7 @@ class Candidate:
 
 
 def random_variables(problem: Problem, rng: np.random.Generator, safe: Array) -> Array:
-    """Where a start begins: a random motion about a random posture, or about the safe one every third time.
+    """Return the variables of a random motion about a posture between the safe one and a random one.
 
     Args:
         problem: of the search.
@@ -72,7 +72,7 @@ def random_variables(problem: Problem, rng: np.random.Generator, safe: Array) ->
 def climbed(
     problem: Problem, x: Array, safe: Array, start: int, check: Callable[[], None], *, polish: bool = False
 ) -> Candidate:
-    """Improve a motion.
+    """Improve a motion by local search, and return the best candidate that keeps all limits at the samples.
 
     Args:
         problem: of the search.
@@ -115,13 +115,13 @@ def climbed(
             if sharpness >= _ROUNDS[2][0] and here.worst > _HOPELESS:
                 break  # caught on the wrong side of an obstacle; another start will do better
     except Interrupted:
-        # Half a round may have left the limits far behind; where it came from may be worth more.
+        # An interrupted round may be far outside the limits; earlier points may be better.
         raise Stopped(_best_of([kept(problem, one, safe, start) for one in (*reached, *latest)])) from None
     return kept(problem, x, safe, start)
 
 
 def _polished(problem: Problem, x: Array, safe: Array, start: int, check: Callable[[], None]) -> Candidate:
-    """Improve a motion that is good already; it is not lost to rounds that lead nowhere.
+    """Improve a motion that is good already by SLSQP; the result is never worse than the start.
 
     Raises:
         Stopped: as `climbed`.
@@ -159,7 +159,7 @@ def _polished(problem: Problem, x: Array, safe: Array, start: int, check: Callab
 def _stepped(
     objective: Callable[[Array, float], tuple[float, Array]], x: Array, sharpness: float, A: Array, b: Array
 ) -> Array:
-    """Minimise under `A x <= b`; the best point that SLSQP comes to, shape (size,)."""
+    """Minimise under `A x <= b` by SLSQP, shape (size,)."""
     slope = -A
     conditions = [{"type": "ineq", "fun": lambda z: b - A @ z, "jac": lambda z: slope}] if len(b) else []
     found = minimize(
@@ -179,7 +179,7 @@ def _best_of(candidates: list[Candidate]) -> Candidate:
 
 
 class Stopped(Interrupted):
-    """Interrupted on the way; carries what there is."""
+    """Report an interrupted local search, with the best candidate so far."""
 
     def __init__(self, candidate: Candidate) -> None:
         self.candidate = candidate
@@ -187,7 +187,7 @@ class Stopped(Interrupted):
 
 
 def kept(problem: Problem, x: Array, safe: Array, start: int) -> Candidate:
-    """The most informative motion on the ways from x to standing still that keeps all limits at the samples.
+    """Return the best motion between x and standing still that keeps all limits at the samples.
 
     Standing still means in the motion's own middle, where that keeps the limits, or in the safe posture.
     """
@@ -198,7 +198,7 @@ def kept(problem: Problem, x: Array, safe: Array, start: int) -> Candidate:
 
 
 def _largest(problem: Problem, X: Array, anchor: Array, start: int) -> Candidate:
-    """The largest motion between an anchor and X that keeps all limits."""
+    """Return the largest motion between an anchor and X that keeps all limits."""
     share = 1.0
     if not keeps(problem, X):
         low, high = 0.0, 1.0
@@ -214,5 +214,5 @@ def _largest(problem: Problem, X: Array, anchor: Array, start: int) -> Candidate
 
 
 def keeps(problem: Problem, coefficients: Array) -> bool:
-    """Whether a motion keeps all limits at the samples."""
+    """Return whether a motion keeps all limits at the samples."""
     return problem.state(problem.variables(coefficients), 1.0).worst <= 0.0

@@ -1,4 +1,4 @@
-"""How informative a motion is: criteria on the information matrix, smooth, with their gradients.
+"""Evaluate criteria of a motion's information matrix, smooth, with their gradients.
 
 All are logarithms and all are to be made small; `G = sum_s H_b' H_b`, rows whitened where the criterion asks for it.
 
@@ -24,7 +24,7 @@ _NOTHING = 1e-100  # a largest eigenvalue that is no information at all, and sti
 
 @dataclass(frozen=True)
 class Value:
-    """A criterion at one information matrix.
+    """Value and gradient of a criterion at one information matrix.
 
     Attributes:
         value: to be made small.
@@ -42,10 +42,10 @@ def criterion(
     chosen: NDArray[np.intp] | None = None,
     scale: Array | None = None,
 ) -> Value:
-    """Evaluate a criterion.
+    """Evaluate a criterion and its gradient.
 
     Args:
-        kind: which.
+        kind: of criterion.
         G: information matrix, shape (base, base).
         sharpness: exponent of the condition number's power means.
         chosen: for `a_optimal`, which parameters; all when None.
@@ -72,6 +72,6 @@ def criterion(
 
 
 def condition_number(G: Array) -> float:
-    """Of the stacked regressor whose information is G: the root of G's own; infinite where G is singular."""
+    """Return the condition number of the stacked regressor with information G; infinite where G is singular."""
     eigenvalues = np.linalg.eigvalsh(G)
     return float(np.sqrt(eigenvalues[-1] / eigenvalues[0])) if eigenvalues[0] > 0.0 else float("inf")

@@ -1,4 +1,4 @@
-"""What a motion asks of the arm, for all time, against what the arm may do.
+"""Bound, for all time, the position, velocity, torque and power of a motion, and compare them with the limits.
 
 Every number here holds between samples too: position, velocity, acceleration and jerk come from enclosures of the
 path over short stretches of time, torque and power from the model's formulas run on those enclosures (`taylor.py`),
@@ -28,7 +28,7 @@ _KINDS = ("velocity", "acceleration", "jerk", "torque")
 
 @dataclass(frozen=True)
 class Demands:
-    """Bounds over a whole motion, each of shape (joints,) unless said otherwise.
+    """Peak bounds over a whole motion, each of shape (joints,) unless said otherwise.
 
     Attributes:
         lowest: position [rad or m].
@@ -55,8 +55,8 @@ class Demands:
     motors: Array | None = None
 
     def violations(self, names: tuple[str, ...], limits: MotionLimits, supply: Supply | None = None) -> list[str]:
-        """What is asked beyond the limits, in words; empty when the arm may move so."""
-        # Asked for so that a bound that is no number counts as beyond every limit.
+        """Return every limit that a bound exceeds, in words; empty when the arm may move so."""
+        # Negated comparisons, so that a bound that is NaN counts as beyond every limit.
         found = []
         for k, name in enumerate(names):
             if not (self.lowest[k] >= limits.lower[k] and self.highest[k] <= limits.upper[k]):
@@ -71,7 +71,7 @@ class Demands:
         return found + self.forces_beyond(names, limits, supply)
 
     def forces_beyond(self, names: tuple[str, ...], limits: MotionLimits, supply: Supply | None = None) -> list[str]:
-        """Of the violations, those of torque and power."""
+        """Return the violations of torque and power alone, in words."""
         found = []
         if self.torque is not None:
             rows = zip(names, self.torque, limits.torque, strict=True)
@@ -85,7 +85,7 @@ class Demands:
 
 
 def demands(path: Path, model: ArmModel) -> Demands:
-    """Bounds of what a motion asks, over all time.
+    """Return the peak bounds of a motion, over all time.
 
     Args:
         path: the motion.
@@ -138,7 +138,7 @@ def demands(path: Path, model: ArmModel) -> Demands:
 
 
 def torque_enclosures(cells: Stretches, model: ArmModel, delta: Array) -> list[Taylor]:
-    """Torque of every joint with link parameters `delta`, shape (layout.size,), over stretches of time."""
+    """Return enclosures of every joint's torque with link parameters `delta`, shape (layout.size,), per stretch."""
     tape, entries = traced_regressor(model.chain, model.layout)
     n = model.chain.joints
     torque: list[Value] = [0.0] * n
@@ -162,7 +162,7 @@ def _drive_rates(velocity: list[Taylor], coupling: Array) -> list[Taylor]:
 
 
 def power_bounds(torque: list[Taylor], velocity: list[Taylor], supply: Supply, coupling: Array) -> Array:
-    """The most that is drawn from the supply [W], shape (stretches,), as `Supply` counts it.
+    """Return the most power that is drawn from the supply [W], shape (stretches,), as `Supply` counts it.
 
     Torque and velocity of the joints are handed to the drives that move them, `tau_drive = C^-T tau`.
     """
@@ -176,7 +176,7 @@ def power_bounds(torque: list[Taylor], velocity: list[Taylor], supply: Supply, c
 
 
 def require_within_limits(path: Path, model: ArmModel, limits: MotionLimits) -> Demands:
-    """The motion's demands.
+    """Return the motion's peak bounds, and refuse a motion that exceeds the limits.
 
     Raises:
         MotionRefused: it asks for more than the arm may do; every violation is named.

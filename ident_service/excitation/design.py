@@ -1,4 +1,4 @@
-"""From an arm to the most informative motion that it can safely make, with the proof that it can.
+"""Design the most informative motion that an arm can safely make, and prove that it can.
 
 Everything a search needs is settled here, contradictions refused with their reason before it begins; what it finds is
 then proven for all time, made smaller where the proof needs it.
@@ -33,13 +33,13 @@ from ident_service.model.collision import CollisionModel
 from ident_service.model.expected_friction import expected_friction
 
 _PER_HARMONIC = 50  # samples of a search per period of its highest harmonic
-_PER_WAY = 24  # samples of a search per way between postures
+_PER_WAY = 24  # samples of a search per segment between postures
 _MOST_SAMPLES = 2000
 
 
 @dataclass(frozen=True)
 class Designed:
-    """A motion, what is proven of it, and the search that it came from.
+    """Designed motion, with its proof and the search that it came from.
 
     Attributes:
         excitation: the motion, ready to be written.
@@ -57,7 +57,7 @@ class Designed:
 
 
 def family(design: Design, model: ArmModel) -> tuple[Basis, BaseParameters]:
-    """The family of motions that a design asks for, and the parameters that it can teach."""
+    """Return the family of motions that a design asks for, and the base parameters that it can identify."""
     if design.motion == "fourier":
         basis = FourierBasis(design.base_frequency, design.harmonics, design.periods, design.ramp)
         return basis, base_parameters(model.chain, model.layout)
@@ -74,7 +74,7 @@ def settled(
     noise: Array | None = None,
     added: Array | None = None,
 ) -> Task:
-    """The task of a search.
+    """Return the search task of a design, with all limits and weights checked.
 
     Args:
         model: of the arm.
@@ -142,7 +142,7 @@ def _require_torque(model: ArmModel, limits: MotionLimits) -> None:
 
 
 def _scale(model: ArmModel, base: BaseParameters, kind: Criterion) -> Array | None:
-    """What deviations are measured in: the prior's values, at least a hundredth of the largest of the unit."""
+    """Return the scale of each parameter's deviation: the prior's value, at least 1 % of the largest of its unit."""
     if kind != "a_optimal" or model.prior is None:
         return None
     values = np.abs(base.K @ model.prior)
@@ -167,7 +167,7 @@ def design_motion(
     tell: Callable[[Progress], None] = lambda _: None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> Designed:
-    """The most informative motion that a search within a budget finds, proven to keep every limit.
+    """Return the most informative motion that a search within a budget finds, proven to keep every limit.
 
     Args:
         model: of the arm, with prior parameters.
@@ -209,7 +209,7 @@ def design_motion(
     best: tuple[float, Array, Proof] | None = None
     for candidate in found.candidates:
         if best is not None and candidate.value >= best[0]:
-            break  # even without the loss that a proof may cost it is no better
+            break  # a proof can only make it worse, so it cannot beat the best
         result = largest_proven(basis, candidate.coefficients, basis.standing(safe), proven)
         if result is not None:
             value = criterion_of(task, basis.path(result[0]), base)
@@ -250,7 +250,7 @@ def design_motion(
 
 
 def require_bearable(basis: Basis) -> None:
-    """Refuse a family of motions that no file may hold.
+    """Refuse a family of motions longer than a file may hold.
 
     Raises:
         UsageError: longer than a day.
@@ -263,14 +263,14 @@ def require_bearable(basis: Basis) -> None:
 
 
 def per_period(basis: Basis) -> int:
-    """How many samples a search looks at."""
+    """Return the number of samples at which a search checks a motion, per period or per whole motion."""
     if isinstance(basis, FourierBasis):
         return min(_MOST_SAMPLES, max(120, _PER_HARMONIC * basis.harmonics))
     return min(_MOST_SAMPLES, max(120, _PER_WAY * 2 * basis.size))
 
 
 def criterion_of(task: Task, path: FourierPath | PosturePath, base: BaseParameters) -> float:
-    """The criterion of a motion over its whole length, with the information that was there before."""
+    """Return the criterion of a motion over its whole length, with the information that was there before."""
     G = information(path, task.model, base, task.noise) * seconds_of_information(path) * task.rate
     if task.added is not None:
         G = G + task.added
@@ -303,7 +303,7 @@ def _require_free_home(model: ArmModel, limits: MotionLimits, collision: Collisi
 def _made(
     model: ArmModel, design: Design, seed: int, found: Found, kappa: float, value: float, proof: Proof
 ) -> dict[str, object]:
-    """How the motion was found and what was proven of it, as JSON values."""
+    """Return the provenance of a motion as JSON values: how it was found and what was proven of it."""
     asked = proof.demands
     bounds: dict[str, object] = {
         "position": np.column_stack([asked.lowest, asked.highest]).tolist(),

@@ -1,4 +1,4 @@
-"""A motion on all of time, as enclosures over short stretches of it.
+"""Enclose a motion over all time, by bounds on short stretches of time.
 
 By Taylor's theorem the k-th derivative stays, at s from the middle of a stretch, within
 
@@ -24,7 +24,7 @@ _PER_CYCLE = 400  # stretches per period of the highest frequency; its half leng
 
 @dataclass(frozen=True)
 class Stretches:
-    """A motion on consecutive stretches of time.
+    """Enclosed motion on consecutive stretches of time.
 
     Attributes:
         time: their middles [s], shape (stretches,).
@@ -39,7 +39,7 @@ class Stretches:
     crackle: Array
 
     def of(self, order: int) -> list[Taylor]:
-        """Enclosures of position (order 0), velocity, acceleration or jerk (3), one per joint."""
+        """Return enclosures of position (order 0), velocity, acceleration or jerk (3), one per joint."""
         h = self.half
         rest = self.crackle * (h ** (5 - order) / factorial(5 - order))[:, None]
         for i in range(2, 5 - order):
@@ -49,7 +49,7 @@ class Stretches:
 
 
 def stretches(path: Path, longest: float | None = None) -> Stretches:
-    """Stretches that cover everything that is different in a motion.
+    """Return stretches of time that cover one instance of every distinct part of a motion.
 
     Args:
         path: the motion.

@@ -1,4 +1,4 @@
-"""A motion ready to run, the arm it was made for, and the one small JSON file that it is kept in."""
+"""Represent a motion that is ready to run, with its arm, and store it in one small JSON file."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _MOST_PERIODS = 10**9
 
 @dataclass(frozen=True)
 class Excitation:
-    """A motion ready to run, and the arm it was made for.
+    """Motion that is ready to run, and the arm it was made for.
 
     Attributes:
         name: what the motion is for.
@@ -43,11 +43,11 @@ class Excitation:
 
     @property
     def duration(self) -> float:
-        """Length of the whole motion [s]."""
+        """Return the length of the whole motion [s]."""
         return self.path.duration
 
     def to_json(self) -> str:
-        """One small JSON object from which the motion can be repeated to the last bit."""
+        """Return one small JSON object from which the motion can be repeated to the last bit."""
         head = {"format": FORMAT, "version": VERSION, "name": self.name, "arm": {"sha256": self.arm_sha256}}
         path = self.path
         if isinstance(path, FourierPath):
@@ -92,7 +92,7 @@ def read_excitation(file: FilePath) -> Excitation:
 
 
 def excitation_from_json(text: str) -> Excitation:
-    """The inverse of `Excitation.to_json`.
+    """Parse the text that `Excitation.to_json` made.
 
     Raises:
         UsageError: not a motion; the message says what is wrong with it.

@@ -1,4 +1,4 @@
-"""What a motion will teach, told beforehand: the standard deviation of every base parameter.
+"""Predict the standard deviation of every base parameter that a motion will give.
 
 Rows whitened by each joint's torque noise, `G = sum_s H_b' S^-1 H_b`, give the covariance `G^-1` of the best linear
 estimate (eq. 81 with a noise per joint). Noise that resembles itself from sample to sample teaches less than white
@@ -25,7 +25,7 @@ _SAMPLES = 2000
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """How far measured torques are from what the best parameters predict.
+    """Expected size and correlation of the torque residual.
 
     Attributes:
         deviation: per joint [N m or N], shape (joints,).
@@ -39,7 +39,7 @@ class NoiseModel:
 
 
 def described_noise(model: ArmModel, limits: MotionLimits) -> NoiseModel:
-    """From the arm's description: the simulated driver's noise, else one hundredth of the torque limits."""
+    """Return the noise of the arm's description: the simulated driver's, else one hundredth of the torque limits."""
     driver = model.config.driver
     fallback = _NOISE_SHARE * limits.torque
     if isinstance(driver, SimulatedDriver):
@@ -50,7 +50,7 @@ def described_noise(model: ArmModel, limits: MotionLimits) -> NoiseModel:
 
 
 def information(path: FourierPath | PosturePath, model: ArmModel, base: BaseParameters, noise: Array) -> Array:
-    """Information per second of a motion, its ramps left out, shape (base, base).
+    """Return the information per second of a motion, its ramps left out, shape (base, base).
 
     Args:
         path: the motion.
@@ -66,7 +66,7 @@ def information(path: FourierPath | PosturePath, model: ArmModel, base: BasePara
 
 
 def seconds_of_information(path: FourierPath | PosturePath) -> float:
-    """How long a motion teaches what `information` says [s]; ramps count for nothing."""
+    """Return the time for which `information` holds [s]; ramps count for nothing."""
     return path.periods * path.series.period if isinstance(path, FourierPath) else path.duration
 
 
@@ -77,7 +77,7 @@ def expected_deviations(
     noise: NoiseModel,
     added: Array | None = None,
 ) -> Array:
-    """Standard deviations to be expected of the base parameters [SI], shape (base,); infinite where nothing is taught.
+    """Return the expected standard deviations of the base parameters [SI], shape (base,); infinite where unseen.
 
     Args:
         path: the motion.

@@ -1,12 +1,12 @@
-"""Friction in the control law, and how far the arm falls behind by what the law does not know of it.
+"""Predict the following error that friction causes beyond the control law's friction feed-forward.
 
 Drives are expected to take `f(w) = F_c s(w) + F_v w` at their velocity w. The law adds the share s_f of it, for the
 velocity of the reference (`FrictionFeedforward`). What is left, `d = (b - s_f) f` where friction is b times what is
 expected, computed torque (eq. 76) answers with the error `e = K_p^-1 M(q)^-1 d`, once it has settled. Where little
 inertia stands behind a joint, as behind the upper arm's rotation when the elbow is straight, little friction moves it
-far. Static, so a forecast and no bound; the guard keeps the limit itself.
+far. It is static, so a prediction and no bound; the safety monitor keeps the limit.
 
-Boundary: forecasts; friction is the prior's where it has some, else a guess from the torque limits.
+Friction is the prior's where it has some, else a guess from the torque limits.
 """
 
 from __future__ import annotations
@@ -25,30 +25,30 @@ if TYPE_CHECKING:
     import scipy.sparse
 
 # Where the inertia behind a joint changes, so does how far it falls behind, and its speed is another than asked for.
-TOLERATED = 1.05  # of the velocity limit; the guard stops at 1.2
-USABLE = 0.8  # of the limit: settling overshoots a little, and the forecast is static
+TOLERATED = 1.05  # share of the velocity limit; the safety monitor stops at 1.2
+USABLE = 0.8  # share of the limit: settling overshoots a little, and the prediction is static
 # Times the expected friction, between which an arm's own lies for a forecast: it changes by a third between a cold and
 # a warm drive (Bittencourt & Gunnarsson 2012, figure 5).
 DOUBT = (0.6, 1.4)
 
 
 def dry_friction(model: ArmModel, delta: Array) -> tuple[Array, Array]:
-    """The most that dry friction can take, of every drive and of every joint [N m or N], each of shape (joints,)."""
+    """Return the largest dry friction of every drive and of every joint [N m or N], each of shape (joints,)."""
     drives = np.abs(model.layout.term_values("coulomb", delta)) + np.abs(model.layout.term_values("stribeck", delta))
     return drives, drives @ np.abs(model.chain.coupling)
 
 
 def unknown_friction(friction: ExpectedFriction, share: float) -> ExpectedFriction:
-    """Return the most of the expected friction that a feed-forward of a share leaves, either way, within `DOUBT`."""
+    """Return the most of the expected friction that a feed-forward of `share` leaves, either way, within `DOUBT`."""
     left = max(DOUBT[1] - share, share - DOUBT[0])
     return ExpectedFriction(left * friction.coulomb, left * friction.viscous, 0.0 * friction.offset)
 
 
 class FollowingError:
-    """The forecast at many states, with derivatives of whatever is computed from it."""
+    """Predicted following error at many states, with derivatives of functions of it."""
 
     def __init__(self, model: ArmModel, limits: MotionLimits, friction: ExpectedFriction, creep: Array) -> None:
-        """Take the prior model.
+        """Build the inertia response of the prior model.
 
         Args:
             model: with prior parameters.
@@ -67,7 +67,7 @@ class FollowingError:
         self._slope = np.zeros((0, len(creep)))
 
     def run(self, position: Array, velocity: Array) -> Array:
-        """Forecast error [rad or m], shape (samples, joints), at states of shape (samples, joints)."""
+        """Return the predicted error [rad or m], shape (samples, joints), at states of shape (samples, joints)."""
         rate = velocity @ self._coupling.T
         turned = np.tanh(rate / self._creep)
         self._slope = self._friction.viscous + self._friction.coulomb * (1.0 - turned**2) / self._creep
@@ -75,13 +75,13 @@ class FollowingError:
         return self._response.run(position, torque) / self._kp
 
     def pull(self, seeds: Array) -> tuple[Array, Array]:
-        """The gradient of `sum(seeds * run(...))` over position and velocity, each of shape (samples, joints)."""
+        """Return the gradient of `sum(seeds * run(...))` over position and velocity, each (samples, joints)."""
         by_position, by_torque = self._response.pull(seeds / self._kp)
         return by_position, ((by_torque @ self._coupling.T) * self._slope) @ self._coupling
 
 
 def rate_of_change(times: Array) -> scipy.sparse.csr_array:
-    """The matrix that takes values at `times` [s] to their time derivatives, by differences of neighbours.
+    """Return the matrix that takes values at `times` [s] to time derivatives, by differences of neighbours.
 
     Neighbours are samples of one stretch; where times jump or turn back, another stretch begins.
     """
@@ -106,7 +106,7 @@ def rate_of_change(times: Array) -> scipy.sparse.csr_array:
 def forecast(
     model: ArmModel, limits: MotionLimits, friction: ExpectedFriction, position: Array, velocity: Array
 ) -> Array:
-    """The largest forecast error of every joint over samples of a motion [rad or m], shape (joints,).
+    """Return the largest predicted following error of every joint over a motion [rad or m], shape (joints,).
 
     Args:
         model: of the arm; its description says which share of the friction is fed forward.

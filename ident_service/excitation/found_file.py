@@ -1,4 +1,4 @@
-"""A search on disk, so that it can go on another day: what it has found, and what it was a search for."""
+"""Store a search on disk, so that it can be resumed: its candidates and a fingerprint of its task."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _MOST_BYTES = 16 * 2**20
 
 
 def fingerprint(task: Task, seed: int) -> str:
-    """SHA-256 of everything that a search's random starts and its criterion depend on."""
+    """Return the SHA-256 of everything that a search's random starts and its criterion depend on."""
     digest = hashlib.sha256()
     parts = (
         task.model.config.motion_sha256,
@@ -36,7 +36,7 @@ def fingerprint(task: Task, seed: int) -> str:
 
 
 def found_to_json(found: Found, task: Task) -> str:
-    """One JSON object."""
+    """Return the results of a search as one JSON object."""
     return json.dumps(
         {
             "format": FORMAT,
@@ -57,7 +57,7 @@ def found_to_json(found: Found, task: Task) -> str:
 
 
 def read_found(file: Path, task: Task, seed: int) -> Found:
-    """Read a search that is to go on.
+    """Read a search that is to be resumed.
 
     Args:
         file: what `found_to_json` made.

@@ -1,8 +1,8 @@
-"""Finite Fourier motions (eq. 78) and what they are made of.
+"""Evaluate finite Fourier series (eq. 78) and their derivatives.
 
     q_k(t) = sum_l a_kl / (w l) sin(w l t) - b_kl / (w l) cos(w l t) + q0_k
 
-Boundary: pure functions of time; whether an arm may move so is `demands.py`'s question.
+`demands.py` checks whether an arm may move so.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ident_service.model.chain import Array
 
 @dataclass(frozen=True)
 class FourierSeries:
-    """A periodic motion of all joints.
+    """Periodic motion of all joints, a finite Fourier series.
 
     Attributes:
         base_frequency: [Hz]; `2 pi base_frequency` is the paper's omega_f.
@@ -40,11 +40,11 @@ class FourierSeries:
 
     @property
     def period(self) -> float:
-        """Length of one period [s]."""
+        """Return the length of one period [s]."""
         return 1.0 / self.base_frequency
 
     def at(self, time: Array | float) -> tuple[Array, Array, Array, Array]:
-        """Position, velocity, acceleration and jerk.
+        """Return position, velocity, acceleration and jerk.
 
         Args:
             time: [s], shape (samples,) or a single number.
@@ -56,7 +56,7 @@ class FourierSeries:
         return position, velocity, acceleration, jerk
 
     def derivatives(self, time: Array, highest: int) -> list[Array]:
-        """Position and its time derivatives up to the order `highest`, each of shape (samples, joints)."""
+        """Return position and its time derivatives up to the order `highest`, each of shape (samples, joints)."""
         rates = self._rates
         phase = time[..., None] * rates
         sine, cosine = np.sin(phase), np.cos(phase)
@@ -71,9 +71,9 @@ class FourierSeries:
 
     @cached_property
     def _rates(self) -> Array:
-        """Of the harmonics [rad/s], shape (harmonics,)."""
+        """Return the angular frequencies of the harmonics [rad/s], shape (harmonics,)."""
         return np.asarray(2.0 * np.pi * self.base_frequency * np.arange(1, self.a.shape[1] + 1))
 
     def scaled(self, factor: float) -> FourierSeries:
-        """The same motion about the same middle with all amplitudes times `factor`."""
+        """Return the motion about the same middle with all amplitudes times `factor`."""
         return FourierSeries(self.base_frequency, self.a * factor, self.b * factor, self.q0.copy())

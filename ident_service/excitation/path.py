@@ -1,7 +1,7 @@
-"""Motions of all joints as functions of time: a Fourier series in a smooth window, or ways between postures.
+"""Represent motions of all joints over time: windowed Fourier series, or straight segments between postures.
 
 Every path bounds its fifth derivative, so that what holds at single times can be extended to all times
-(`enclosure.py`). Boundary: pure functions of time.
+(`enclosure.py`).
 """
 
 from __future__ import annotations
@@ -24,41 +24,41 @@ STEP_PEAKS = (1.0, 35.0 / 16.0, 84.0 / 5.0**0.5 / 5.0, 52.5, 840.0, 10080.0)
 
 
 class Path(Protocol):
-    """A motion of all joints."""
+    """Motion of all joints as a function of time."""
 
     @property
     def joints(self) -> int:
-        """Number of joints."""
+        """Return the number of joints."""
 
     @property
     def duration(self) -> float:
-        """Length [s]."""
+        """Return the length of the motion [s]."""
 
     @property
     def distinct(self) -> tuple[tuple[float, float], ...]:
-        """Stretches of time [s] in which everything happens that ever happens; the others repeat them."""
+        """Return the stretches of time [s] that contain every distinct part; all other times repeat them."""
 
     @property
     def crackle(self) -> Array:
-        """Bound of the fifth derivative, but where the fourth may jump [rad/s^5 or m/s^5], shape (joints,)."""
+        """Return the bound of the fifth derivative between the seams [rad/s^5 or m/s^5], shape (joints,)."""
 
     @property
     def seams(self) -> Array:
-        """Times between which all derivatives are smooth [s], from 0 to the duration, increasing."""
+        """Return the times between which all derivatives are smooth [s], from 0 to the duration, increasing."""
 
     def fastest(self, begin: float, end: float) -> float:
-        """The highest frequency that matters between two times [Hz]."""
+        """Return the highest relevant frequency between two times [Hz]."""
 
     def derivatives(self, time: Array, highest: int) -> list[Array]:
-        """Position and its time derivatives up to the order `highest` <= 4, each of shape (samples, joints)."""
+        """Return position and its time derivatives up to the order `highest` <= 4, each of shape (samples, joints)."""
 
     def at(self, time: Array | float) -> tuple[Array, Array, Array, Array]:
-        """Position, velocity, acceleration and jerk at `time` [s], shape (samples, joints) or (joints,)."""
+        """Return position, velocity, acceleration and jerk at `time` [s], shape (samples, joints) or (joints,)."""
 
 
 @dataclass(frozen=True)
 class FourierPath:
-    """A Fourier series that swells from rest about its middle, repeats, and dies down to rest.
+    """Fourier series that swells from rest about its middle, repeats, and dies down to rest.
 
         q(t) = q0 + w(t) s(t - ramp)
 
@@ -66,7 +66,7 @@ class FourierPath:
 
     Attributes:
         series: the periodic motion.
-        periods: how often it repeats at full size.
+        periods: number of repetitions at full size.
         ramp: length of the swelling and of the dying down [s]; 0 for a motion that begins and ends moving.
     """
 
@@ -80,17 +80,17 @@ class FourierPath:
 
     @property
     def joints(self) -> int:
-        """Number of joints."""
+        """Return the number of joints."""
         return len(self.series.q0)
 
     @property
     def duration(self) -> float:
-        """Length of the whole motion [s]."""
+        """Return the length of the whole motion [s]."""
         return self.periods * self.series.period + 2.0 * self.ramp
 
     @property
     def distinct(self) -> tuple[tuple[float, float], ...]:
-        """Both ramps and one period."""
+        """Return the times of both ramps and of one period [s]."""
         full = (self.ramp, self.ramp + self.series.period)
         if self.ramp == 0.0:
             return (full,)
@@ -98,7 +98,7 @@ class FourierPath:
 
     @property
     def crackle(self) -> Array:
-        """Leibniz' rule on the window and the sum of the harmonics' sizes, shape (joints,)."""
+        """Return the bound of the fifth derivative by Leibniz' rule on window and harmonics, shape (joints,)."""
         rates = 2.0 * np.pi * self.series.base_frequency * np.arange(1, self.series.a.shape[1] + 1)
         sizes = np.hypot(self.series.a, self.series.b) / rates
         swing = [(sizes * rates**order).sum(axis=1) for order in range(6)]
@@ -109,18 +109,18 @@ class FourierPath:
 
     @property
     def seams(self) -> Array:
-        """The ends of the ramps [s]."""
+        """Return the ends of the ramps [s]."""
         ends = [0.0, self.ramp, self.duration - self.ramp, self.duration]
         return np.array(sorted(set(ends)))
 
     def fastest(self, begin: float, end: float) -> float:
-        """Of the highest harmonic, or of a ramp [Hz]."""
+        """Return the frequency of the highest harmonic, or the reciprocal of the ramp where that is higher [Hz]."""
         highest = self.series.base_frequency * self.series.a.shape[1]
         in_ramp = self.ramp > 0.0 and (begin < self.ramp or end > self.duration - self.ramp)
         return float(max(highest, 1.0 / self.ramp) if in_ramp else highest)
 
     def at(self, time: Array | float) -> tuple[Array, Array, Array, Array]:
-        """Position, velocity, acceleration and jerk.
+        """Return position, velocity, acceleration and jerk.
 
         Args:
             time: [s] since the beginning of the first ramp, shape (samples,) or a single number; before and after a
@@ -133,7 +133,7 @@ class FourierPath:
         return position, velocity, acceleration, jerk
 
     def derivatives(self, time: Array, highest: int) -> list[Array]:
-        """Position and its time derivatives up to the order `highest`."""
+        """Return position and its time derivatives up to the order `highest`."""
         swing = self.series.derivatives(time - self.ramp, highest)
         if self.ramp == 0.0:
             return swing
@@ -147,7 +147,7 @@ class FourierPath:
         return values
 
     def _window(self, t: Array, highest: int) -> list[Array]:
-        """The window and its derivatives."""
+        """Return the window and its derivatives."""
         rising, falling = t / self.ramp, (self.duration - t) / self.ramp
         nearer = np.minimum(rising, falling)
         inside = (nearer > 0.0) & (nearer < 1.0)
@@ -162,12 +162,12 @@ class FourierPath:
 
 @dataclass(frozen=True)
 class PosturePath:
-    """Straight ways in joint space from posture to posture, at rest at each.
+    """Straight segments in joint space from posture to posture, at rest at each.
 
     Attributes:
         points: postures in the order they are visited [rad or m], shape (postures, joints).
-        times: how long each way takes [s], shape (postures - 1,).
-        dwell: how long the arm stands at each posture [s].
+        times: durations of the segments [s], shape (postures - 1,).
+        dwell: time that the arm stands at each posture [s].
     """
 
     points: Array
@@ -188,41 +188,41 @@ class PosturePath:
 
     @property
     def joints(self) -> int:
-        """Number of joints."""
+        """Return the number of joints."""
         return int(self.points.shape[1])
 
     @property
     def duration(self) -> float:
-        """Length of the whole motion [s]."""
+        """Return the length of the whole motion [s]."""
         return float(self._begins[-1])
 
     @property
     def distinct(self) -> tuple[tuple[float, float], ...]:
-        """All of it."""
+        """Return the whole motion as one stretch [s]."""
         return ((0.0, self.duration),)
 
     @property
     def crackle(self) -> Array:
-        """Of the steepest way, shape (joints,)."""
+        """Return the bound of the fifth derivative, that of the steepest segment, shape (joints,)."""
         ways = np.abs(np.diff(self.points, axis=0))
         return np.asarray((ways * STEP_PEAKS[5] / self.times[:, None] ** 5).max(axis=0))
 
     @property
     def seams(self) -> Array:
-        """Where ways begin and end [s]."""
+        """Return the times at which segments begin and end [s]."""
         return np.unique(np.concatenate([[0.0], self._begins[:-1], self._begins[:-1] + self.times, [self.duration]]))
 
     def fastest(self, begin: float, end: float) -> float:
-        """Of the shortest way [Hz]."""
+        """Return the reciprocal duration of the shortest segment [Hz]."""
         return float(1.0 / self.times.min())
 
     def at(self, time: Array | float) -> tuple[Array, Array, Array, Array]:
-        """As `FourierPath.at`."""
+        """Return position, velocity, acceleration and jerk, as `FourierPath.at`."""
         position, velocity, acceleration, jerk = self.derivatives(np.asarray(time, dtype=float), 3)
         return position, velocity, acceleration, jerk
 
     def derivatives(self, time: Array, highest: int) -> list[Array]:
-        """Position and its time derivatives up to the order `highest`."""
+        """Return position and its time derivatives up to the order `highest`."""
         way = np.clip(np.searchsorted(self._begins, time, side="right") - 1, 0, len(self.times) - 1)
         length = self.times[way]
         share = (time - self._begins[way]) / length

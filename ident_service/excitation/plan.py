@@ -1,4 +1,4 @@
-"""The motion an arm description asks for: a published Fourier series, or a seeded one scaled into the limits."""
+"""Build the motion that an arm description asks for: a published Fourier series, or a seeded one within the limits."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _HELD = 0.7  # of the torque limits, that a motion about home takes at most
 def excitation(
     model: ArmModel, purpose: Literal["identification", "validation"], *, checked: bool = True
 ) -> Excitation:
-    """The motion configured for a purpose, proven to stay inside the arm's limits unless somebody else will prove it.
+    """Return the motion configured for a purpose, proven to keep the arm's limits if `checked`.
 
     Raises:
         MotionRefused: limits are missing, or the motion leaves them.
@@ -46,7 +46,7 @@ def _published(motion: FourierMotion) -> FourierSeries:
 
 
 def _seeded(motion: SeededMotion, model: ArmModel, limits: MotionLimits) -> FourierSeries:
-    """A random series, each joint scaled to use the same share of its tightest limit, then all of them for torque."""
+    """Return a random series, each joint scaled to the same share of its tightest limit, then all for torque."""
     rng = np.random.default_rng(motion.seed)
     shape = (model.chain.joints, motion.harmonics)
     middle = limits.home if motion.about == "home" else 0.5 * (limits.lower + limits.upper)

@@ -1,6 +1,6 @@
-"""A posture in which the arm can stand: what every motion may shrink to, and where a search without luck ends.
+"""Find a posture in which the arm can stand: every motion may shrink to it, and a failed search returns it.
 
-Boundary: static. Gravity torque, position limits and clearance; nothing moves.
+The checks are static: gravity torque, position limits and clearance.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _RESERVE = 0.9  # of the room between clearance and torque limits that the postu
 
 
 def safe_posture(model: ArmModel, limits: MotionLimits, seed: int = 0) -> Array:
-    """The posture nearest to home that leaves the motion room, shape (joints,).
+    """Return the posture nearest to home that leaves the motion room, shape (joints,).
 
     Args:
         model: its prior gives the gravity torque.
@@ -57,7 +57,7 @@ def safe_posture(model: ArmModel, limits: MotionLimits, seed: int = 0) -> Array:
 
 
 def _torque_used(model: ArmModel, limits: MotionLimits, postures: Array) -> Array:
-    """Share of the torque limits that standing takes, dry friction against it, shape (postures, joints)."""
+    """Return the share of the torque limits that standing takes, dry friction against it, shape (postures, joints)."""
     if model.prior is None:
         return np.zeros_like(postures)
     still = np.zeros_like(postures)

@@ -1,4 +1,4 @@
-"""A search's objective and limits at the samples of a time grid, with their derivatives.
+"""Compute a search's objective and limits at the samples of a time grid, with their derivatives.
 
 Variables are the coefficients of the basis, scaled to about one. Every limit is a number that must not be positive, in
 shares of the limit. They enter the objective as an augmented Lagrangian (Hestenes 1969, Powell 1969),
@@ -35,11 +35,11 @@ from ident_service.model.regressor_gradient import RegressorGradient
 _RESERVE = 0.004  # of every limit, for what happens between two samples
 # Likewise for the forecast of the following error, which is static: the arm itself takes its time to settle.
 _TURNING = 0.5
-_CREEP = 0.05  # of the velocity limit: friction's direction turns round over so much, which gives it a gradient
+_CREEP = 0.05  # share of the velocity limit over which friction reverses, which gives its direction a gradient
 _DEPTH = 0.05  # m; a clearance missed by so much counts like another limit missed altogether
 _BETWEEN = 0.02  # m, the most that is kept free for what happens between two samples; the proof mends the rest
 _LINE = 25  # points on the way from home to where the motion begins
-_INSIDE = 0.0005  # by so much linear conditions are harder than the limits, so that rounding leaves none exceeded
+_INSIDE = 0.0005  # linear conditions are tighter than the limits by this, so that rounding leaves none exceeded
 Limits = dict[str, Array]
 Peak = tuple[int, int, int, bool]  # order of the derivative, sample, joint, and whether its upper limit is near
 LINEAR = ("position", "velocity", "acceleration", "jerk")  # limits that are linear in the variables
@@ -47,20 +47,20 @@ LINEAR = ("position", "velocity", "acceleration", "jerk")  # limits that are lin
 
 @dataclass
 class Multipliers:
-    """State of the augmented Lagrangian: one multiplier per limit and sample, and the weight of what is violated."""
+    """State of the augmented Lagrangian: one multiplier per limit and sample, and the weight of violations."""
 
     values: Limits
     weight: float
 
     def tightened(self, found: Limits, factor: float) -> Multipliers:
-        """The next state after a minimisation that ended with `found`."""
+        """Return the next state after a minimisation that ended with `found`."""
         values = {name: np.maximum(0.0, self.values[name] + self.weight * c) for name, c in found.items()}
         return Multipliers(values, self.weight * factor)
 
 
 @dataclass(frozen=True)
 class State:
-    """Everything at one point.
+    """Criterion and limits at one point of the search.
 
     Attributes:
         coefficients: of the basis, shape (joints, size).
@@ -74,15 +74,15 @@ class State:
 
     @property
     def worst(self) -> float:
-        """The largest share by which a limit is exceeded; not positive where all are kept."""
+        """Return the largest share by which a limit is exceeded; not positive where all are kept."""
         return max(float(values.max()) for values in self.limits.values() if values.size)
 
 
 class Problem:
-    """One search on one time grid."""
+    """Optimisation problem of one search on one time grid."""
 
     def __init__(self, task: Task, per_period: int) -> None:
-        """Lay the grid.
+        """Prepare the time grid.
 
         Args:
             task: what to search.
@@ -110,7 +110,7 @@ class Problem:
             self._rate_of = rate_of_change(times)
         self._capsules = CapsuleModel(model)
         step = float(np.median(np.diff(times)))
-        # What a point a metre away from an axis may do between two samples, beyond the straight line between them.
+        # Departure of a point, a metre from an axis, from the straight line between two samples.
         between = min(0.125 * float(limits.acceleration.max()) * step**2, _BETWEEN)
         self._clearance = model.config.workspace.clearance + between
         # The straight way from home to where the motion begins, for which only clearance matters.
@@ -123,7 +123,7 @@ class Problem:
         self.names += ["clearance"] * bool(self._capsules.pairs)
 
     def _torque_parameters(self) -> None:
-        """The model's base parameters without dry friction, which is taken off the limits instead: it has no slope."""
+        """Compute base parameters without dry friction, which has no slope and is taken off the limits instead."""
         model = self.task.model
         self._beta = np.zeros(len(self.task.columns))
         self._torque_limit = self.task.limits.torque.copy()
@@ -148,25 +148,25 @@ class Problem:
 
     @property
     def size(self) -> int:
-        """Number of variables."""
+        """Return the number of variables."""
         return self._scale.size
 
     def coefficients(self, x: Array) -> Array:
-        """Coefficients of the basis, shape (joints, size), of variables of shape (size,)."""
+        """Return the coefficients of the basis, shape (joints, size), of variables of shape (size,)."""
         return np.asarray(self._offset + x.reshape(self._scale.shape) * self._scale)
 
     def variables(self, coefficients: Array) -> Array:
-        """The inverse of `coefficients`."""
+        """Return the variables of coefficients, the inverse of `coefficients`."""
         return np.asarray(((coefficients - self._offset) / self._scale).ravel())
 
     def no_multipliers(self, weight: float) -> Multipliers:
-        """Where an augmented Lagrangian begins."""
+        """Return the initial state of an augmented Lagrangian, all multipliers zero."""
         samples = len(self._weights)
         shapes = {"power": (samples, 1), "clearance": (samples + _LINE, len(self._capsules.pairs))}
         return Multipliers({name: np.zeros(shapes.get(name, (samples, self._n))) for name in self.names}, weight)
 
     def linear_peaks(self, x: Array, share: float) -> set[Peak]:
-        """Return where the limits that are linear in x are used most: local peaks above a share, and their neighbours.
+        """Return the local peaks, above a share, of the limits that are linear in x, and their neighbours.
 
         Args:
             x: variables, shape (size,).
@@ -195,18 +195,18 @@ class Problem:
         return A.reshape(len(peaks), self.size), b
 
     def _linear(self) -> tuple[tuple[Array, Array, Array], ...]:
-        """Maps of position and its derivatives, with the middle and the size of what each may be, shape (joints,)."""
+        """Return maps of position and its derivatives, with middle and size of each allowed range, shape (joints,)."""
         limits, zero = self.task.limits, np.zeros(self._n)
         middles = (self._middle, zero, zero, zero)
         sizes = (self._half, limits.velocity, limits.acceleration, limits.jerk)
         return tuple(zip(self._maps, middles, sizes, strict=True))
 
     def state(self, x: Array, sharpness: float) -> State:
-        """Criterion and limits at x."""
+        """Return criterion and limits at x."""
         return self._evaluate(x, sharpness, None)[0]
 
     def value_and_gradient(self, x: Array, sharpness: float, multipliers: Multipliers) -> tuple[float, Array]:
-        """The augmented Lagrangian and its gradient, shape (size,)."""
+        """Return the augmented Lagrangian and its gradient, shape (size,)."""
         _, value, gradient = self._evaluate(x, sharpness, multipliers)
         return value, gradient
 
@@ -248,7 +248,7 @@ class Problem:
             found["power"], power_slopes = self._power(torque, dq)
         if self._capsules.pairs:
             way = limits.home + self._line * (self._begin @ X.T - limits.home)
-            # The arm, which falls behind, and not its reference has to keep clear.
+            # Clearance is that of the arm, which lags behind its reference.
             where = q if self._following is None else q - behind
             found["clearance"] = (self._clearance - self._capsules.distances(np.concatenate([where, way])).T) / _DEPTH
         state = State(X, value, found)
@@ -301,7 +301,10 @@ class Problem:
         return state, value.value + penalty, (gradient * self._scale).ravel()
 
     def _power(self, torque: Array, velocity: Array) -> tuple[Array, tuple[Array, Array]]:
-        """Share of the supply's budget beyond it, shape (samples, 1), and its slopes over torque and velocity."""
+        """Return the power beyond the supply's budget, in shares of it, (samples, 1), and its slopes.
+
+        The slopes are over torque and velocity.
+        """
         supply = self._supply
         if supply is None:
             raise AssertionError("no supply")

@@ -1,4 +1,4 @@
-"""What is proven of a motion for all time, and the largest motion of a family that it can be proven of."""
+"""Prove that a motion keeps all limits for all time, and find the largest motion of a family that can be proven."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Proof:
         demands: on the joints and the supply.
         clearance: the smallest distance, None where the arm has no geometry.
         approach: the smallest distance on the straight way from home to where the motion begins and back, likewise.
-        ways: what calm ways from home and back ask, home itself included.
+        ways: peak bounds on the slow segments from home and back, home itself included.
         tracking: how a simulated arm follows the motion, None where nothing was simulated; clearances are the arm's
             then, and else the reference's.
     """
@@ -48,12 +48,12 @@ def proof_of(
     collision: CollisionModel,
     torque_margin: float | None = None,
 ) -> Proof:
-    """Bound everything a motion asks, and simulate the arm where its reference is proven to keep every limit.
+    """Bound a motion's peaks, and simulate the arm where its reference is proven to keep every limit.
 
     Args:
         path: the motion.
         model: of the arm.
-        limits: that the motion may use, also for home and for how fast the ways to and from it are.
+        limits: that the motion may use, also for home and for the speed of the segments to and from it.
         collision: geometry of the arm.
         torque_margin: share of the torque that the motion keeps free for what the model does not know; the
             description's when None.
@@ -78,7 +78,7 @@ def proof_of(
 
 
 def _ways(path: FourierPath | PosturePath, limits: MotionLimits) -> PosturePath:
-    """Straight ways from home to where a motion begins, back, and to where it ends, at half of the limits."""
+    """Return straight segments from home to a motion's beginning, back, and to its end, at half of the limits."""
     points = np.array([limits.home, path.at(0.0)[0], limits.home, path.at(path.duration)[0]])
     far = np.abs(np.diff(points, axis=0))
     needed = [
@@ -89,7 +89,7 @@ def _ways(path: FourierPath | PosturePath, limits: MotionLimits) -> PosturePath:
 
 
 def objections(proof: Proof, model: ArmModel, limits: MotionLimits) -> list[str]:
-    """Every limit that is not proven to be kept, in words; empty when all are."""
+    """Return every limit that is not proven to be kept, in words; empty when all are."""
     found = proof.demands.violations(model.chain.names, limits, model.config.supply)
     forces = proof.ways.forces_beyond(model.chain.names, limits, model.config.supply)
     found += [f"at home, or on the way from it or back: {one}" for one in forces]
@@ -111,7 +111,7 @@ def largest_proven(
     safe: Array,
     proven: Callable[[Array], Proof | None],
 ) -> tuple[Array, Proof] | None:
-    """The largest motion between standing still and the given one of which everything can be proven.
+    """Return the largest motion between standing still and the given one that can be proven to keep all limits.
 
     Sizes are tried ever more coarsely until one can be proven, then halfway back. That takes a few proofs, of seconds
     each, where one size after another would take twenty.

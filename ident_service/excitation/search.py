@@ -1,4 +1,4 @@
-"""The search: many random starts on all cores, the best of them polished, within a budget of time or starts.
+"""Search for motions: many random starts on all cores, the best of them polished, within a budget.
 
 Start number k of seed s is always the same motion to begin with, so that a search bounded by starts gives the same
 result every time, and one bounded by time can be resumed. Starts take a quarter of the time, because polishing gains
@@ -26,7 +26,7 @@ from ident_service.excitation.task import Task
 from ident_service.model.chain import Array
 from ident_service.model.threads import one_blas_thread
 
-_KEPT = 8  # candidates
+_KEPT = 8  # best candidates
 _POLISHED = 4
 _STARTS_SHARE = 0.25
 _STARTS_TAKE = 0.5  # of all the time, where their number is given
@@ -36,7 +36,7 @@ _TICK = 0.2
 
 @dataclass(frozen=True)
 class Budget:
-    """When a search ends; at least one of both bounds.
+    """Limits of time and of random starts that end a search; at least one of both.
 
     Attributes:
         seconds: of wall time.
@@ -59,7 +59,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a search is.
+    """Progress of a search.
 
     Attributes:
         phase: `starts` or `polish`.
@@ -78,7 +78,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class Found:
-    """What a search has found: enough to go on from.
+    """Result of a search, from which it can be resumed.
 
     Attributes:
         seed: of the random starts.
@@ -103,7 +103,7 @@ def search(
     cancelled: Callable[[], bool] = lambda: False,
     earlier: Found | None = None,
 ) -> Found:
-    """Search until the budget is used up, or somebody cancels.
+    """Search for the best motion until the budget is used up, or the search is cancelled.
 
     Args:
         task: what to search.
@@ -134,7 +134,7 @@ def search(
 
 @dataclass(frozen=True)
 class _Crew:
-    """Whoever does the work: hands out a start or a polish, or stops what is under way."""
+    """Worker pool: submits a start or a polish, and interrupts running ones."""
 
     submit: Callable[[int, Candidate | None, float | None], Future[Candidate]]
     interrupt: Callable[[], None]
@@ -167,12 +167,12 @@ class _Run:
         return Found(self._seed, self._finished, elapsed, tuple(self._best) or (self._standing,))
 
     def goes_on(self) -> bool:
-        """Tell whether there is time for further starts, and leave to make them."""
+        """Return whether there is time for further starts, and the budget allows them."""
         seconds, starts = self._budget.seconds, self._budget.starts
         return seconds is not None and starts is None and not self._over(self._begun + seconds)
 
     def starts(self, crew: _Crew) -> None:
-        """Make starts in a share of the time that is left, or as many as are asked for."""
+        """Run starts in a share of the time that is left, or as many as are asked for."""
         seconds, now = self._budget.seconds, time.monotonic()
         until = None if seconds is None else now + _STARTS_SHARE * (self._begun + seconds - now)
         last = None if self._budget.starts is None else self._first + self._budget.starts
@@ -265,7 +265,7 @@ def _crew(
 
 
 class _Worker:
-    """What a process needs to work on starts, made once."""
+    """Problems and seed of one worker process, made once."""
 
     def __init__(self, task: Task, safe: Array, seed: int, per_period: int, stopped: Callable[[], bool]) -> None:
         self._coarse, self._fine = Problem(task, per_period), Problem(task, _FINER * per_period)
@@ -273,7 +273,7 @@ class _Worker:
         self._seed, self._stopped = seed, stopped
 
     def work(self, number: int, candidate: Candidate | None, until: float | None) -> Candidate:
-        """One start, or the polish of a candidate, cut short at the time `until` of the monotonic clock."""
+        """Run one start, or the polish of a candidate, cut short at the time `until` of the monotonic clock."""
 
         def check() -> None:
             if self._stopped() or (until is not None and time.monotonic() >= until):
@@ -295,7 +295,7 @@ _worker: _Worker | None = None
 
 
 def _begin(task: Task, safe: Array, seed: int, per_period: int, stop: Event) -> None:
-    """In a new process: an interrupt from the terminal is for the parent, who then sets `stop`."""
+    """Initialise a worker process: ignore the terminal's interrupt, as the parent sets `stop` instead."""
     global _worker
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _worker = _Worker(task, safe, seed, per_period, stop.is_set)

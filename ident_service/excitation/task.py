@@ -1,4 +1,4 @@
-"""What a search is asked for: the arm, the family of motions, the criterion, and how much of each limit may be used."""
+"""Define the task of a search: the arm, the family of motions, the criterion, and the usable part of each limit."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ident_service.model.expected_friction import ExpectedFriction
 
 @dataclass(frozen=True)
 class Task:
-    """A search, settled before it begins.
+    """Complete input of a search.
 
     Attributes:
         model: with the prior parameters that torque is predicted from.
@@ -49,7 +49,7 @@ class Task:
 
 
 def usable_limits(names: tuple[str, ...], limits: MotionLimits, design: Design) -> MotionLimits:
-    """The limits with the design's margins taken off.
+    """Return the limits with the design's margins taken off.
 
     Raises:
         MotionRefused: nothing is left of a position range.

@@ -1,4 +1,4 @@
-"""Simulate the control loop over a motion: how far the arm, not its reference, goes.
+"""Simulate the control loop over a motion, to bound where the arm goes, not only its reference.
 
 The plant has the control law's own model with other friction and heavier links; between two cycles it is integrated
 with its friction taken implicitly (`model/rigid_body.py`). The law is that of `motion/control.py`, with its velocity
@@ -6,7 +6,7 @@ filter, its torque limits and its delay: the torque of a sample acts `delay` cyc
 
     tau_k+d = M(q_k) (ddq_r + K_d (dq_r - v_k) + K_p (q_r - q_k)) + c(q_k, v_k) + g(q_k) + f(dq_r)
 
-Boundary: a simulation of stated cases and no bound over all; the guard keeps the limits of the arm itself.
+This is a simulation of stated cases, no bound over all; the safety monitor keeps the limits of the arm itself.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from ident_service.model.chain import Array
 from ident_service.model.expected_friction import expected_friction, friction_feedforward
 from ident_service.model.rigid_body import ForwardDynamics, InverseDynamics
 
-# Shares of what the guard allows that a simulated arm may use: the guard stops at 1.0 times the following error allowed
+# Shares of the safety monitor's limits that a simulated arm may use: it stops at 1.0 times the following error allowed
 # and at 1.2 times the velocity limit, and an arm has noise that no case has.
 _ERROR_USED, _VELOCITY_USED = 0.85, 1.1
 _BIN = 0.02  # s, over which the tube around the reference has one width
@@ -38,7 +38,7 @@ _WHOLE, _PARTS, _SETTLES = 15.0, 24, 8.0
 
 @dataclass(frozen=True)
 class Case:
-    """An arm that is not quite as described.
+    """Deviation of a simulated arm from its description.
 
     Attributes:
         words: what is different.
@@ -53,7 +53,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Tracking:
-    """How an arm follows a motion in the worst of the simulated cases.
+    """Following error and velocity of an arm on a motion, in the worst of the simulated cases.
 
     Attributes:
         error: largest distance from the reference [rad or m], shape (joints,).
@@ -74,7 +74,7 @@ class Tracking:
     repeats_from: float = np.inf
 
     def objections(self, names: Sequence[str], limits: MotionLimits) -> list[str]:
-        """Return what the guard would stop, or might, in words; empty when the arm can follow.
+        """Return what the safety monitor would stop, or might, in words; empty when the arm can follow.
 
         Args:
             names: of the joints.
@@ -97,7 +97,7 @@ class Tracking:
         return found
 
     def width(self, time: Array, half: Array) -> Array:
-        """Return how far the arm may be from its reference [rad or m], shape (cells, joints).
+        """Return the largest distance of the arm from its reference [rad or m], shape (cells, joints).
 
         Args:
             time: middles of cells of time in the motion [s], shape (cells,).
@@ -114,7 +114,7 @@ class Tracking:
 
 
 def cases(margin: float) -> tuple[Case, ...]:
-    """Return the arms to simulate: with less friction, and with more and links heavier by the margin of the torque."""
+    """Return the cases to simulate: less friction, and more friction with links heavier by the torque margin."""
     heavier = 1.0 + margin
     down, up = DOUBT
     return (
@@ -124,7 +124,7 @@ def cases(margin: float) -> tuple[Case, ...]:
 
 
 def track(path: Path, model: ArmModel, margin: float) -> Tracking:
-    """Simulate the arm over a motion; of a periodic one both ramps and one period, which the others repeat.
+    """Simulate the arm over a motion; of a periodic one, both ramps and one period, which the others repeat.
 
     Args:
         path: the motion.
@@ -163,13 +163,13 @@ def track(path: Path, model: ArmModel, margin: float) -> Tracking:
 
 
 def way_width(path: Path, model: ArmModel, margin: float) -> Callable[[Array, Array], Array]:
-    """Simulate the arm over calm ways, as `track`; over long ones in parts, whose largest error then counts throughout.
+    """Simulate the arm over slow segments as `track`, long ones in parts, whose largest error then counts throughout.
 
     A joint that dry friction holds moves only when the reference has left it behind by `|M^-1| f / kp`, which on a slow
     way takes longer than a part; so that is added.
 
     Args:
-        path: the ways.
+        path: the segments.
         model: of the arm, with prior parameters.
         margin: as of `track`.
 

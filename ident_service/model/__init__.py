@@ -1,1 +1,1 @@
-"""The arm model: parameters and their names, mechanism, regressor, base parameters, information."""
+"""Model the arm: parameters and their names, mechanism, regressor, base parameters, information."""

@@ -1,4 +1,4 @@
-"""Derivatives of what a tape computes: reverse accumulation, recorded once and run on many samples.
+"""Differentiate the program of a tape: reverse accumulation, recorded once and run on many samples.
 
 For a program y = f(x) and seeds s, one per output, the pull is the gradient of `sum(s y)` with respect to x. The
 reverse sweep is itself written on a tape, so that it is folded, shared and planned like any other program; forward
@@ -19,10 +19,10 @@ Array = NDArray[np.float64]
 
 
 class Differentiable:
-    """A program that can also be run backwards."""
+    """Program of a tape that can also be run backwards, for gradients."""
 
     def __init__(self, tape: Tape, inputs: Sequence[Symbol], outputs: Sequence[Value]) -> None:
-        """Plan both directions.
+        """Plan the forward and the backward run.
 
         Args:
             tape: what was recorded; all of its inputs, in the order they were made.
@@ -35,7 +35,7 @@ class Differentiable:
         gradients = [back.adjoints.get(symbol.index, 0.0) for symbol in inputs]
         self._kept = list(back.known)
         self._forward = Program(tape, [*outputs, *(Symbol(tape, index) for index in self._kept)])
-        # The seeds were made first, what is kept of the forward run whenever it was met.
+        # Its inputs are seeds and kept forward values, in the order in which the sweep made them.
         self._backward = Program(back.tape, gradients)
         self._gradients = len(inputs)
         self._order = back.order
@@ -43,11 +43,11 @@ class Differentiable:
 
     @property
     def steps(self) -> tuple[int, int]:
-        """Numpy calls per run and per pull."""
+        """Return the numbers of numpy calls per run and per pull."""
         return self._forward.steps, self._backward.steps
 
     def run(self, values: Array) -> Array:
-        """Compute, and remember what the pull needs.
+        """Compute the outputs, and keep the values that `pull` needs.
 
         Args:
             values: all inputs of the tape, shape (inputs, samples).
@@ -67,7 +67,7 @@ class Differentiable:
         return self._values[: self._outputs]
 
     def pull(self, seeds: Array) -> Array:
-        """The gradient of `sum(seeds * outputs)`, sample by sample, at the values of the last run.
+        """Return the gradient of `sum(seeds * outputs)`, sample by sample, at the values of the last run.
 
         Args:
             seeds: shape (outputs, samples).
@@ -90,7 +90,7 @@ class Differentiable:
 
 
 class _Backwards:
-    """The reverse sweep on a tape of its own.
+    """Reverse sweep on a tape of its own.
 
     Attributes:
         tape: of the sweep; its inputs are seeds and forward values, in the order of `order`.
@@ -122,7 +122,7 @@ class _Backwards:
             self.adjoints[at] = self.adjoints.get(at, 0.0) + term
 
     def _value(self, at: int | float | None) -> Value:
-        """A forward value, as an input of the sweep."""
+        """Return a forward value as an input of the sweep."""
         if not isinstance(at, int):
             return float(at or 0.0)
         if at not in self.known:
@@ -131,7 +131,7 @@ class _Backwards:
         return self.known[at]
 
     def _through(self, at: int, adjoint: Value) -> None:
-        """Hand the adjoint of a step on to its operands."""
+        """Propagate the adjoint of a step to its operands."""
         operation, a, b = self._steps[at]
         if operation == "mul":
             self._add(a, adjoint * self._value(b) if isinstance(a, int) else 0.0)
@@ -154,7 +154,7 @@ class _Backwards:
             self._add(a, adjoint * self._apply("sign", a))
 
     def _apply(self, function: str, at: int | float | None) -> Value:
-        """A function of a forward value; the forward run's own where it has computed it already."""
+        """Return a function of a forward value; the forward run's own where it has computed it already."""
         key = (function, at)
         for index, step in enumerate(self._steps):
             if (step[0], step[1]) == key:

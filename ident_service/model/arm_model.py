@@ -1,4 +1,4 @@
-"""From a configuration to the arm's model: chain, parameter layout and prior parameters in one frozen object."""
+"""Build the arm's model from its configuration: chain, parameter layout and prior parameters in one frozen object."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LONGEST_LINK = 20.0  # m, as in DH tables
 
 @dataclass(frozen=True)
 class ArmModel:
-    """A mechanism with named parameters.
+    """Mechanism with named parameters.
 
     Attributes:
         config: what it was made from.
@@ -140,7 +140,7 @@ def with_payload(config: ArmConfig, names: tuple[str, ...], layout: Layout, delt
 
 
 def control_model(model: ArmModel) -> ArmModel:
-    """Return the model that the control law, and every forecast of it, computes torques with.
+    """Return the model that the control law, and every prediction of it, computes torques with.
 
     Its prior has the drive inertia that the description states (`joints.*.drive_inertia`) where the prior, often a CAD
     model of the links alone, has less. The description states what is felt at the joint, `sum_d C_dj^2 Ia_d` of drives

@@ -1,4 +1,4 @@
-"""Base parameters: what a motion can teach at all (4.1).
+"""Group link parameters into base parameters, the combinations that motion can identify (4.1).
 
 `beta = K delta` with `K = P_b^T + K_d P_d^T` (eqs. 38, 39), found numerically (Gautier 1991): the regressor at random
 states has the structural rank of the mechanism; base columns are the first independent ones from the left (4.1), the
@@ -27,7 +27,7 @@ _SEED = 20140301
 
 @dataclass(frozen=True)
 class BaseParameters:
-    """The grouping of link parameters into base parameters.
+    """Grouping of link parameters into base parameters.
 
     Attributes:
         names: link parameter names, the columns of K.
@@ -50,17 +50,17 @@ class BaseParameters:
 
     @property
     def size(self) -> int:
-        """Number of base parameters, n_b."""
+        """Return the number of base parameters, n_b."""
         return int(self.K.shape[0])
 
     @cached_property
     def dependent(self) -> NDArray[np.intp]:
-        """Columns P_d selects: everything that is not a base column."""
+        """Return the columns P_d selects: everything that is not a base column."""
         return np.setdiff1d(np.arange(len(self.names)), self.base)
 
     @cached_property
     def expressions(self) -> tuple[str, ...]:
-        """Each base parameter as a sum of link parameters (table 3)."""
+        """Return each base parameter as a sum of link parameters (table 3)."""
         return tuple(
             format_expression([(float(row[column]), self.names[column]) for column in np.flatnonzero(row)])
             for row in self.K
@@ -68,7 +68,7 @@ class BaseParameters:
 
 
 def base_parameters(chain: Chain, layout: Layout) -> BaseParameters:
-    """Base parameters of a mechanism; the same ones every time for the same mechanism."""
+    """Return the base parameters of a mechanism; the same ones every time for the same mechanism."""
     rng = np.random.default_rng(_SEED)
     samples = max(8, -(-4 * layout.size // chain.joints))
     states = rng.uniform(-np.pi, np.pi, size=(3, samples, chain.joints))
@@ -80,7 +80,7 @@ def base_parameters(chain: Chain, layout: Layout) -> BaseParameters:
 
 
 def grouping(H: Array, names: tuple[str, ...], units: tuple[str, ...]) -> BaseParameters:
-    """The grouping of parameters whose effects are the columns of a matrix.
+    """Return the grouping of parameters whose effects are the columns of a matrix.
 
     Args:
         H: a regressor at enough states, or K itself for some of its columns, shape (rows, names).
@@ -96,7 +96,7 @@ def grouping(H: Array, names: tuple[str, ...], units: tuple[str, ...]) -> BasePa
 
 
 def remarks_on_angles(base: BaseParameters) -> tuple[str, ...]:
-    """Tell which base parameters are only there because angles of the mechanism are rounded, in words.
+    """Return remarks on base parameters that exist only because angles of the mechanism are rounded.
 
     Columns of real mechanisms are a third independent of the others, or not at all; 1.5708 for pi/2 leaves a millionth.
     """
@@ -114,7 +114,7 @@ def remarks_on_angles(base: BaseParameters) -> tuple[str, ...]:
 
 
 def static_base_parameters(chain: Chain, layout: Layout) -> BaseParameters:
-    """What standing still and slow motion can teach: gravity's base parameters and the friction terms."""
+    """Return the base parameters that standing still and slow motion identify: gravity's and the friction terms."""
     rng = np.random.default_rng(_SEED)
     samples = max(8, -(-4 * layout.size // chain.joints))
     position, velocity = rng.uniform(-np.pi, np.pi, size=(2, samples, chain.joints))
@@ -126,7 +126,7 @@ def static_base_parameters(chain: Chain, layout: Layout) -> BaseParameters:
 
 
 def _first_independent(H: Array) -> tuple[NDArray[np.intp], Array, Array]:
-    """First independent columns from the left, how independent, and what the others are made of (eq. 32)."""
+    """Return the first independent columns from the left, their independence, and K_d of the others (eq. 32)."""
     import scipy.linalg  # loads for 0.2 s, and no process that moves an arm needs it
 
     base, independence = _independent_columns(H)
@@ -142,12 +142,12 @@ def _first_independent(H: Array) -> tuple[NDArray[np.intp], Array, Array]:
 
 
 def _round_digits(values: Array) -> Array:
-    """Decimals that people can read: rounding noise of the least squares becomes zero, geometry stays."""
+    """Round to decimals that people can read: rounding noise of the least squares becomes zero, geometry stays."""
     return np.round(values, _DECIMALS) + 0.0
 
 
 def base_from_expressions(expressions: tuple[str, ...], names: tuple[str, ...]) -> BaseParameters:
-    """The grouping that a table of expressions defines, no arm model needed.
+    """Return the grouping that a table of expressions defines, without an arm model.
 
     Args:
         expressions: one per base parameter.
@@ -174,7 +174,7 @@ def base_from_expressions(expressions: tuple[str, ...], names: tuple[str, ...]) 
 
 
 def _independent_columns(matrix: Array) -> tuple[NDArray[np.intp], Array]:
-    """First independent columns from the left, and the share of each that those before it leave.
+    """Return the first independent columns from the left, and the share of each that those before it leave.
 
     Numerically null columns are none.
     """

@@ -1,4 +1,4 @@
-"""Fast, differentiable distances for the search: every solid in a capsule that contains it.
+"""Compute fast, differentiable distances for the search, with every moving solid in a capsule that contains it.
 
 Capsules are exact, other solids of moving links are replaced by a capsule around them, so that while two bodies are
 apart no distance here is larger than the exact one of `collision.py`. Boxes and half spaces that do not move stay what
@@ -8,7 +8,7 @@ nearest face.
 With end points e(q) and closest points held fast, the gradient of a distance is that of its direction times the
 points' motion; forward kinematics is traced once per arm (`tape.py`) and run backwards for it (`adjoint.py`).
 
-Boundary: numpy only; what is a pair is `solids.py`.
+`scene.py` defines the pairs.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _Vector = list[Value]
 
 
 class CapsuleModel:
-    """The pairs of `CollisionModel`, in the same order, with distances for whole blocks of postures at once.
+    """Pairs of `CollisionModel`, in the same order, with distances for whole blocks of postures at once.
 
     Attributes:
         pairs: readable names.
@@ -38,7 +38,7 @@ class CapsuleModel:
     """
 
     def __init__(self, model: ArmModel) -> None:
-        """Trace the arm.
+        """Trace the arm's forward kinematics and collect the pairs.
 
         Raises:
             ModelError: geometry that does not fit the arm.
@@ -79,7 +79,7 @@ class CapsuleModel:
         self._smallest: Array | None = None
 
     def distances(self, position: Array) -> Array:
-        """How far each pair is apart at least.
+        """Return a lower bound of the distance of each pair.
 
         Args:
             position: [rad or m], shape (samples, joints).
@@ -105,7 +105,7 @@ class CapsuleModel:
         return self._smallest.copy()
 
     def pull(self, seeds: Array) -> Array:
-        """The gradient of `sum(seeds * distances)` at the positions of the last call of `distances`.
+        """Return the gradient of `sum(seeds * distances)` at the positions of the last call of `distances`.
 
         Args:
             seeds: shape (pairs, samples).
@@ -132,12 +132,12 @@ class CapsuleModel:
 
 
 def _stays(body: Body) -> bool:
-    """Whether a body keeps its shape here."""
+    """Return whether a body needs no capsule: a fixed box or half space."""
     return body.joint == WORLD and isinstance(body.solid, Box | HalfSpace)
 
 
 def containing_capsule(body: Body) -> Capsule:
-    """The body's own capsule, or one around it: along a box's longest edge, along a cylinder's axis."""
+    """Return the body's own capsule, or one around it: along a box's longest edge, along a cylinder's axis."""
     solid = body.solid
     if isinstance(solid, Capsule):
         return solid
@@ -156,8 +156,8 @@ class _Family:
     """Pairs of a capsule with one kind of solid.
 
     Attributes:
-        rows: which rows of all contacts they are.
-        capsules: how many capsules there are in all.
+        rows: their rows among all contacts.
+        capsules: number of all capsules.
     """
 
     def __init__(
@@ -180,11 +180,11 @@ class _Family:
     _fixed = True
 
     def _take(self, others: Sequence[int], capsules: Sequence[Capsule], solids: Sequence[object]) -> None:
-        """Keep what is needed of the other solids."""
+        """Store the needed data of the other solids."""
         raise NotImplementedError
 
     def distances(self, start: Array, along: Array) -> Array:
-        """Signed distances [m], shape (rows, samples), of capsules whose axes have these starts and vectors."""
+        """Return signed distances [m], shape (rows, samples), of capsules whose axes have these starts and vectors."""
         raise NotImplementedError
 
     def pull(self, seeds: Array, forces: Array) -> None:
@@ -255,7 +255,7 @@ class _BoxPairs(_Family):
 
 
 def _frames(tape: Tape, chain: Chain, q: Sequence[Symbol]) -> list[tuple[list[_Vector], _Vector]]:
-    """Rotation (rows) and origin of every joint frame in the base frame."""
+    """Return rotation (rows) and origin of every joint frame in the base frame."""
     frames: list[tuple[list[_Vector], _Vector]] = []
     for k in range(chain.joints):
         parent = chain.parents[k]
@@ -282,7 +282,7 @@ def _frames(tape: Tape, chain: Chain, q: Sequence[Symbol]) -> list[tuple[list[_V
 
 
 def _turned(rest: Array, axis: Array, cosine: Symbol, sine: Symbol) -> list[_Vector]:
-    """Rows of `rest` times the turn about `axis` (Rodrigues' formula)."""
+    """Return the rows of `rest` times the rotation about `axis` (Rodrigues' formula)."""
     x, y, z = (float(component) for component in axis)
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     still, with_sine, with_cosine = rest @ (np.eye(3) + K @ K), rest @ K, -(rest @ (K @ K))
@@ -293,7 +293,7 @@ def _turned(rest: Array, axis: Array, cosine: Symbol, sine: Symbol) -> list[_Vec
 
 
 def _placed(frames: Sequence[tuple[list[_Vector], _Vector]], joint: int, point: Array) -> _Vector:
-    """A point of a joint's frame in the base frame."""
+    """Return a point of a joint's frame in the base frame."""
     constant: _Vector = [float(component) for component in point]
     if joint == WORLD:
         return constant

@@ -1,10 +1,10 @@
-"""The mechanism: a tree of one-degree-of-freedom joints, whatever format described it.
+"""Represent the mechanism, a tree of one-degree-of-freedom joints, independently of its file format.
 
 Frames. Joint k's frame sits on its parent's frame by a constant placement (at zero position) and then turns about, or
 slides along, its own axis. Link parameters are expressed in the link frame, which is the joint frame for URDF, MJCF
 and modified-DH arms and the distal frame for standard-DH arms (conventions), a constant offset further.
 
-Boundary: pure geometry; dynamics are `regressor.py` and `rigid_body.py`.
+Dynamics are in `regressor.py` and `rigid_body.py`.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ Array = NDArray[np.float64]
 WORLD = -1
 
 
-@dataclass(frozen=True, eq=False)  # identity is what a chain is compared and hashed by
+@dataclass(frozen=True, eq=False)  # chains are compared and hashed by identity
 class Chain:
-    """A kinematic tree with joints numbered depth first, as pinocchio needs them: parents, then whole branches.
+    """Kinematic tree with joints numbered depth first, as pinocchio needs them: parents, then whole branches.
 
     Attributes:
         names: joint names.
@@ -73,11 +73,11 @@ class Chain:
 
     @property
     def joints(self) -> int:
-        """Number of joints."""
+        """Return the number of joints."""
         return len(self.names)
 
     def ancestors(self, joint: int) -> tuple[int, ...]:
-        """The joints that move `joint`'s link, from the base outwards, `joint` itself included."""
+        """Return the joints that move `joint`'s link, from the base outwards, `joint` itself included."""
         path = [joint]
         while (parent := self.parents[path[-1]]) != WORLD:
             path.append(parent)
@@ -85,24 +85,24 @@ class Chain:
 
 
 def rotation_x(angle: float) -> Array:
-    """Rotation about x by `angle` [rad], shape (3, 3)."""
+    """Return the rotation about x by `angle` [rad], shape (3, 3)."""
     c, s = _clean(np.cos(angle)), _clean(np.sin(angle))
     return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
 
 
 def rotation_z(angle: float) -> Array:
-    """Rotation about z by `angle` [rad], shape (3, 3)."""
+    """Return the rotation about z by `angle` [rad], shape (3, 3)."""
     c, s = _clean(np.cos(angle)), _clean(np.sin(angle))
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _clean(value: float) -> float:
-    """Quarter turns exactly, so that their rounding noise does not look like a link offset."""
+    """Round sines and cosines of quarter turns exactly, so that rounding noise does not look like a link offset."""
     return float(np.round(value)) if abs(value - np.round(value)) < 1e-15 else float(value)
 
 
 def chain_from_dh(table: DHTable, gravity: tuple[float, float, float]) -> Chain:
-    """The serial chain of a DH table.
+    """Return the serial chain of a DH table.
 
     Standard: `A_k = Rz(theta) Tz(d) Tx(a) Rx(alpha)`, link frames distal as in the paper (table 2). Modified (Craig):
     `A_k = Rx(alpha) Tx(a) Rz(theta) Tz(d)`, link frames on the joint's own axis. The joint variable adds to theta, or

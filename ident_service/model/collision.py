@@ -1,8 +1,8 @@
-"""Exact signed distances between an arm's bodies, and of them to the surroundings, by pinocchio and coal.
+"""Compute exact signed distances between an arm's bodies, and to the surroundings, by pinocchio and coal.
 
 Distances of convex solids: how far they are apart, or, negative, how far one must be moved to free them (of two
-capsules, the distance of their axes less both radii). Boundary: what is a pair is `solids.py`, how fast distances
-change `reach.py`; the search for motions uses `capsules.py`.
+capsules, the distance of their axes less both radii). `scene.py` defines the pairs, `reach.py` how fast distances
+change; the search for motions uses `capsules.py`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _POSTURES, _SEED = 200, 20140101
 
 
 class CollisionModel:
-    """The pairs of an arm that must stay apart, and how far apart they are.
+    """Pairs of an arm's bodies that must stay apart, with their distances.
 
     Attributes:
         pairs: readable names, such as `j4 - base`, `j4 - obstacle table`, `j4 - inside z lower`.
@@ -36,7 +36,7 @@ class CollisionModel:
     """
 
     def __init__(self, model: ArmModel) -> None:
-        """Collect the bodies and see to it that they are not in each other's way always.
+        """Collect the bodies, and check that no pair is always in contact.
 
         Raises:
             ModelError: geometry that does not fit the arm.
@@ -55,7 +55,7 @@ class CollisionModel:
         self._require_freedom(around, model.config.name)
 
     def distances(self, position: Array) -> Array:
-        """How far each pair is apart.
+        """Return the signed distance of each pair.
 
         Args:
             position: [rad or m], shape (samples, joints).
@@ -103,7 +103,7 @@ class CollisionModel:
 
 
 def share_touching(model: ArmModel, within: float, postures: int, seed: int) -> dict[tuple[str, str], float]:
-    """Say in which share of random postures the bodies of each pair touch, the moving link first.
+    """Return the share of random postures in which the bodies of each pair touch, the moving link first.
 
     Args:
         model: of an arm, also of one whose bodies always touch.
@@ -136,7 +136,7 @@ def share_touching(model: ArmModel, within: float, postures: int, seed: int) -> 
 
 
 def kinematics(chain: Chain) -> pin.Model:
-    """Where the joints carry what stands still in their frames; without masses."""
+    """Return a pinocchio model of the joints alone, without masses."""
     model = pin.Model()
     for k in range(chain.joints):
         axis = chain.axes[k]
@@ -147,7 +147,7 @@ def kinematics(chain: Chain) -> pin.Model:
 
 
 def geometry(around: Scene, contacts: Sequence[tuple[int, int]]) -> tuple[pin.GeometryModel, pin.GeometryData]:
-    """All bodies, and what coal needs to find the distances of some pairs of them.
+    """Return all bodies as coal geometry, with the data for the distances of some pairs of them.
 
     Args:
         around: the bodies.

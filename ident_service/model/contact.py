@@ -1,11 +1,11 @@
-"""What the arm touches in one posture, cheap enough for every control cycle: itself, obstacles, the allowed box.
+"""Detect contacts of the arm in one posture, within a control cycle: with itself, obstacles, the allowed box.
 
 The exact distances of `collision.py`, of which all is computed but only the smallest is read while nothing touches.
 Up to `AT_ONCE` pairs of solids are looked at in every cycle; more of them in turn, so that of up to 400 pairs each is
 looked at at least every 10 cycles. Between capsules, and of anything to a plane, a pair takes less than 0.1 us; of
 boxes and cylinders a few.
 
-Boundary: one posture, touching or not; what is a pair is `solids.py`.
+`scene.py` defines the pairs.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ AT_ONCE = 40
 
 
 class Contact:
-    """The pairs of solids of an arm that must stay apart.
+    """Contact check of the pairs of solids of an arm that must stay apart.
 
     Attributes:
         pairs: readable names of their owners, one per pair of solids.
     """
 
     def __init__(self, model: ArmModel) -> None:
-        """Collect the pairs.
+        """Collect the pairs of solids.
 
         Args:
             model: with geometry and workspace; without any, there are no pairs.
@@ -53,7 +53,7 @@ class Contact:
         self._clear.setflags(write=False)
 
     def depths(self, position: Array) -> Array:
-        """How deep each pair of solids reaches into each other, of those whose turn it is.
+        """Return the penetration depth of each pair of solids that is checked in this call.
 
         Args:
             position: [rad or m], shape (joints,).
@@ -67,7 +67,7 @@ class Contact:
         solids, found, rows = self._groups[self._turn]
         self._turn = (self._turn + 1) % self._turns
         nearest = pin.computeDistances(self._model, self._data, solids, found, position)
-        # Where no distance is a number, there is no nearest one.
+        # If all distances are NaN, there is no nearest pair.
         if nearest < len(solids.collisionPairs) and found.distanceResults[nearest].min_distance >= 0.0:
             return self._clear
         depths = self._clear.copy()

@@ -1,4 +1,4 @@
-"""What drives add to a joint, where a joint has a drive of its own; other programs' models know no other.
+"""Compute the inertia, damping and friction that a joint's own drive adds, as other programs' models represent them.
 
 A drive whose coordinate is `d = c q` of one joint alone, with inertia Ia, viscous fv and Coulomb friction fc on its own
 side, adds to that joint the inertia `c^2 Ia`, the damping `c^2 fv` and the dry friction `|c| fc`.
@@ -20,7 +20,7 @@ JOINT_TERMS: tuple[JointTerm, ...] = ("drive_inertia", "viscous", "coulomb")
 
 @dataclass(frozen=True)
 class JointDrives:
-    """Per joint, what its own drive adds; zero where it shares drives with other joints.
+    """Effect of each joint's own drive; zero where a joint shares drives with other joints.
 
     Attributes:
         own: which joints have a drive that moves no other, and no other drive, shape (joints,).
@@ -35,18 +35,18 @@ class JointDrives:
     friction: Array
 
     def of(self, term: JointTerm) -> Array:
-        """The values of one of `JOINT_TERMS`."""
+        """Return the values of one of `JOINT_TERMS`, shape (joints,)."""
         return {"drive_inertia": self.armature, "viscous": self.damping, "coulomb": self.friction}[term]
 
 
 def own_drives(chain: Chain) -> NDArray[np.bool_]:
-    """Which joints have a drive that moves no other joint, and are moved by no other drive, shape (joints,)."""
+    """Return which joints have a drive that moves no other joint, and are moved by no other drive, shape (joints,)."""
     shared = (chain.coupling != 0.0) & ~np.eye(chain.joints, dtype=bool)
     return np.asarray(~(shared.any(axis=0) | shared.any(axis=1)))
 
 
 def joint_drives(chain: Chain, layout: Layout, delta: Array) -> JointDrives:
-    """What each joint's own drive adds to it.
+    """Return the inertia, damping and dry friction that each joint's own drive adds to it.
 
     Args:
         chain: the mechanism.
@@ -61,7 +61,7 @@ def joint_drives(chain: Chain, layout: Layout, delta: Array) -> JointDrives:
 
 @dataclass(frozen=True)
 class WrittenArm:
-    """An arm as some reader found it in a file, joints in the file's order.
+    """Arm as read from a file, joints in the file's order.
 
     Attributes:
         chain: the mechanism; link frames are joint frames.

@@ -1,4 +1,4 @@
-"""An identified arm as a pinocchio model with friction, and what pinocchio reads of one in a file.
+"""Represent an identified arm as a pinocchio model with friction, and read one back from a file.
 
 Pinocchio's algorithms know armature and leave friction alone, though a model can carry it as numbers.
 """
@@ -24,7 +24,7 @@ from ident_service.model.rigid_body import chain_of, pinocchio_model
 
 
 class DynamicModel:
-    """An arm with known parameters.
+    """Arm with known parameters: a pinocchio model, with friction and coupled drives.
 
     Attributes:
         model: for pinocchio's own algorithms: one position and one velocity per joint, gravity, armature, and damping,
@@ -32,7 +32,7 @@ class DynamicModel:
             armature, damping or friction of its own, and only the methods here know these terms.
         arm: the mechanism and its configuration.
         delta: link parameters, shape (arm.layout.size,).
-        presliding: way over which each drive's dry friction turns round [rad or m], shape (joints,). Where one is not
+        presliding: distance over which each drive's dry friction reverses [rad or m], shape (joints,). Where one is not
             zero, friction has a memory: carry a `direction` along with `turned`, or leave it out and have friction that
             turns round at once, which the parameters were not fitted with.
     """
@@ -63,11 +63,11 @@ class DynamicModel:
         _set_limits(self.model, arm)
         self._data = self.model.createData()
         inertia = layout.term_values("drive_inertia", delta)
-        # What armatures do not say: zero where every joint has its own drive.
+        # Drive inertia beyond the armatures: zero where every joint has its own drive.
         self._shared = chain.coupling.T @ (inertia[:, None] * chain.coupling) - np.diag(drives.armature)
 
     def turned(self, direction: Array, step: Array) -> Array:
-        """The direction of dry friction after a step (Dahl 1968); exact where no drive turns round within it.
+        """Return the direction of dry friction after a step (Dahl 1968); exact where no drive reverses within it.
 
         Args:
             direction: before it, per drive, between -1 and 1, shape (..., joints); the signs of the first motion, where
@@ -80,7 +80,7 @@ class DynamicModel:
         return turned(direction, np.asarray(step, dtype=float) @ self.arm.chain.coupling.T, self.presliding)
 
     def friction(self, velocity: Array, direction: Array | None = None) -> Array:
-        """Torque that friction takes, offsets included.
+        """Return the friction torque, offsets included.
 
         Args:
             velocity: [rad/s or m/s], shape (..., joints).
@@ -104,7 +104,7 @@ class DynamicModel:
     def inverse_dynamics(
         self, position: Array, velocity: Array, acceleration: Array, direction: Array | None = None
     ) -> Array:
-        """Torque of a motion: links, drives and friction; what the regressor predicts (eq. 29).
+        """Return the torque of a motion: links, drives and friction, as the regressor predicts it (eq. 29).
 
         Args:
             position: [rad or m], shape (joints,).
@@ -145,7 +145,7 @@ def read_back(
     gravity: tuple[float, float, float],
     kinematics: Kinematics | None = None,
 ) -> WrittenArm:
-    """Read a file that was written, for comparison.
+    """Read an exported file back, for comparison.
 
     Args:
         file: what was written.

@@ -1,4 +1,4 @@
-"""Friction as it is expected before it is identified, and the share of it that the control law feeds forward.
+"""Predict friction before it is identified, and compute the control law's friction feed-forward.
 
 Drives are expected to take `f(w) = F_c s(w) + F_v w + F_o` at their velocity w: the prior's friction, or a guess in
 shares of the torque limits. Where it is felt by joints, `C^T f(C dq)`.
@@ -14,11 +14,11 @@ from ident_service.config.limits import MotionLimits
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array, Chain
 
-# Of the velocity limit: over so much of the reference's velocity the Coulomb part fed forward turns round. A sign would
+# Share of the velocity limit over which the Coulomb feed-forward reverses. A sign function of the velocity would
 # step by twice the friction, and chatter where a reference stands.
 _TURNS = 0.02
-# Behind dry gears more: turning round at the acceleration limit changes the torque by this at most, half of what the
-# guard lets through (libfranka's 1000 N m/s), whose other half the errors at a reversal need.
+# Wider for much dry friction: reversing at the acceleration limit changes the torque at most at this rate, half of what
+# the safety monitor allows (libfranka's 1000 N m/s); errors at a reversal need the other half.
 _TURNING = 500.0  # N m/s or N/s
 
 
@@ -43,7 +43,7 @@ class ExpectedFriction:
 
 
 def expected_friction(model: ArmModel, limits: MotionLimits, guess: tuple[float, float]) -> ExpectedFriction:
-    """The prior's friction, or, of drives of which it has none, the guess.
+    """Return the prior's friction, or, for drives of which it has none, the guess.
 
     Args:
         model: of the arm.
@@ -62,7 +62,7 @@ def expected_friction(model: ArmModel, limits: MotionLimits, guess: tuple[float,
 
 
 class FrictionFeedforward:
-    """Friction that the control law adds for the velocity of the reference.
+    """Friction torque that the control law adds for the velocity of the reference.
 
     It depends on the reference alone, so that it closes no loop: it can neither chatter on the noise of a measured
     velocity nor drive a limit cycle, and where the reference stands it is the drives' offset.
@@ -73,7 +73,7 @@ class FrictionFeedforward:
     """
 
     def __init__(self, friction: ExpectedFriction, share: float, chain: Chain, limits: MotionLimits) -> None:
-        """Take what is expected.
+        """Store the expected friction and the share of it to add.
 
         Args:
             friction: of the drives.
@@ -89,7 +89,7 @@ class FrictionFeedforward:
         self._turns = 1.0 / over
 
     def torque(self, velocity: Array) -> Array:
-        """Torque to add [N m or N] for a reference's velocity [rad/s or m/s], each of shape (..., joints)."""
+        """Return the torque to add [N m or N] for a reference's velocity [rad/s or m/s], each (..., joints)."""
         rate = velocity @ self._coupling.T
         felt = self._coulomb * np.tanh(self._turns * rate) + self._viscous * rate + self.friction.offset
         return np.asarray(felt @ self._coupling)

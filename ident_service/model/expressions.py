@@ -1,4 +1,4 @@
-"""Base-parameter expressions that people read and programs parse: writing, reading, and the matrix K of a table."""
+"""Write and parse base-parameter expressions, and build the matrix K of a table of them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ident_service.errors import ParameterError
 
 
 def format_number(value: float) -> str:
-    """The shortest decimal that reads back as the same number, without a trailing `.0`."""
+    """Return the shortest decimal that reads back as the same number, without a trailing `.0`."""
     text = repr(float(value))
     return text.removesuffix(".0")
 
@@ -42,7 +42,7 @@ def format_expression(terms: Sequence[tuple[float, str]]) -> str:
 
 
 def parse_exactly(text: str) -> dict[str, Fraction]:
-    """Read the coefficients of a sum by name, decimals as they are written.
+    """Parse a sum into its coefficients by name, decimals as they are written.
 
     Raises:
         ParameterError: not a sum as in `certificate_verifier.parse_expression`; the message says where.
@@ -54,7 +54,7 @@ def parse_exactly(text: str) -> dict[str, Fraction]:
 
 
 def parse_expression(text: str) -> dict[str, float]:
-    """Read the coefficients of a sum by name.
+    """Parse a sum into its coefficients by name.
 
     Raises:
         ParameterError: as `parse_exactly`, or a coefficient too large for a float.
@@ -66,7 +66,7 @@ def parse_expression(text: str) -> dict[str, float]:
 
 
 def parameter_matrix(expressions: Sequence[str], names: Sequence[str]) -> NDArray[np.float64]:
-    """K of eq. 38: `K @ delta` gives the values of the expressions, shape (expressions, names).
+    """Return K of eq. 38: `K @ delta` gives the values of the expressions, shape (expressions, names).
 
     Raises:
         ParameterError: an expression does not parse or uses a name that is not among `names`.

@@ -1,4 +1,4 @@
-"""What a torque accelerates: `y = M(q)^-1 d` at many postures, with derivatives of whatever is computed from it.
+"""Compute accelerations from torques, `y = M(q)^-1 d`, at many postures, with derivatives of functions of them.
 
 With `lambda = M^-1 s` for seeds s, the gradient of `sum(s y)` is `-lambda' d(M y)/dq` over position and lambda over
 torque; `M y` is the torque of the acceleration y from rest without gravity, traced once per arm.
@@ -23,7 +23,7 @@ class InertiaResponse:
     """Accelerations that torques cause in an arm with known parameters, run forwards and backwards."""
 
     def __init__(self, chain: Chain, layout: Layout, delta: Array) -> None:
-        """Take link parameters `delta` [SI], shape (layout.size,).
+        """Trace the dynamics for link parameters `delta` [SI], shape (layout.size,).
 
         Raises:
             ModelError: a link without positive mass.
@@ -37,7 +37,7 @@ class InertiaResponse:
         self._position = self._M = self._response = np.zeros((0, n))
 
     def run(self, position: Array, torque: Array) -> Array:
-        """Accelerations [rad/s^2 or m/s^2], shape (samples, joints).
+        """Return the accelerations [rad/s^2 or m/s^2], shape (samples, joints).
 
         Args:
             position: [rad or m], shape (samples, joints).
@@ -52,7 +52,7 @@ class InertiaResponse:
         return self._response
 
     def pull(self, seeds: Array) -> tuple[Array, Array]:
-        """The gradient of `sum(seeds * run(...))` at the last run's states.
+        """Return the gradient of `sum(seeds * run(...))` at the last run's states.
 
         Args:
             seeds: shape (samples, joints).

@@ -1,4 +1,4 @@
-"""What a set of equations knows about the base parameters: per joint, the R of `[H_b | tau]` (eqs. 64-70).
+"""Accumulate the information of equations on the base parameters: per joint, the R of `[H_b | tau]` (eqs. 64-70).
 
 Two factors merge by a QR of the two stacked, so information of blocks, logs and arms adds up in any order, and joints
 can be weighted afterwards. Columns that a joint cannot feel (links nearer the base) are left out of its factor.
@@ -19,7 +19,7 @@ from ident_service.model.layout import INERTIAL, Layout
 
 @dataclass(frozen=True)
 class Information:
-    """One triangular factor per joint.
+    """Information of equations: one triangular factor per joint.
 
     Attributes:
         supports: per joint, which base parameters it feels, increasing.
@@ -39,11 +39,11 @@ class Information:
 
     @property
     def joints(self) -> int:
-        """Number of joints."""
+        """Return the number of joints."""
         return len(self.factors)
 
     def merged(self, other: Information) -> Information:
-        """The information of both sets of equations together.
+        """Return the information of both sets of equations together.
 
         Raises:
             ModelError: the two belong to different models.
@@ -81,7 +81,7 @@ class Information:
             )
 
     def stacked(self, weights: Array | None = None) -> Array:
-        """The triangular factor of all joints' equations together, `[R1 rho1; 0 |rho2|]` of eqs. 64-70.
+        """Return the triangular factor of all joints' equations together, `[R1 rho1; 0 |rho2|]` of eqs. 64-70.
 
         Args:
             weights: per joint, what its equations are multiplied by, shape (joints,); ones when None.
@@ -99,7 +99,7 @@ class Information:
         return np.vstack([R, np.zeros((self.base + 1 - R.shape[0], self.base + 1))])
 
     def squared_residuals(self, beta: Array) -> Array:
-        """Per joint, the sum of squared torque errors of `beta` [N^2 m^2 or N^2], shape (joints,)."""
+        """Return per joint the sum of squared torque errors of `beta` [N^2 m^2 or N^2], shape (joints,)."""
         errors = [
             factor[:, -1] - factor[:, :-1] @ beta[support]
             for support, factor in zip(self.supports, self.factors, strict=True)
@@ -107,12 +107,12 @@ class Information:
         return np.array([float(error @ error) for error in errors])
 
     def times(self, weights: Array) -> Information:
-        """The same equations with each joint's rows multiplied, `weights` of shape (joints,)."""
+        """Return the equations with each joint's rows multiplied by `weights`, shape (joints,)."""
         factors = tuple(weight * factor for weight, factor in zip(weights, self.factors, strict=True))
         return Information(self.supports, factors, self.rows.copy(), self.base)
 
     def with_torques_times(self, scales: Array) -> Information:
-        """The same equations with each joint's torque multiplied, `scales` of shape (joints,)."""
+        """Return the equations with each joint's torque multiplied by `scales`, shape (joints,)."""
         factors = []
         for scale, factor in zip(scales, self.factors, strict=True):
             scaled = factor.copy()
@@ -121,11 +121,11 @@ class Information:
         return Information(self.supports, tuple(factors), self.rows.copy(), self.base)
 
     def squared_torques(self) -> Array:
-        """Per joint, the sum of squared torques [N^2 m^2 or N^2], shape (joints,)."""
+        """Return per joint the sum of squared torques [N^2 m^2 or N^2], shape (joints,)."""
         return np.array([float(factor[:, -1] @ factor[:, -1]) for factor in self.factors])
 
     def scores(self, beta: Array, weights: Array | None = None) -> Array:
-        """Gradient of half the squared residual, `W^T (omega - W beta)`, summed over joints, shape (base,).
+        """Return the negative gradient of half the squared residual, `W^T (omega - W beta)`, shape (base,).
 
         Args:
             beta: base parameters, shape (base,).
@@ -145,12 +145,12 @@ def _stacked(factors: Sequence[Array]) -> Array:
 
 
 def triangle(rows: Array) -> Array:
-    """R of a QR decomposition, signs as they fall."""
+    """Return R of a QR decomposition, with arbitrary signs."""
     return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
 def supports(chain: Chain, layout: Layout, base_columns: NDArray[np.intp]) -> tuple[NDArray[np.intp], ...]:
-    """Per joint, the base columns of the links that it carries and the joint terms of the drives that move it."""
+    """Return per joint the base columns of the links that it carries and the joint terms of drives that move it."""
     links = base_columns // layout.per_link
     own_term = base_columns % layout.per_link >= len(INERTIAL)
     felt = []
@@ -161,7 +161,7 @@ def supports(chain: Chain, layout: Layout, base_columns: NDArray[np.intp]) -> tu
 
 
 def empty_information(joint_supports: tuple[NDArray[np.intp], ...], base: int) -> Information:
-    """No equations yet."""
+    """Return the information of no equations."""
     factors = tuple(np.zeros((0, len(support) + 1)) for support in joint_supports)
     return Information(joint_supports, factors, np.zeros(len(joint_supports), dtype=np.int64), base)
 
@@ -173,7 +173,7 @@ def information_of(
     joint_supports: tuple[NDArray[np.intp], ...],
     row_weights: Array | None = None,
 ) -> Information:
-    """Information of one block of samples.
+    """Return the information of one block of samples.
 
     Args:
         H_b: base regressor, shape (joints, base, samples).

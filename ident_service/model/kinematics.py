@@ -1,4 +1,4 @@
-"""Where the links are: poses and origins of joint and link frames in the base frame, for many postures at once."""
+"""Compute poses and origins of joint and link frames in the base frame, for many postures at once."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from ident_service.model.chain import WORLD, Array, Chain
 
 
 def frame_origins(chain: Chain, position: Array) -> Array:
-    """Origins along the arm.
+    """Return the origins of the base, joint and link frames along the arm.
 
     Args:
         chain: the mechanism.
@@ -25,7 +25,7 @@ def frame_origins(chain: Chain, position: Array) -> Array:
 
 
 def link_poses(chain: Chain, position: Array) -> tuple[Array, Array]:
-    """Where every link frame is and how it is turned.
+    """Return orientation and origin of every link frame in the base frame.
 
     Args:
         chain: the mechanism.
@@ -42,7 +42,7 @@ def link_poses(chain: Chain, position: Array) -> tuple[Array, Array]:
 
 
 def _joint_poses(chain: Chain, position: Array) -> list[tuple[Array, Array]]:
-    """Per joint, its frame to the base frame, shape (postures, 3, 3), and its origin [m], shape (postures, 3)."""
+    """Return per joint its rotation to the base frame, shape (postures, 3, 3), and origin [m], (postures, 3)."""
     postures = len(position)
     poses: list[tuple[Array, Array]] = []
     for k in range(chain.joints):
@@ -63,7 +63,7 @@ def _joint_poses(chain: Chain, position: Array) -> list[tuple[Array, Array]]:
 
 
 def branches(chain: Chain) -> tuple[tuple[int, ...], ...]:
-    """Per branch of the arm, the points of `frame_origins` from the base to its end."""
+    """Return per branch of the arm the points of `frame_origins` from the base to its end."""
     ends = set(range(chain.joints)) - set(chain.parents)
     return tuple(
         (0, *(point for k in chain.ancestors(end) for point in (1 + 2 * k, 2 + 2 * k))) for end in sorted(ends)

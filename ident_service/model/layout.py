@@ -1,4 +1,4 @@
-"""Names, order and units of the link parameters delta (eqs. 12, 13, 27, 28).
+"""Define names, order and units of the link parameters delta (eqs. 12, 13, 27, 28).
 
 Per link k: `Lxx Lxy Lxz Lyy Lyz Lzz lx ly lz m`, then the joint terms the model has, in the order `Ia fv fc fo` and,
 beyond eq. 27, `fs` (Stribeck), `fq` (quadratic) and `fa` (viscous asymmetry; an asymmetric Coulomb friction is `fo`):
@@ -47,7 +47,7 @@ _PRISMATIC_UNITS = {"Ia": "kg", "fv": "N s/m", "fc": "N", "fo": "N", "fs": "N", 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where each link parameter stands in delta.
+    """Order of the link parameters in delta.
 
     Attributes:
         revolute: per joint, True where it turns and False where it slides.
@@ -66,28 +66,28 @@ class Layout:
 
     @property
     def joints(self) -> int:
-        """Number of joints, which is the number of links."""
+        """Return the number of joints, which is the number of links."""
         return len(self.revolute)
 
     @property
     def per_link(self) -> int:
-        """Number of parameters of one link."""
+        """Return the number of parameters of one link."""
         return len(INERTIAL) + len(self.terms)
 
     @property
     def size(self) -> int:
-        """Number of parameters of the arm, n in the paper."""
+        """Return the number of parameters of the arm, n in the paper."""
         return self.per_link * self.joints
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """All names, `Lxx1 ... foN`."""
+        """Return all names, `Lxx1 ... foN`."""
         symbols = INERTIAL + tuple(TERM_SYMBOLS[term] for term in self.terms)
         return tuple(f"{symbol}{link}" for link in range(1, self.joints + 1) for symbol in symbols)
 
     @cached_property
     def units(self) -> tuple[str, ...]:
-        """The unit of each parameter."""
+        """Return the unit of each parameter."""
         inertial = ("kg m^2",) * 6 + ("kg m",) * 3 + ("kg",)
         units: list[str] = []
         for revolute in self.revolute:
@@ -96,23 +96,23 @@ class Layout:
         return tuple(units)
 
     def inertial(self, link: int) -> slice:
-        """Columns of the ten inertial parameters of `link` (counted from 0)."""
+        """Return the columns of the ten inertial parameters of `link` (counted from 0)."""
         start = link * self.per_link
         return slice(start, start + len(INERTIAL))
 
     def term_columns(self, term: JointTerm) -> NDArray[np.intp]:
-        """Columns of one joint term, shape (joints,), or empty where the model has no such term."""
+        """Return the columns of one joint term, shape (joints,), or empty where the model has no such term."""
         if term not in self.terms:
             return np.zeros(0, dtype=np.intp)
         return np.arange(self.joints) * self.per_link + len(INERTIAL) + self.terms.index(term)
 
     def term_values(self, term: JointTerm, delta: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values of one joint term in `delta`, shape (joints,), zero where the model has no such term."""
+        """Return the values of one joint term in `delta`, shape (joints,), zero where the model has no such term."""
         columns = self.term_columns(term)
         return delta[columns] if len(columns) else np.zeros(self.joints)
 
     def vector(self, table: ParameterTable) -> NDArray[np.float64]:
-        """Delta from named values, shape (size,); names that are not given are zero.
+        """Return delta from named values, shape (size,); names that are not given are zero.
 
         Raises:
             ParameterError: names that this arm does not have.

@@ -1,6 +1,6 @@
-"""Bodies that an arm's links are likely to have: those of its prior, else rods of its geometry.
+"""Estimate likely bodies of an arm's links: those of its prior, else rods of its geometry.
 
-Motion tells base parameters only, and many bodies move alike. Who looks at link values expects those of the arm: of all
+Motion shows base parameters only, and many bodies move alike. Readers of link values expect those of the arm: of all
 bodies behind the same base parameters the nearest to these is chosen (`estimation/feasible/central.py`). They are no
 knowledge: they change no base parameter by more than a hundredth of its deviation.
 """
@@ -32,7 +32,7 @@ IN_WORDS: dict[Source, str] = {"prior": "the bodies of its prior", "geometry": "
 
 @dataclass(frozen=True)
 class LikelyBodies:
-    """Link parameters to choose near to.
+    """Likely link parameters, to choose link values near to.
 
     Attributes:
         delta: of the links [SI], shape (layout.size,); joint terms are zero.
@@ -48,7 +48,7 @@ class LikelyBodies:
 
 
 def likely_bodies(model: ArmModel) -> LikelyBodies:
-    """Say what bodies the links of an arm are likely to have.
+    """Return the likely bodies of an arm's links.
 
     A link whose prior is a real body has that one. Any other is a rod, of the description's capsules where it has some,
     else along the lines from its joint to the next ones, with the bounds of its mass and of the arm's kept.
@@ -73,7 +73,7 @@ def likely_bodies(model: ArmModel) -> LikelyBodies:
     masses = sum(float(delta[place][-1]) for place in guessed)
     known = sum(float(delta[layout.inertial(link)][-1]) for link in range(chain.joints)) - masses
     if guessed:
-        # Of a prior that is heavier than the arm may be, nothing is left for the others; so a tenth of a guess.
+        # Where prior links alone exceed the arm's total mass, the guessed ones get a tenth of their guess.
         left = np.inf if total.upper is None else total.upper - known
         wanted = float(np.clip(masses, total.lower - known, left)) if left > 0.0 else 0.1 * masses
         for place in guessed:
@@ -85,7 +85,7 @@ def likely_bodies(model: ArmModel) -> LikelyBodies:
 
 
 def with_urdf_bodies(model: ArmModel) -> ArmModel:
-    """Give the model every body of its URDF as its prior, those too that no real link has."""
+    """Return the model with every body of its URDF as its prior, also those that no real link could have."""
     kinematics = model.config.kinematics
     if kinematics.urdf is None:
         return model
@@ -97,7 +97,7 @@ def with_urdf_bodies(model: ArmModel) -> ArmModel:
 
 
 def _drives(model: ArmModel, delta: Array) -> Array:
-    """Drive inertias: the prior's, the description's, or about what the links beyond a joint have."""
+    """Return likely drive inertias: the prior's, the description's, or about those of the links beyond a joint."""
     layout, found = model.layout, np.zeros(model.layout.size)
     columns = layout.term_columns("drive_inertia")
     if not len(columns):
@@ -118,7 +118,7 @@ def _drives(model: ArmModel, delta: Array) -> Array:
 
 
 def lines_of(model: ArmModel, link: int) -> Sequence[Capsule]:
-    """Give capsules along the ways from a link's joint to the joints that it carries, in the link's frame.
+    """Return capsules from a link's joint to the joints that it carries, in the link's frame.
 
     Args:
         model: of the arm.
@@ -135,7 +135,7 @@ def lines_of(model: ArmModel, link: int) -> Sequence[Capsule]:
 
 
 def _rod(rod: Capsule) -> Array:
-    """The inertial parameters of a homogeneous cylinder in place of a capsule, shape (10,), see `INERTIAL`."""
+    """Return the inertial parameters of a homogeneous cylinder in place of a capsule, shape (10,), see `INERTIAL`."""
     start, end = np.array(rod.start), np.array(rod.end)
     way, r = end - start, rod.radius
     distance = float(np.linalg.norm(way))
@@ -150,7 +150,7 @@ def _rod(rod: Capsule) -> Array:
 
 
 def _is_body(parameters: Array) -> bool:
-    """Whether inertial parameters are those of a real body: their pseudo-inertia is positive definite."""
+    """Return whether inertial parameters are those of a real body: their pseudo-inertia is positive definite."""
     xx, xy, xz, yy, yz, zz, *first, m = parameters
     if not m > 0.0:
         return False

@@ -1,4 +1,4 @@
-"""Run one of our programs on a file that may break it, with limits of memory and time; it answers with JSON."""
+"""Run one of our modules on an untrusted file, with limits of memory and time; it answers with JSON."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def ask_process(module: str, path: Path, deadline: float, *more: str) -> dict[st
 
 
 def answer_within(memory: int, seconds: int, document: Callable[[], dict[str, Any]]) -> int:
-    """In the process: limit it, then print what `document` returns; whatever libraries print is no part of it.
+    """Limit this process, then print what `document` returns, without anything that libraries print.
 
     Args:
         memory: bytes of addresses that it may have, libraries included.

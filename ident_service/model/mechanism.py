@@ -1,4 +1,4 @@
-"""A mechanism as a URDF or MJCF file describes it: the one door to the parsers that are written in C++.
+"""Read a mechanism from a URDF or MJCF file, guarding the parsers that are written in C++.
 
 Files come from strangers, and those parsers recurse: thousands of links in one another overflow the stack, and a small
 MJCF with a name twice damages the heap (decision 0052). So expat first counts what a file holds, in one pass that keeps
@@ -41,7 +41,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Mechanism:
-    """The joints of a file in pinocchio's order, fixed ones merged into their parents; arrays are read-only.
+    """Joints of a file in pinocchio's order, fixed ones merged into their parents; arrays are read-only.
 
     Attributes:
         names: of the joints.
@@ -79,7 +79,7 @@ def read_mechanism(file: TextFile, kind: Kind, kinematics: Kinematics | None = N
         file: its name and text.
         kind: of the file.
         kinematics: which part of it is the arm; all of it when None.
-        own: whether this process has just written it, so that nobody else has a word in it.
+        own: whether this process has just written the file, so that its content is not foreign.
 
     Raises:
         ModelError: not such a file, beyond the limits, entities or includes in it, or a joint that is neither
@@ -106,7 +106,7 @@ def _read(file: TextFile, kind: Kind, part: str | None, own: bool) -> Mechanism:
 
 
 def count_mechanism(file: TextFile, kind: Kind) -> None:
-    """Refuse a file that its parser should not see.
+    """Refuse a file that could break its parser, by its size, elements and links.
 
     Raises:
         ModelError: not XML, too large, too many or too deeply nested elements or links, two joints that carry one
@@ -183,7 +183,7 @@ def _as_number(word: str) -> float:
 
 
 class _Counter:
-    """Count elements, links and how deep they stand in one another."""
+    """Counter of elements, links and their depth of nesting."""
 
     def __init__(self, name: str, kind: Kind) -> None:
         self._name, self._urdf = name, kind == "urdf"

@@ -1,4 +1,4 @@
-"""The part of a mechanism that is the arm: from a base to a tip, with the other joints and the locked ones held still.
+"""Extract the arm from a mechanism: from a base to a tip, with the other joints and the locked ones held still.
 
 A joint that is held still is a fixed joint at its value, and its link's inertia merges into the link before it
 (pinocchio's `buildReducedModel`). Joints outside base and tip are held at zero, or at the limit nearest to zero, unless
@@ -26,7 +26,7 @@ _OUTSIDE = 1e-6  # rad or m; what a value may be beyond a limit by rounding
 
 @dataclass(frozen=True)
 class Part:
-    """Which part of a mechanism is the arm: `base`, `tip` and `lock` of `config.kinematics.Kinematics`."""
+    """Part of a mechanism that is the arm: `base`, `tip` and `lock` of `config.kinematics.Kinematics`."""
 
     base: str | None = None
     tip: str | None = None
@@ -35,7 +35,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Mimic:
-    """A URDF joint's `<mimic>`: its position is `multiplier` times that of `joint`, plus `offset` [rad or m]."""
+    """`<mimic>` of a URDF joint: its position is `multiplier` times that of `joint`, plus `offset` [rad or m]."""
 
     joint: str
     multiplier: float
@@ -135,7 +135,7 @@ def _require_agreement(name: str, follower: Mimic, held: Mapping[str, float], fi
 
 
 def _between(model: pin.Model, part: Part, file: str) -> set[str]:
-    """Find the joints that are neither on the way to the base nor off the way to the tip."""
+    """Return the joints between base and tip, without those on the way to the base or off the way to the tip."""
     ids = set(range(1, model.njoints))
     if part.base is not None:
         base = _joint_of(model, part.base, "base", file)
@@ -149,7 +149,7 @@ def _between(model: pin.Model, part: Part, file: str) -> set[str]:
 
 
 def _joint_of(model: pin.Model, link: str, role: str, file: str) -> int:
-    """Find the joint that moves a link; 0 is the world."""
+    """Return the joint that moves a link; 0 is the world."""
     if not model.existFrame(link, pin.FrameType.BODY):
         known = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
         raise ModelError(f"{file}: kinematics.{role}: no link {link!r}; it has {', '.join(known[:40])}")
@@ -175,7 +175,7 @@ def _checked(model: pin.Model, name: str, value: float, file: str) -> float:
 
 
 def _rest(model: pin.Model, name: str) -> float:
-    """Return zero, or the limit nearest to it."""
+    """Return the position at which a joint is held [rad or m]: zero, or the limit nearest to it."""
     joint = model.joints[model.getJointId(name)]
     if joint.nq != 1:
         return 0.0
@@ -184,7 +184,7 @@ def _rest(model: pin.Model, name: str) -> float:
 
 
 def _rebase(model: pin.Model, base: str) -> None:
-    """Let the model's world be the frame of a link that does not move."""
+    """Move the model's world frame to the frame of a link that does not move."""
     to_base = model.frames[model.getFrameId(base, pin.FrameType.BODY)].placement.inverse()
     for k in range(1, model.njoints):
         if model.parents[k] == 0:

@@ -1,4 +1,4 @@
-"""Read a mechanism with pinocchio, as JSON values; as a program: an MJCF whose path it is given, within limits.
+"""Read a mechanism with pinocchio, as JSON values; as a program, read the MJCF at a given path within limits.
 
 `python -m ident_service.model.mechanism_process FILE` prints one JSON object. `error` in it says why there is no other.
 """
@@ -18,7 +18,7 @@ from ident_service.errors import ModelError
 from ident_service.model.limited_process import answer_within
 from ident_service.model.mechanism_part import Mimic, Part, arm_part, mimics
 
-if TYPE_CHECKING:  # as there
+if TYPE_CHECKING:  # this process loads no configuration
     from ident_service.config.quantities import TextFile
 
 MOST_MEMORY: Final = 512 * 2**20  # bytes of addresses, of which the libraries take 230 MB
@@ -93,7 +93,7 @@ def _document(
 
 
 def main(words: list[str]) -> int:
-    """Read one file within the limits."""
+    """Read one MJCF file within the limits of memory and time, and print it as JSON."""
     return answer_within(MOST_MEMORY, MOST_SECONDS, lambda: mjcf_document(words[0], words[1] if words[1:] else None))
 
 

@@ -1,4 +1,4 @@
-"""Inverse dynamics, gravity and mass matrix as formulas of joint states and parameters, by recursion.
+"""Derive inverse dynamics, gravity and mass matrix as formulas of joint states and parameters, by recursion.
 
 Newton-Euler outwards and inwards with the ten parameters of eq. 13 per link: with w, e and a the angular velocity,
 angular acceleration and linear acceleration of the link frame's origin (gravity as an upward acceleration of the base),
@@ -9,7 +9,7 @@ angular acceleration and linear acceleration of the link frame's origin (gravity
 values of the base parameters and every other column at zero, `K delta = beta` holds, and so do all torques (eq. 37).
 The mass matrix is that of composite bodies, whose ten parameters simply add up.
 
-Boundary: formulas on a tape (`tape.py`); who runs or prints them is elsewhere.
+The formulas are recorded on a tape (`tape.py`), which other modules run or print.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Parameters = Mapping[int, Value]
 
 @dataclass(frozen=True)
 class _Body:
-    """L (symmetric, rows), first moment l and m of eq. 13 about the origin of some frame."""
+    """Body with L (symmetric, rows), first moment l and m of eq. 13 about the origin of some frame."""
 
     L: Rotation
     first: Vector
@@ -39,7 +39,7 @@ class _Body:
 def rigid_torque(
     tape: Tape, chain: Chain, layout: Layout, parameters: Parameters, q: Sequence[Symbol], *rates: Sequence[Value]
 ) -> list[Value]:
-    """Torque of the links: M(q) ddq + c(q, dq) + g(q) without drives.
+    """Return the torque of the links: M(q) ddq + c(q, dq) + g(q) without drives.
 
     Args:
         tape: to write on.
@@ -71,7 +71,7 @@ def rigid_torque(
 def mass_matrix(
     tape: Tape, chain: Chain, layout: Layout, parameters: Parameters, q: Sequence[Symbol]
 ) -> list[list[Value]]:
-    """M(q), drive inertia included: composite bodies, whose weight every joint on the way to the base feels."""
+    """Return M(q), drive inertia included, by composite bodies, which every joint towards the base carries."""
     n = chain.joints
     steps = [_Step(tape, chain, k, q) for k in range(n)]
     composite = [
@@ -105,7 +105,7 @@ def mass_matrix(
 
 
 def drive_torque(chain: Chain, layout: Layout, parameters: Parameters, ddq: Sequence[Value]) -> list[Value]:
-    """What accelerating the drives takes, in the rows of the joints they move."""
+    """Return the torque that accelerates the drives, in the rows of the joints they move."""
     torque: list[Value] = [0.0] * chain.joints
     for drive, column in enumerate(layout.term_columns("drive_inertia")):
         share = constant(chain.coupling[drive])
@@ -122,7 +122,7 @@ def friction_torque(
     dq: Sequence[Symbol],
     direction: Sequence[Symbol] | None = None,
 ) -> list[Value]:
-    """What friction takes (`layout.py`); its direction per drive is the sign of the drive's velocity when None."""
+    """Return the friction torque (`layout.py`); `direction` per drive is the sign of its velocity when None."""
     torque: list[Value] = [0.0] * chain.joints
     columns = {term: layout.term_columns(term) for term in layout.terms}
     for drive in range(chain.joints):
@@ -140,7 +140,7 @@ def friction_torque(
 def _shape(
     tape: Tape, layout: Layout, term: JointTerm, drive: int, rate: Value, direction: Symbol | None = None
 ) -> Value:
-    """What a friction parameter is multiplied by."""
+    """Return the factor of a friction parameter."""
     if not isinstance(rate, Symbol):
         return 1.0 if term == "offset" else 0.0  # a drive that moves no joint
     if term == "offset":
@@ -158,7 +158,7 @@ def _shape(
 
 
 class _Step:
-    """From a parent's joint frame to a joint's: `arm` in the parent's frame, then `rotation` into the joint's."""
+    """Transform from the parent's joint frame to a joint's: `arm` in the parent's, then `rotation` into the joint's."""
 
     def __init__(self, tape: Tape, chain: Chain, k: int, q: Sequence[Symbol]) -> None:
         self.parent = chain.parents[k]
@@ -175,7 +175,7 @@ class _Step:
     def outwards(
         self, motion: tuple[Vector, Vector, Vector], rate: Value, acceleration: Value
     ) -> tuple[Vector, Vector, Vector]:
-        """Motion w, e, a of the joint frame's origin from that of the parent's."""
+        """Return the motion w, e, a of the joint frame's origin from that of the parent's."""
         w, e, a = motion
         a = rotate(self.rotation, add(a, add(cross(e, self.arm), cross(w, cross(w, self.arm)))))
         w, e = rotate(self.rotation, w), rotate(self.rotation, e)
@@ -185,13 +185,13 @@ class _Step:
         return w, e, add(add(a, along), scaled(cross(w, speed), 2.0))
 
     def inwards(self, force: Vector, moment: Vector) -> tuple[Vector, Vector]:
-        """A force and moment about this joint's origin, in the parent's frame about the parent's."""
+        """Return a force and moment about this joint's origin, in the parent's frame about the parent's."""
         back = _transposed(self.rotation)
         force = rotate(back, force)
         return force, add(rotate(back, moment), cross(self.arm, force))
 
     def felt(self, force: Vector, moment: Vector) -> Value:
-        """The share of a force and moment that the joint has to give."""
+        """Return the component of a force and moment that the joint has to give."""
         return dot(self.axis, moment if self.revolute else force)
 
 
@@ -202,7 +202,7 @@ def _link_body(layout: Layout, parameters: Parameters, link: int) -> _Body:
 
 
 def _link_wrench(chain: Chain, link: int, motion: tuple[Vector, Vector, Vector], body: _Body) -> tuple[Vector, Vector]:
-    """What moving a link takes: force, and moment about the joint frame's origin, in the joint frame."""
+    """Return the wrench that moves a link: force, and moment about the joint frame's origin, in the joint frame."""
     w, e, a = motion
     arm, out = constant(chain.link_translation[link]), _rows(chain.link_rotation[link].T)
     a = rotate(out, add(a, add(cross(e, arm), cross(w, cross(w, arm)))))
@@ -215,7 +215,7 @@ def _link_wrench(chain: Chain, link: int, motion: tuple[Vector, Vector, Vector],
 
 
 def _seen_from(body: _Body, rotation: Rotation, arm: Vector) -> _Body:
-    """The same body about the origin that its own lies `arm` away from, turned by `rotation` (Steiner, eq. 8)."""
+    """Return the body about the origin that its own lies `arm` away from, turned by `rotation` (Steiner, eq. 8)."""
     first = rotate(rotation, body.first)
     half = _transposed([rotate(rotation, row) for row in body.L])  # R L, since L is symmetric
     L = [rotate(rotation, row) for row in half]

@@ -1,4 +1,4 @@
-"""Other notations of link parameters: Khalil's (SYMORO) and that of SymPyBotics, renamed to ours.
+"""Translate other notations of link parameters, Khalil's (SYMORO) and that of SymPyBotics, to ours.
 
     | ours          | Khalil, Dombre 2002        | SymPyBotics          |
     |---------------|----------------------------|----------------------|
@@ -35,7 +35,7 @@ _NAME = re.compile(r"(?<![\w.])[A-Za-z_]\w*")
 
 
 def translate(text: str, notation: Notation) -> str:
-    """Rename all parameters of an expression to ours.
+    """Rename all parameters of an expression to our notation.
 
     Raises:
         ParameterError: a name that the notation does not have.

@@ -1,4 +1,4 @@
-"""Capsules around the links of a URDF whose collision geometry is meshes, for a description to begin with.
+"""Fit capsules around the links of a URDF whose collision geometry is meshes, for a first description.
 
 Meshes are read by coal (assimp) and never again: what a description says of bodies are capsules, which people can check
 and correct.
@@ -87,12 +87,12 @@ def capsule_around(points: Array) -> Capsule:
 
 
 def _points(element: ET.Element, owner: str, where: str) -> Array:
-    """Points whose capsule encloses a primitive, shape (points, 3)."""
+    """Return points whose capsule encloses a primitive, shape (points, 3)."""
     return outline_of(solid_of(element, np.eye(3), np.zeros(3), owner, where))
 
 
 def outline_of(solid: Solid) -> Array:
-    """Corners of the box around a solid, in its frame [m], shape (points, 3)."""
+    """Return the corners of the box around a solid, in its frame [m], shape (points, 3)."""
     corners = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
     if isinstance(solid, Box):
         return np.asarray(solid.center + corners * solid.half @ solid.rotation.T)
@@ -105,7 +105,7 @@ def outline_of(solid: Solid) -> Array:
 
 
 def _vertices(mesh: ET.Element, folder: Path) -> Array | None:
-    """The vertices of a mesh file [m], shape (vertices, 3); None where it cannot be read."""
+    """Return the vertices of a mesh file [m], shape (vertices, 3); None where it cannot be read."""
     path = _find(mesh.get("filename", ""), folder)
     if path is None or path.stat().st_size > MOST_MESH_BYTES:
         return None
@@ -119,7 +119,7 @@ def _vertices(mesh: ET.Element, folder: Path) -> Array | None:
 
 
 def _find(name: str, folder: Path) -> Path | None:
-    """A mesh by its name in a URDF: a path, or `package://NAME/REST` in a folder NAME at or above the URDF."""
+    """Return the path of a mesh named in a URDF: a path, or `package://NAME/REST` in a folder NAME at or above it."""
     if not name.startswith("package://"):
         path = folder / name.removeprefix("file://")
         return path if path.is_file() else None

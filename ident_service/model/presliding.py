@@ -1,4 +1,4 @@
-"""Pre-sliding friction: the direction of dry friction as a state that turns with the way travelled (Dahl 1968).
+"""Advance the pre-sliding state of dry friction by the distance travelled (Dahl 1968).
 
 `estimation/direction.py` has it for a whole recording; this is one step of the same solution. Where the drive moves by
 `step` without turning round, the direction s goes to
@@ -17,7 +17,7 @@ from ident_service.model.chain import Array
 
 
 def presliding_ways(model: ArmModel) -> Array:
-    """x0 per drive [rad or m], shape (joints,).
+    """Return the pre-sliding distance x0 per drive [rad or m], shape (joints,).
 
     Zero where dry friction turns round at once: nothing was fitted, or the arm has no dry friction.
     """
@@ -28,7 +28,7 @@ def presliding_ways(model: ArmModel) -> Array:
 
 
 def turned(direction: Array, step: Array, ways: Array) -> Array:
-    """The direction of dry friction after a step.
+    """Return the direction of dry friction after a step.
 
     Args:
         direction: before it, between -1 and 1, shape (..., drives).

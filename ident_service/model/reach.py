@@ -1,4 +1,4 @@
-"""How fast a joint can change the distance of two bodies: Lipschitz constants that hold in every posture.
+"""Bound how fast a joint can change the distance of two bodies: Lipschitz constants that hold in every posture.
 
 The signed distance of two convex sets changes no more than their points move against each other, and joint k moves a
 point by at most its distance from k's axis per radian (its travel per metre). What hangs on joint k stays, however the
@@ -37,7 +37,7 @@ class _Hull:
 
 
 def reach(scene: Scene) -> tuple[Array, ...]:
-    """Per pair, constants L with `|d(q) - d(p)| <= sum_k L_k |q_k - p_k|`.
+    """Return per pair constants L with `|d(q) - d(p)| <= sum_k L_k |q_k - p_k|`.
 
     Sliding joints are taken to stay within their position limits; where one has none, the joints that carry it have
     infinite constants.
@@ -60,7 +60,7 @@ def reach(scene: Scene) -> tuple[Array, ...]:
 
 
 def _of_body(scene: Scene, body: Body) -> Array:
-    """How far each joint moves any point of a body at most [m/rad or m/m], shape (joints,)."""
+    """Return how far each joint moves any point of a body at most [m/rad or m/m], shape (joints,)."""
     chain = scene.chain
     result = np.zeros(chain.joints)
     hull = _around(body, chain.axes[body.joint])
@@ -72,7 +72,7 @@ def _of_body(scene: Scene, body: Body) -> Array:
 
 
 def corners(body: Body) -> tuple[Array, float]:
-    """Points whose convex hull, made thicker by a radius, contains a solid.
+    """Return points whose convex hull, made thicker by a radius, contains a solid.
 
     Returns:
         Points in the joint frame [m], shape (points, 3), and the radius [m].
@@ -93,7 +93,7 @@ def _around(body: Body, axis: Array) -> _Hull:
 
 
 def _hull(points: Array, axis: Array, across: float, along: float, ball: float) -> _Hull:
-    """Bounds about an axis of points that are thickened by `across` and `along` it, and lie in a ball."""
+    """Return bounds about an axis of points that are thickened by `across` and `along` it, and lie in a ball."""
     heights = points @ axis
     distances = np.linalg.norm(points - np.outer(heights, axis), axis=1)
     return _Hull(
@@ -105,7 +105,7 @@ def _hull(points: Array, axis: Array, across: float, along: float, ball: float) 
 
 
 def _seen_from_parent(scene: Scene, joint: int, hull: _Hull) -> _Hull:
-    """The same points, wherever the joint stands, seen from the joint it sits on."""
+    """Return bounds of the points, wherever the joint stands, about the parent joint."""
     chain = scene.chain
     axis = chain.rotation[joint] @ chain.axes[joint]
     low, high, ball = hull.low, hull.high, hull.ball

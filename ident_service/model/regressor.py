@@ -1,4 +1,4 @@
-"""The regressor H(q, dq, ddq) with H delta = tau (eq. 29), for many samples at once.
+"""Compute the regressor H(q, dq, ddq) with H delta = tau (eq. 29), for many samples at once.
 
 For link k with angular velocity w, angular acceleration e and linear acceleration a of its frame's origin (gravity
 taken as an upward acceleration of the base), all in the link frame,
@@ -11,7 +11,7 @@ row is ten products of vectors, computed for whole blocks with the samples along
 
 The formulas are traced once per chain (`tape.py`), which drops everything that the geometry makes zero or one.
 
-Boundary: numpy only; no samples are looped over in Python.
+No loop over samples runs in Python.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def joint_regressor(
     out: Array | None = None,
     direction: Array | None = None,
 ) -> Array:
-    """The rows of H for every joint and sample.
+    """Return the rows of H for every joint and sample.
 
     Args:
         chain: the mechanism.
@@ -84,14 +84,14 @@ def joint_regressor(
 
 @lru_cache(maxsize=32)
 def _program(chain: Chain, layout: Layout, columns: tuple[int, ...]) -> tuple[Program, list[tuple[int, int]]]:
-    """The traced formulas, and the (joint, column) that each of its outputs belongs to; the others are zero."""
+    """Return the traced formulas, and the (joint, column) that each output belongs to; the others are zero."""
     tape, entries = traced_regressor(chain, layout)
     kept = entries_of(entries, columns)
     return Program(tape, list(kept.values())), list(kept)
 
 
 def traced_regressor(chain: Chain, layout: Layout) -> tuple[Tape, dict[tuple[int, int], Value]]:
-    """The formulas of H on a fresh tape, for programs of other kinds than the one here.
+    """Return the formulas of H on a fresh tape, for programs of other kinds than the one here.
 
     Returns:
         The tape, whose inputs are position, velocity, acceleration and direction of every joint, in this order, and
@@ -110,7 +110,7 @@ def traced_regressor(chain: Chain, layout: Layout) -> tuple[Tape, dict[tuple[int
 def traced_rigid_torque(
     tape: Tape, chain: Chain, layout: Layout, delta: Array, q: list[Symbol], dq: Sequence[Value], ddq: Sequence[Value]
 ) -> list[Value]:
-    """The links' share of the torque of every joint for known parameters; numbers in `dq` and `ddq` are folded."""
+    """Return the links' share of every joint's torque for known parameters; numbers in `dq` and `ddq` are folded."""
     torque: list[Value] = [0.0] * chain.joints
     states = _Forward(tape, chain, q, dq, ddq)
     for link in range(chain.joints):
@@ -122,7 +122,7 @@ def traced_rigid_torque(
 
 
 def entries_of(entries: dict[tuple[int, int], Value], columns: Sequence[int]) -> dict[tuple[int, int], Value]:
-    """The entries that are not zero, by joint and place in `columns`."""
+    """Return the entries that are not zero, by joint and place in `columns`."""
     chosen = {column: row for row, column in enumerate(columns)}
     return {
         (joint, chosen[column]): value
@@ -134,7 +134,7 @@ def entries_of(entries: dict[tuple[int, int], Value], columns: Sequence[int]) ->
 def _joint_terms(
     tape: Tape, chain: Chain, layout: Layout, dq: list[Symbol], ddq: list[Symbol], direction: list[Symbol]
 ) -> dict[tuple[int, int], Value]:
-    """Drive inertia and friction (`layout.py`): each drive's own columns, in the rows of the joints it moves."""
+    """Return drive inertia and friction (`layout.py`): each drive's columns, in the rows of the joints it moves."""
     entries: dict[tuple[int, int], Value] = {}
     for drive in range(chain.joints):
         share = constant(chain.coupling[drive])
@@ -207,12 +207,12 @@ class _Forward:
 
 
 def _carried(screws: dict[int, _Screw], arm: Vector, rotation: Rotation) -> dict[int, _Screw]:
-    """The same screws seen from a frame whose origin is `arm` further and which is turned by `rotation`."""
+    """Return the screws seen from a frame whose origin is `arm` further and which is turned by `rotation`."""
     return {i: (rotate(rotation, u), rotate(rotation, add(v, cross(u, arm)))) for i, (u, v) in screws.items()}
 
 
 def _link_entries(states: _Forward, link: int) -> dict[tuple[int, int], Value]:
-    """The ten columns of one link in the rows of all joints that carry it, by (joint, parameter of eq. 13)."""
+    """Return the ten columns of one link in the rows of all joints that carry it, by (joint, parameter of eq. 13)."""
     w, e, a = states.motion[link]
     entries: dict[tuple[int, int], Value] = {}
     # What only depends on the link is shared by all joints: e~ + w~ w~ of the first moment, and L's factors.
@@ -234,7 +234,7 @@ def _link_entries(states: _Forward, link: int) -> dict[tuple[int, int], Value]:
 
 
 def _inertia_columns(W: list[list[Value]], e: Vector) -> list[Vector]:
-    """Per entry of L (eq. 13), the moment `L e + w x (L w)` of a unit entry; W is w w^T."""
+    """Return, per entry of L (eq. 13), the moment `L e + w x (L w)` of a unit entry; W is w w^T."""
     columns: list[Vector] = []
     for i, j in _ENTRIES:
         # L w has w_j at i and w_i at j; w x (L w) multiplies them with w again, which are entries of W.

@@ -1,4 +1,4 @@
-"""The base regressor of many samples together with the derivatives of whatever is computed from it.
+"""Compute the base regressor of many samples together with the derivatives of functions of it.
 
 For a scalar function of H, `pull` turns its derivatives with respect to the entries of H into those with respect to
 position, velocity, acceleration and direction: what a search for a motion needs. Exact, from the same traced formulas
@@ -20,7 +20,7 @@ from ident_service.model.tape import Symbol
 
 
 class RegressorGradient:
-    """H of chosen columns, run forwards and backwards.
+    """Regressor of chosen columns, run forwards and backwards.
 
     Attributes:
         joints: number of joints.
@@ -42,7 +42,7 @@ class RegressorGradient:
         self._H = np.zeros((0, 0, 0))
 
     def run(self, position: Array, velocity: Array, acceleration: Array, direction: Array) -> Array:
-        """The rows of H.
+        """Return the rows of H.
 
         Args:
             position: [rad or m], shape (samples, joints).
@@ -64,7 +64,7 @@ class RegressorGradient:
         return self._H
 
     def pull(self, seeds: Array) -> tuple[Array, Array, Array, Array]:
-        """The gradient of `sum(seeds * H)` at the states of the last run.
+        """Return the gradient of `sum(seeds * H)` at the states of the last run.
 
         Args:
             seeds: shape (joints, columns, samples).

@@ -1,4 +1,4 @@
-"""The door to pinocchio: chains from what `mechanism.py` reads, and models it can run, from a chain and delta.
+"""Convert between our model and pinocchio: chains from what `mechanism.py` reads, models from a chain and delta.
 
 Pinocchio keeps a link's inertia as mass, centre of mass and inertia about the centre of mass in the joint frame; here
 stand the conversions from and to delta (eqs. 5, 8), whose inertia is about the link frame's origin.
@@ -23,7 +23,7 @@ from ident_service.model.mechanism import Mechanism, read_mechanism
 def read_urdf(
     file: TextFile, gravity: tuple[float, float, float], kinematics: Kinematics | None = None
 ) -> tuple[Chain, Array]:
-    """Chain and link inertias of a URDF; fixed joints, and those held still, are merged into their parents.
+    """Read chain and link inertias from a URDF; fixed joints, and those held still, are merged into their parents.
 
     Args:
         file: the URDF.
@@ -42,12 +42,12 @@ def read_urdf(
 def read_mjcf(
     file: TextFile, gravity: tuple[float, float, float], kinematics: Kinematics | None = None
 ) -> tuple[Chain, Array]:
-    """As `read_urdf`, for an MJCF file of hinge and slide joints."""
+    """Read chain and link inertias from an MJCF file of hinge and slide joints, as `read_urdf`."""
     return chain_of(read_mechanism(file, "mjcf", kinematics), gravity)
 
 
 def chain_of(mechanism: Mechanism, gravity: tuple[float, float, float]) -> tuple[Chain, Array]:
-    """Return what `read_urdf` does, of a file that was read."""
+    """Return chain and link inertias of a mechanism, as `read_urdf` does of a file."""
     n = len(mechanism.names)
     chain = Chain(
         names=mechanism.names,
@@ -64,7 +64,7 @@ def chain_of(mechanism: Mechanism, gravity: tuple[float, float, float]) -> tuple
 
 
 def inertia_from_delta(parameters: Array) -> pin.Inertia:
-    """The inertia of the ten parameters of eq. 13; `parameters` shape (10,), with positive mass.
+    """Return the inertia of the ten parameters of eq. 13; `parameters` shape (10,), with positive mass.
 
     Raises:
         ModelError: the mass is not positive, so that no centre of mass exists.
@@ -76,12 +76,12 @@ def inertia_from_delta(parameters: Array) -> pin.Inertia:
 
 
 def link_frame(chain: Chain, link: int) -> pin.SE3:
-    """Placement of the link frame in the joint frame."""
+    """Return the placement of the link frame in the joint frame."""
     return pin.SE3(chain.link_rotation[link], chain.link_translation[link])
 
 
 def joint_frame_inertias(chain: Chain, layout: Layout, delta: Array) -> list[pin.Inertia]:
-    """Each link's inertia in its joint's frame, whatever frame delta is expressed in.
+    """Return each link's inertia in its joint's frame, whatever frame delta is expressed in.
 
     Raises:
         ModelError: a link without positive mass.
@@ -90,7 +90,7 @@ def joint_frame_inertias(chain: Chain, layout: Layout, delta: Array) -> list[pin
 
 
 def pinocchio_model(chain: Chain, layout: Layout, delta: Array) -> pin.Model:
-    """A pinocchio model of the chain with the inertias of `delta` and its drive inertias as armature.
+    """Return a pinocchio model of the chain with the inertias of `delta` and its drive inertias as armature.
 
     Every joint has one position coordinate, continuous joints too. Friction stays with whoever integrates, because
     pinocchio's has no sticking.
@@ -117,10 +117,10 @@ def pinocchio_model(chain: Chain, layout: Layout, delta: Array) -> pin.Model:
 
 
 class InverseDynamics:
-    """Torque of a chain with known parameters at one state, fast enough for a control loop; no friction."""
+    """Inverse dynamics of a chain with known parameters at one state, fast enough for a control loop; no friction."""
 
     def __init__(self, chain: Chain, layout: Layout, delta: Array) -> None:
-        """Take the parameters.
+        """Build the pinocchio model of the parameters.
 
         Raises:
             ModelError: `delta` does not fit the layout, or a link has no positive mass.
@@ -136,19 +136,19 @@ class InverseDynamics:
         self._data = self._model.createData()
 
     def torque(self, position: Array, velocity: Array, acceleration: Array) -> NDArray[np.float64]:
-        """`M(q) ddq + c(q, dq) + g(q)` [N m or N], shape (joints,), drive inertia included."""
+        """Return `M(q) ddq + c(q, dq) + g(q)` [N m or N], shape (joints,), drive inertia included."""
         rigid = np.asarray(pin.rnea(self._model, self._data, position, velocity, acceleration))
         return rigid if self._drives is None else np.asarray(rigid + self._drives @ acceleration)
 
     def mass_matrix(self, position: Array) -> NDArray[np.float64]:
-        """M(q), shape (joints, joints), drive inertia included."""
+        """Return M(q), shape (joints, joints), drive inertia included."""
         upper = pin.crba(self._model, self._data, position)
         rigid = np.asarray(np.triu(upper) + np.triu(upper, 1).T)
         return rigid if self._drives is None else np.asarray(rigid + self._drives)
 
 
 class ForwardDynamics:
-    """Where a chain with known parameters goes, drives and friction included, in steps that are stable at any speed.
+    """Forward dynamics of a chain with known parameters, drives and friction, in steps stable at any speed.
 
     Friction is a secant through its present value, `f = D(v) v` with `D = fv + (fc + fs exp(-(v/v_s)^2)) / max(|v|,
     1 mrad/s) + fq |v| + fa sign(v)`, and taken at the end of the step, so that a joint creeps where it ought to stick:
@@ -158,7 +158,7 @@ class ForwardDynamics:
     _CREEP = 1e-3  # rad/s or m/s
 
     def __init__(self, chain: Chain, layout: Layout, delta: Array, friction: tuple[Array, Array] | None = None) -> None:
-        """Take the parameters.
+        """Build the pinocchio model of the parameters.
 
         Args:
             chain: the mechanism.
@@ -187,12 +187,12 @@ class ForwardDynamics:
         self._bends = any(self._terms[term].any() for term in ("stribeck", "quadratic", "viscous_asymmetry"))
 
     def torque(self, position: Array, velocity: Array, acceleration: Array) -> NDArray[np.float64]:
-        """`M(q) ddq + c(q, dq) + g(q)` [N m or N], shape (joints,), drive inertia included, no friction."""
+        """Return `M(q) ddq + c(q, dq) + g(q)` [N m or N], shape (joints,), drive inertia included, no friction."""
         rigid = pin.rnea(self._model, self._data, position, velocity, acceleration)
         return np.asarray(rigid + self._drive_matrix @ acceleration)
 
     def mass_matrices(self, position: Array) -> NDArray[np.float64]:
-        """M(q) at postures [rad or m] of shape (samples, joints); (samples, joints, joints), drive inertia included."""
+        """Return M(q) at postures [rad or m] (samples, joints); (samples, joints, joints), drive inertia included."""
         n = self._model.nv
         M = np.empty((len(position), n, n))
         for k, posture in enumerate(position):
@@ -202,12 +202,12 @@ class ForwardDynamics:
         return np.asarray(M + self._drive_matrix)
 
     def friction(self, velocity: Array) -> NDArray[np.float64]:
-        """Torque that friction takes [N m or N], shape (joints,)."""
+        """Return the friction torque [N m or N], shape (joints,)."""
         rate = self._coupling @ velocity
         return np.asarray(self._coupling.T @ (self._secant(rate) * rate) + self._offset)
 
     def next_velocity(self, position: Array, velocity: Array, torque: Array, period: float) -> NDArray[np.float64]:
-        """The velocity after one step of a constant torque, implicit in the friction, explicit in the rest.
+        """Return the velocity after one step of a constant torque, implicit in the friction, explicit in the rest.
 
         Args:
             position: [rad or m], shape (joints,).
@@ -238,7 +238,7 @@ class ForwardDynamics:
         return np.asarray(velocity + period * acceleration)
 
     def _secant(self, rate: Array) -> Array:
-        """D of every drive at its velocity, shape (joints,)."""
+        """Return D of every drive at its velocity, shape (joints,)."""
         terms, speed = self._terms, np.abs(rate)
         if not self._bends:
             return np.asarray(np.maximum(terms["viscous"] + terms["coulomb"] / np.maximum(speed, self._CREEP), 0.0))

@@ -1,11 +1,11 @@
-"""The bodies of an arm and of its surroundings, and which pairs of them must stay apart.
+"""Collect the bodies of an arm and of its surroundings, and the pairs of them that must stay apart.
 
 A link is a union of convex solids that stand still in its joint's frame; the base and the obstacles stand still in the
 base frame. Two links that a joint connects are no pair, nor are two that the configuration lets touch; a half space
 of `workspace.inside` is an obstacle like any other. The distance of a pair is the smallest of any solid of one to any
 solid of the other.
 
-Boundary: who is checked against whom; distances are `collision.py` (exact) and `capsules.py` (fast, differentiable).
+Distances are computed by `collision.py` (exact) and `capsules.py` (fast, differentiable).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from ident_service.model.urdf_solids import urdf_solids
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What must stay apart.
+    """Bodies, and pairs of them that must stay apart.
 
     Attributes:
         chain: the mechanism that moves the bodies.
@@ -44,7 +44,7 @@ class Scene:
 
 
 def scene(model: ArmModel) -> Scene:
-    """Everything the configuration and, for links it says nothing about, the URDF say about bodies.
+    """Return the bodies of the configuration and, for links without geometry there, of the URDF.
 
     Raises:
         ModelError: a link that does not exist, or a mesh where capsules are needed.
@@ -90,7 +90,7 @@ def _check_names(model: ArmModel) -> None:
 
 
 def _pairs(chain: Chain, owners: dict[str, list[int]]) -> Iterator[tuple[str, str]]:
-    """Moving link and what it must stay clear of, links before surroundings."""
+    """Yield each moving link with what it must stay clear of, links before surroundings."""
     inner = (BASE, *chain.names)
     for k, name in enumerate(chain.names):
         for other in inner[: k + 1]:

@@ -1,10 +1,10 @@
-"""Smallest distance of lines of finite length to each other, to half spaces and to boxes, for many at once.
+"""Compute the smallest distance of line segments to each other, to half spaces and to boxes, for many at once.
 
 Arrays have their three components first and the samples last: points are of shape (3, pairs, samples). Where along the
 lines the distance is smallest comes back too, because the gradient of a smallest distance is that of the distance
 between those points held fast (envelope theorem).
 
-Boundary: numpy on given end points; what they belong to is `capsules.py`.
+`capsules.py` supplies the end points.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ _TOUCH = 1e-9  # m; what comes nearer to a box may as well be inside it
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Inner products along the first axis."""
+    """Return inner products along the first axis."""
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 def unit(vectors: Array) -> tuple[Array, Array]:
-    """Lengths and directions; a vector of length zero has direction zero."""
+    """Return lengths and directions; a vector of length zero has direction zero."""
     length = np.sqrt(dot(vectors, vectors))
     # Squares of anything shorter underflow.
     return length, vectors * (1.0 / np.maximum(length, 1e-150))
@@ -32,7 +32,7 @@ def unit(vectors: Array) -> tuple[Array, Array]:
 def between_segments(
     start: Array, along: Array, other_start: Array, other_along: Array, squares: Array, other_squares: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Two segments each (Ericson, Real-Time Collision Detection, 5.1.9), parallel ones and points among them.
+    """Return distances between segments (Ericson, Real-Time Collision Detection, 5.1.9), also parallel and degenerate.
 
     Args:
         start: of the first segments [m], shape (3, pairs, samples).
@@ -64,7 +64,7 @@ def _inverse(squares: Array) -> Array:
 
 
 def to_half_spaces(start: Array, along: Array, normal: Array, offset: Array) -> tuple[Array, Array]:
-    """Segments above planes, `normal . x - offset` at the lower end.
+    """Return distances of segments to half spaces, `normal . x - offset` at the lower end.
 
     Args:
         start: [m], shape (3, pairs, samples).
@@ -81,7 +81,7 @@ def to_half_spaces(start: Array, along: Array, normal: Array, offset: Array) -> 
 
 
 def to_boxes(start: Array, along: Array, half: Array) -> tuple[Array, Array, Array]:
-    """Segments and boxes about the origin, along the axes.
+    """Return signed distances of segments to boxes about the origin, along the axes.
 
     Outside, half the slope of the squared distance is linear between the places where the line crosses a face's plane.
     Of a line that enters the box the deepest point counts, whose negative distance to the nearest face is convex too.
@@ -105,7 +105,7 @@ def to_boxes(start: Array, along: Array, half: Array) -> tuple[Array, Array, Arr
 
 
 def _nearest(start: Array, along: Array, half: Array) -> Array:
-    """Where a segment is nearest to a box that it does not enter."""
+    """Return the share along a segment at which it is nearest to a box that it does not enter."""
     moves = np.abs(along) > 1e-12
     inverse = np.where(moves, 1.0, 0.0) / np.where(moves, along, 1.0)
     crossings = np.concatenate([(half - start) * inverse, (-half - start) * inverse])
@@ -125,13 +125,13 @@ def _nearest(start: Array, along: Array, half: Array) -> Array:
 
 
 def _slope(start: Array, along: Array, half: Array, share: Array) -> Array:
-    """Half the derivative of the squared distance to the box along the line."""
+    """Return half the derivative of the squared distance to the box along the line."""
     points = start + along * share
     return dot(points - np.clip(points, -half, half), along)
 
 
 def _deepest(start: Array, along: Array, half: Array) -> tuple[Array, Array, Array]:
-    """As `to_boxes`, of segments that enter their box, shape (3, segments)."""
+    """Return distance, gradient and share, as `to_boxes`, of segments that enter their box, shape (3, segments)."""
     low, high = np.zeros(start.shape[1:]), np.ones(start.shape[1:])
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
@@ -147,7 +147,7 @@ def _deepest(start: Array, along: Array, half: Array) -> tuple[Array, Array, Arr
 
 
 def _box_gradient(points: Array, half: Array) -> tuple[Array, Array]:
-    """Signed distance of points to boxes, and its gradient."""
+    """Return the signed distance of points to boxes, and its gradient."""
     beyond = np.abs(points) - half
     outside = np.maximum(beyond, 0.0)
     length, direction = unit(outside)

@@ -1,6 +1,6 @@
-"""Convex solids, and bodies made of them: capsules, boxes, cylinders and half spaces, in some joint's frame.
+"""Define convex solids, and bodies made of them: capsules, boxes, cylinders and half spaces, in some joint's frame.
 
-Boundary: what they are; whose they are and who must stay clear of whom is `scene.py`.
+`scene.py` assigns them to links and surroundings, and says which pairs must stay apart.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from ident_service.model.chain import Array, rotation_x, rotation_z
 
 @dataclass(frozen=True, eq=False)
 class Capsule:
-    """All points within `radius` of the line from `start` to `end` [m], shape (3,) each."""
+    """Capsule: all points within `radius` of the line from `start` to `end` [m], shape (3,) each."""
 
     start: Array
     end: Array
@@ -23,7 +23,7 @@ class Capsule:
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """A box about `center` with half edges `half` [m], its own frame turned by `rotation`."""
+    """Box about `center` with half edges `half` [m], its own frame turned by `rotation`."""
 
     rotation: Array
     center: Array
@@ -32,7 +32,7 @@ class Box:
 
 @dataclass(frozen=True, eq=False)
 class Cylinder:
-    """A cylinder about the z axis of its own frame, which sits at its `center` [m]."""
+    """Cylinder about the z axis of its own frame, which sits at its `center` [m]."""
 
     rotation: Array
     center: Array
@@ -42,7 +42,7 @@ class Cylinder:
 
 @dataclass(frozen=True, eq=False)
 class HalfSpace:
-    """Points x with `normal . x < offset` [m]; the normal has length one."""
+    """Half space: points x with `normal . x < offset` [m]; the normal has length one."""
 
     normal: Array
     offset: float
@@ -67,7 +67,7 @@ class Body:
 
 
 def turned(roll: float, pitch: float, yaw: float) -> Array:
-    """Rotation by roll, pitch and yaw about fixed axes [rad], `Rz(yaw) Ry(pitch) Rx(roll)`, shape (3, 3)."""
+    """Return the rotation by roll, pitch and yaw about fixed axes [rad], `Rz(yaw) Ry(pitch) Rx(roll)`, shape (3, 3)."""
     # About y as about x, with the axes renamed: x -> y -> z -> x.
     rename = np.eye(3)[[1, 2, 0]]
     return np.asarray(rotation_z(yaw) @ (rename.T @ rotation_x(pitch) @ rename) @ rotation_x(roll))

@@ -1,4 +1,4 @@
-"""Arithmetic written once and run on many samples.
+"""Record arithmetic once as a graph of expressions, and run it on many samples.
 
 A `Tape` records sums and products of symbols, folding what is constant and sharing what is equal; the `Program` it ends
 in runs them on arrays, one numpy call a step, in a workspace small enough for the cache. For the regressor that is
@@ -20,7 +20,7 @@ _BINARY = {"mul": np.multiply, "add": np.add, "sub": np.subtract}
 
 @dataclass(frozen=True, eq=False)
 class Symbol:
-    """A value per sample that a tape knows how to compute."""
+    """Value per sample that a tape knows how to compute."""
 
     tape: Tape
     index: int
@@ -60,22 +60,22 @@ _Operand = int | float | None
 
 
 class Tape:
-    """Records steps; equal steps are recorded once."""
+    """Expression graph: a record of steps; equal steps are recorded once."""
 
     def __init__(self) -> None:
         self.steps: list[tuple[str, _Operand, _Operand]] = []
         self._known: dict[tuple[object, ...], Symbol] = {}
 
     def input(self) -> Symbol:
-        """A value that is given when the program runs, in the order of these calls."""
+        """Record a value that is given when the program runs, in the order of these calls."""
         return self.step("input", len(self.steps), None)
 
     def apply(self, function: str, value: Symbol) -> Symbol:
-        """`sin`, `cos`, `exp`, `abs` or `sign` of a value."""
+        """Record `sin`, `cos`, `exp`, `abs` or `sign` of a value."""
         return self.step(function, value.index, None)
 
     def step(self, operation: str, a: _Operand, b: _Operand) -> Symbol:
-        """One operation on indices of earlier steps (int) or constants (float)."""
+        """Record one operation on indices of earlier steps (int) or constants (float)."""
         # The types tell step 2 from the constant 2.0, which are equal.
         key = (operation, a, type(a), b, type(b))
         if (known := self._known.get(key)) is None:
@@ -85,7 +85,7 @@ class Tape:
 
 
 class Program:
-    """A finished tape with the values that it is for."""
+    """Executable plan of a tape for given outputs."""
 
     def __init__(self, tape: Tape, outputs: Sequence[Value]) -> None:
         """Plan the run: which steps are needed, and which may use the same memory one after another.
@@ -143,11 +143,11 @@ class Program:
 
     @property
     def steps(self) -> int:
-        """Numpy calls per run."""
+        """Return the number of numpy calls per run."""
         return len(self._plan)
 
     def run(self, inputs: Sequence[Array], output: Sequence[Array]) -> None:
-        """Compute.
+        """Compute the outputs for arrays of inputs.
 
         Args:
             inputs: arrays of one shape, in the order of `Tape.input` calls.
@@ -168,13 +168,13 @@ class Program:
 
 
 def operands_of(tape: Tape, at: int) -> list[int]:
-    """The earlier steps that a step is made of."""
+    """Return the earlier steps that a step is made of."""
     operation, a, b = tape.steps[at]
     return [] if operation == "input" else [value for value in (a, b) if isinstance(value, int)]
 
 
 def needed_steps(tape: Tape, wanted: list[int]) -> list[int]:
-    """Steps that the wanted ones depend on, in order."""
+    """Return the steps that the wanted ones depend on, in order."""
     found: set[int] = set()
     waiting = list(wanted)
     while waiting:

@@ -1,4 +1,4 @@
-"""Enclosures over short stretches of time: what a tape computes, between samples too.
+"""Enclose the values of a tape over short stretches of time, between samples too, by Taylor models.
 
 A value on the stretch `|s| <= h` about a sample is `x(s) = c + d s + rho` with `|rho| <= r`: value and time derivative
 at the sample, and a bound of everything else (a Taylor model of first order: Makino and Berz 2003). Sums, products and
@@ -23,7 +23,7 @@ _CHUNK = 2048
 
 @dataclass(frozen=True)
 class Taylor:
-    """A value on many stretches of time; all arrays of shape (stretches,).
+    """Taylor model of a value on many stretches of time; all arrays of shape (stretches,).
 
     Attributes:
         c: value in the middle.
@@ -39,22 +39,22 @@ class Taylor:
 
     @property
     def reach(self) -> Array:
-        """How far the value may be from `c`."""
+        """Return the largest distance of the value from `c`."""
         return np.asarray(np.abs(self.d) * self.h + self.r)
 
     @property
     def size(self) -> Array:
-        """The largest that `|x|` can be."""
+        """Return the largest that `|x|` can be."""
         return np.asarray((np.abs(self.c) + self.reach) * (1.0 + _ROUNDING))
 
     @property
     def highest(self) -> Array:
-        """The largest that x can be."""
+        """Return the largest that x can be."""
         return np.asarray(self.c + self.reach + _ROUNDING * np.abs(self.c))
 
     @property
     def lowest(self) -> Array:
-        """The smallest that x can be."""
+        """Return the smallest that x can be."""
         return np.asarray(self.c - self.reach - _ROUNDING * np.abs(self.c))
 
     def __add__(self, other: Taylor) -> Taylor:
@@ -72,15 +72,15 @@ class Taylor:
         return Taylor(self.c * other.c, self.c * other.d + self.d * other.c, r, self.h)
 
     def shifted(self, constant: float) -> Taylor:
-        """This plus a number."""
+        """Return the sum of this value and a number."""
         return Taylor(self.c + constant, self.d, self.r, self.h)
 
     def scaled(self, constant: float) -> Taylor:
-        """This times a number."""
+        """Return the product of this value and a number."""
         return Taylor(self.c * constant, self.d * constant, self.r * abs(constant), self.h)
 
     def function(self, name: str) -> Taylor:
-        """`sin`, `cos`, `exp`, `abs`, `sign` or `neg` of this."""
+        """Return `sin`, `cos`, `exp`, `abs`, `sign` or `neg` of this value."""
         reach = self.reach
         if name == "neg":
             return -self
@@ -103,7 +103,7 @@ class Taylor:
 
 
 def enclose(tape: Tape, inputs: Sequence[Taylor], outputs: Sequence[Value]) -> list[Taylor]:
-    """Run a tape on enclosures.
+    """Run a tape on enclosures and return the enclosures of its outputs.
 
     Args:
         tape: what was recorded.

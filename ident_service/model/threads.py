@@ -1,4 +1,4 @@
-"""One BLAS thread where matrices are small.
+"""Limit BLAS to one thread where matrices are small.
 
 A QR of a thousand rows by seventy gains nothing from a second thread, and loses a factor of ten when another process
 wants the same core, because BLAS threads wait by spinning.
@@ -21,10 +21,10 @@ def _controller() -> ThreadpoolController:
 
 
 class one_blas_thread(ContextDecorator):  # noqa: N801  # used as a decorator and in `with`, like contextlib's own
-    """Limits BLAS to one thread inside a `with` block or a decorated function."""
+    """Limit BLAS to one thread inside a `with` block or a decorated function."""
 
     def __enter__(self) -> Self:
-        """Limit."""
+        """Limit BLAS to one thread."""
         self._limit: Any = _controller().limit(limits=1, user_api="blas")
         self._limit.__enter__()
         return self
@@ -32,7 +32,7 @@ class one_blas_thread(ContextDecorator):  # noqa: N801  # used as a decorator an
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Restore."""
+        """Restore the earlier limit."""
         self._limit.__exit__(kind, error, trace)
 
     def _recreate_cm(self) -> Self:

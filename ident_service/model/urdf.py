@@ -1,4 +1,4 @@
-"""A chain with parameters as URDF: link frames are joint frames, inertias about centres of mass, no meshes.
+"""Write a chain with parameters as URDF: link frames are joint frames, inertias about centres of mass, no meshes.
 
 URDF has viscous damping and Coulomb friction per joint, written where a joint has a drive of its own and they are not
 negative; drive inertia and torque offset have no place in it and stay in the parameter file.
@@ -19,7 +19,7 @@ BASE_LINK = "base_link"
 
 
 def urdf_text(model: ArmModel, delta: Array | None) -> str:
-    """The arm as URDF.
+    """Return the arm as URDF text.
 
     Args:
         model: the mechanism and its limits.
@@ -101,7 +101,7 @@ def _numbers(values: Array) -> str:
 
 
 def roll_pitch_yaw(rotation: Array) -> Array:
-    """URDF's fixed-axis angles [rad]: R = Rz(yaw) Ry(pitch) Rx(roll); exact near gimbal lock too."""
+    """Return URDF's fixed-axis angles [rad]: R = Rz(yaw) Ry(pitch) Rx(roll); exact near gimbal lock too."""
     yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
     # Roll and pitch of what is left after that very yaw, so that where it is arbitrary, they make up for it.
     c, s = np.cos(yaw), np.sin(yaw)

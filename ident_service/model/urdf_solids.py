@@ -1,4 +1,4 @@
-"""Primitive `<collision>` geometry of a URDF's links.
+"""Read primitive `<collision>` geometry of a URDF's links.
 
 The text is read again here, after pinocchio has accepted it: urdfdom drops all collision elements of a link silently
 when it cannot read one of them, and knows no capsules. Where links sit is pinocchio's word, fixed joints merged.
@@ -21,7 +21,7 @@ from ident_service.model.solids import Body, Box, Capsule, Cylinder, Solid, turn
 
 
 def urdf_solids(kinematics: Kinematics, chain: Chain, skip: frozenset[str]) -> list[Body]:
-    """The solids of all links but some.
+    """Return the solids of all links but those in `skip`.
 
     Args:
         kinematics: the URDF that the chain was read from, and which part of it is the arm.
@@ -58,7 +58,7 @@ def urdf_solids(kinematics: Kinematics, chain: Chain, skip: frozenset[str]) -> l
 
 
 def solid_of(collision: ET.Element, rotation: Array, center: Array, owner: str, where: str) -> Solid:
-    """Give the solid of a collision element that is placed so in its joint's frame; `owner` and `where` for errors.
+    """Return the solid of a collision element at a placement in its joint's frame; `owner` and `where` for errors.
 
     Raises:
         ModelError: a mesh, or a shape or number that cannot be read.
@@ -87,7 +87,7 @@ def solid_of(collision: ET.Element, rotation: Array, center: Array, owner: str, 
 
 
 def origin_of(origin: ET.Element | None, where: str) -> pin.SE3:
-    """Give the placement that an `<origin>` says, the identity without one; ModelError where it cannot be read."""
+    """Return the placement of an `<origin>`, the identity without one; ModelError where it cannot be read."""
     if origin is None:
         return pin.SE3.Identity()
     return pin.SE3(

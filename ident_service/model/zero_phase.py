@@ -1,4 +1,4 @@
-"""Zero-phase low-pass and local polynomials, as `sosfiltfilt` and `savgol_filter` of scipy.signal compute them.
+"""Filter with zero phase and fit local polynomials, as scipy.signal's `sosfiltfilt` and `savgol_filter` do.
 
 Loading scipy.signal, which brings scipy.stats, interpolate, ndimage and spatial, takes half a second. That is more than
 identifying an arm from a minute of recording, and every verb that looks at positions would pay it. A recursive filter
@@ -97,7 +97,7 @@ def local_polynomial(values: Array, length: int, degree: int, derivative: int, p
         values: shape (samples, ...), at least `length` samples.
         length: samples of a window, odd and more than `degree`.
         degree: of the polynomial.
-        derivative: which, 0 for the value itself.
+        derivative: its order, 0 for the value itself.
         period: of the samples [s].
 
     Returns:
@@ -116,7 +116,7 @@ def local_polynomial(values: Array, length: int, degree: int, derivative: int, p
     factors = np.array([math.perm(int(power), derivative) for power in powers]) / (max(half, 1) * period) ** derivative
 
     def at(places: Array) -> Array:
-        """Weights of a window's samples for the derivative at places in it, shape (places, length)."""
+        """Return weights of a window's samples for the derivative at places in it, shape (places, length)."""
         return (np.vander(places, len(powers), increasing=True) * factors) @ to_coefficients[derivative:]
 
     columns = np.asarray(values, dtype=float).reshape(len(values), -1)
@@ -127,6 +127,6 @@ def local_polynomial(values: Array, length: int, degree: int, derivative: int, p
 
 
 def widened(marks: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
-    """Mark every sample that is at most `reach` samples from a marked one, shape (samples, columns)."""
+    """Return marks on every sample that is at most `reach` samples from a marked one, shape (samples, columns)."""
     counts = np.cumsum(np.pad(marks, ((reach + 1, reach), (0, 0))), axis=0)
     return np.asarray(counts[2 * reach + 1 :] > counts[: len(marks)])

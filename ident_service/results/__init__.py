@@ -1,4 +1,4 @@
-"""Results: the parameter file, exports and the run folder."""
+"""Read and write results: parameter file, exports, report and run folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether the values in a parameter file agree with each other; one that was edited by hand often does not.
+"""Check that the values in a parameter file agree with each other; after edits by hand they often do not.
 
 Pure computation, no I/O; what the values say of an arm is each reader's business.
 """
@@ -16,11 +16,11 @@ from ident_service.results.parameter_file import ParameterFile
 
 AGREEMENT = 1e-9
 """Largest difference between base values and those of the link values, relative to the largest base value."""
-_LARGEST = 1e30  # of any value in SI units; far beyond every arm, and squares of it are numbers still
+_LARGEST = 1e30  # largest value in SI units; far beyond every arm, and its square is still finite
 
 
 def require_consistent(file: ParameterFile, where: Path) -> None:
-    """See that the values of a parameter file belong together.
+    """Check that the values of a parameter file belong together.
 
     Args:
         file: what was read.
@@ -52,7 +52,7 @@ def require_consistent(file: ParameterFile, where: Path) -> None:
 
 
 def named_link_values(file: ParameterFile) -> dict[str, float] | None:
-    """Link values by name; None where there are none, or names and values are not equally many."""
+    """Return link values by name; None where there are none, or names and values are not equally many."""
     table = file.content.get("link_parameters")
     if table is None or len(table["names"]) != len(table["values"]):
         return None
@@ -60,7 +60,7 @@ def named_link_values(file: ParameterFile) -> dict[str, float] | None:
 
 
 def require_base_values(base: BaseParameters, delta: Array, values: Array, where: Path) -> None:
-    """See that link values have the base values.
+    """Check that link values have the base values.
 
     Args:
         base: the grouping.

@@ -1,8 +1,7 @@
-"""A small SVG pencil: canvas, axes, round numbers, and lines thinned to what a pixel shows.
+"""Draw SVG: canvas, axes, round numbers, and lines thinned to what a pixel shows.
 
 A drawing is one self-contained text: no script, no font, no identifier that could clash inside a larger page. What the
-kinds of shape look like is in `drawing_style.py`. Boundary: numbers in, text out; what is drawn is the figures'
-business (`motion_figures.py`, `posture_figure.py`).
+kinds of shape look like is in `drawing_style.py`.
 """
 
 from __future__ import annotations
@@ -22,12 +21,12 @@ LARGEST = 1e12  # beyond any quantity of an arm; pixels could not be computed fr
 
 
 def plain(text: str) -> str:
-    """Text as XML content or attribute: quoted, and without the characters that XML 1.0 (2.2) does not have."""
+    """Return text as XML content or attribute: quoted, without characters that XML 1.0 (2.2) does not have."""
     return html.escape(re.sub("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "\ufffd", text))
 
 
 def number(value: float, digits: int = 3) -> str:
-    """A number for people, with a real minus sign."""
+    """Format a number for people, with a real minus sign."""
     text = f"{value:.{digits}g}"
     if "e+" in text and abs(value) < 1e6:
         text = f"{value:.0f}"
@@ -40,50 +39,50 @@ def _pixel(value: float) -> str:
 
 
 def points_of(x: Array, y: Array) -> str:
-    """Coordinates of a polyline or polygon [px]."""
+    """Return the coordinates of a polyline or polygon [px]."""
     return " ".join(f"{_pixel(a)},{_pixel(b)}" for a, b in zip(x.tolist(), y.tolist(), strict=True))
 
 
 class Canvas:
-    """Collects the shapes of one drawing."""
+    """Shapes of one drawing."""
 
     def __init__(self, width: float, height: float) -> None:
         self._width, self._height = _pixel(width), _pixel(height)
         self._parts: list[str] = []
 
     def rectangle(self, kind: str, left: float, top: float, width: float, height: float) -> None:
-        """A rectangle [px]."""
+        """Draw a rectangle [px]."""
         size = f'width="{_pixel(width)}" height="{_pixel(height)}"'
         self._parts.append(f'<rect class="{kind}" x="{_pixel(left)}" y="{_pixel(top)}" {size}/>')
 
     def line(self, kind: str, x1: float, y1: float, x2: float, y2: float, width: float | None = None) -> None:
-        """A line [px], as wide as its kind or as `width` says."""
+        """Draw a line [px], as wide as its kind or as `width` says."""
         more = "" if width is None else f' stroke-width="{_pixel(width)}"'
         ends = f'x1="{_pixel(x1)}" y1="{_pixel(y1)}" x2="{_pixel(x2)}" y2="{_pixel(y2)}"'
         self._parts.append(f'<line class="{kind}" {ends}{more}/>')
 
     def polyline(self, kind: str, x: Array, y: Array) -> None:
-        """A line through points [px], each of shape (points,)."""
+        """Draw a line through points [px], each of shape (points,)."""
         self._parts.append(f'<polyline class="{kind}" points="{points_of(x, y)}"/>')
 
     def polygon(self, kind: str, x: Array, y: Array) -> None:
-        """A closed line through points [px], each of shape (points,)."""
+        """Draw a closed line through points [px], each of shape (points,)."""
         self._parts.append(f'<polygon class="{kind}" points="{points_of(x, y)}"/>')
 
     def circle(self, kind: str, x: float, y: float, radius: float) -> None:
-        """A disc [px]."""
+        """Draw a disc [px]."""
         self._parts.append(f'<circle class="{kind}" cx="{_pixel(x)}" cy="{_pixel(y)}" r="{_pixel(radius)}"/>')
 
     def text(
         self, kind: str, x: float, y: float, words: str, *, size: float = 11.0, anchor: str = "start", hint: str = ""
     ) -> None:
-        """One line of text; `hint` appears where a pointer rests on it."""
+        """Draw one line of text; `hint` appears where a pointer rests on it."""
         title = f"<title>{plain(hint)}</title>" if hint else ""
         where = f'x="{_pixel(x)}" y="{_pixel(y)}" font-size="{_pixel(size)}" text-anchor="{anchor}"'
         self._parts.append(f'<text class="{kind}" {where}>{title}{plain(words)}</text>')
 
     def clip(self, axes: Axes | None) -> None:
-        """Show what follows only inside axes, until it is called with None."""
+        """Clip what follows to axes, until it is called with None."""
         if axes is None:
             self._parts.append("</svg>")
             return
@@ -93,7 +92,7 @@ class Canvas:
         self._parts.append(f"<svg {where}>")
 
     def svg(self, title: str, description: str, *, inline: bool = False) -> str:
-        """The whole drawing.
+        """Return the whole drawing.
 
         Args:
             title: what a screen reader says first.
@@ -113,7 +112,7 @@ class Canvas:
 
 @dataclass(frozen=True)
 class Axes:
-    """A rectangle of the canvas [px] that shows a range of two quantities, the second one upwards."""
+    """Rectangle of the canvas [px] that shows a range of two quantities, the second one upwards."""
 
     left: float
     top: float
@@ -125,16 +124,16 @@ class Axes:
     high_y: float
 
     def x(self, value: Array | float) -> Array:
-        """Pixels from the left."""
+        """Return pixels from the left."""
         return np.asarray(self.left + self.width * (np.asarray(value) - self.low_x) / (self.high_x - self.low_x))
 
     def y(self, value: Array | float) -> Array:
-        """Pixels from the top."""
+        """Return pixels from the top."""
         return np.asarray(self.top + self.height * (self.high_y - np.asarray(value)) / (self.high_y - self.low_y))
 
 
 def round_values(low: float, high: float, most: int) -> list[float]:
-    """At most `most` + 1 round numbers between two numbers, evenly spaced by 1, 2 or 5 times a power of ten."""
+    """Return at most `most` + 1 round numbers between two numbers, evenly spaced by 1, 2 or 5 times a power of ten."""
     step = 10.0 ** np.floor(np.log10((high - low) / most))
     step = next(step * factor for factor in (1.0, 2.0, 5.0, 10.0) if step * factor * most >= (high - low) * (1 - 1e-9))
     first = np.ceil(low / step - 1e-9)
@@ -142,7 +141,7 @@ def round_values(low: float, high: float, most: int) -> list[float]:
 
 
 def visible(time: Array, values: Array, columns: int) -> NDArray[np.intp]:
-    """Which samples a line needs so that it looks like the line through all of them.
+    """Return the samples that a line needs so that it looks like the line through all of them.
 
     Args:
         time: increasing, shape (samples,).
@@ -163,7 +162,7 @@ def visible(time: Array, values: Array, columns: int) -> NDArray[np.intp]:
 
 
 def require_drawable(name: str, values: Array, shape: tuple[int, ...], *, unlimited: bool = False) -> None:
-    """Refuse what no pixel can be computed from.
+    """Refuse values that cannot be drawn.
 
     Args:
         name: what the values are, for the message.

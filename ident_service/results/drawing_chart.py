@@ -1,7 +1,4 @@
-"""Charts: a frame with round numbers around a range of two quantities, straight or in powers of ten.
-
-Boundary: numbers in, shapes on a canvas out; what is charted is the report's business.
-"""
+"""Draw charts: a frame with round numbers around a range of two quantities, linear or logarithmic."""
 
 from __future__ import annotations
 
@@ -17,7 +14,7 @@ _FEWEST, _MOST = 3, 6  # round numbers along an axis
 
 
 def range_around(*values: Array, least: float = 0.0, zero: bool = False, share: float = 0.06) -> tuple[float, float]:
-    """A range that holds all finite values with room for the lines' own width.
+    """Return a range that holds all finite values with room for the lines' own width.
 
     Args:
         values: of any shapes.
@@ -45,7 +42,7 @@ def draw_frame(
     y_log: bool = False,
     y_ticks: Sequence[tuple[float, str]] | None = None,
 ) -> None:
-    """Grid, frame, ticks and names of both quantities.
+    """Draw grid, frame, ticks and names of both quantities.
 
     Args:
         canvas: to draw on.
@@ -74,7 +71,7 @@ def draw_frame(
 
 
 def draw_key(canvas: Canvas, right: float, y: float, entries: Sequence[tuple[str, str, str]]) -> None:
-    """What colours and strokes mean, in one row that ends at `right` [px].
+    """Draw a legend of colours and strokes, in one row that ends at `right` [px].
 
     Args:
         canvas: to draw on.

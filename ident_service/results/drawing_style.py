@@ -1,7 +1,6 @@
-"""What the kinds of shape look like, in light and in dark: one style sheet that travels inside every drawing.
+"""Style the kinds of shape in drawings, light and dark, by one sheet that travels inside every drawing.
 
 Colours follow Okabe and Ito, "Color Universal Design" (2008), so that no meaning hangs on telling red from green.
-Boundary: names of kinds to CSS.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from collections.abc import Iterable, Sequence
 
 STEPS = 8  # shades from early to late
 
-# What a browser shows where it knows no dark mode, and every other program.
+# Light colours, for every program without a dark mode.
 _LIGHT = {
     "ground": "fill:#ffffff",
     "ink": "fill:#1f2328",
@@ -108,12 +107,12 @@ _SHAPES = {
 
 
 def style() -> str:
-    """The sheet as an SVG element; who prefers dark gets it."""
+    """Return the style sheet as an SVG element; readers who prefer dark get the dark colours."""
     return f"<style>{sheet()}</style>"
 
 
 def sheet() -> str:
-    """The sheet as CSS, for a page that holds many drawings."""
+    """Return the style sheet as CSS, for a page that holds many drawings."""
 
     def rules(rows: Iterable[tuple[str, str]]) -> str:
         # Everything below one class: a style inside an SVG would otherwise reach the page around it.

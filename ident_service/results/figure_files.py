@@ -1,4 +1,4 @@
-"""The drawings of a report as files of their own: SVG, which is what they are, or PNG by an optional library.
+"""Write the drawings of a report as files of their own: SVG, or PNG by an optional library.
 
 PNG comes from resvg, which renders the same SVG: there is no second way of drawing. It draws text with the fonts of the
 machine; where there are none it would leave the text out without a word, so that is looked at first.
@@ -47,7 +47,7 @@ def write_figures(run: Path, out: Path, form: Literal["svg", "png"]) -> list[str
 
 
 def _png() -> Callable[[str], bytes]:
-    """What makes PNG of SVG."""
+    """Return the function that renders SVG as PNG."""
     try:
         import resvg_py
     except ImportError:

@@ -1,4 +1,4 @@
-"""Files appear whole or not at all."""
+"""Write files and folders so that they appear whole or not at all."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def require_place(folder: Path) -> None:
 
 @contextmanager
 def appearing_folder(folder: Path) -> Iterator[Path]:
-    """A place to build a folder's content in; it appears under its name when the block ends without an error.
+    """Yield a place to build a folder's content in, which gets its name when the block ends without an error.
 
     A folder that exists keeps its other files; files of the same name are replaced one by one.
 
@@ -52,7 +52,7 @@ def appearing_folder(folder: Path) -> Iterator[Path]:
 
 @contextmanager
 def staging_beside(folder: Path) -> Iterator[Path]:
-    """A place beside a folder to build its content in; gone with what is in it after an error.
+    """Yield a place beside a folder to build its content in; removed with its content after an error.
 
     Raises:
         UsageError: the folder's place cannot be written, or is a file.

@@ -1,4 +1,4 @@
-"""The information of a fit as JSON values: per joint, the triangle of `[H_b | tau]` (eqs. 64-70).
+"""Convert the information of a fit to and from JSON: per joint, the triangle of `[H_b | tau]` (eqs. 64-70).
 
 With it, a parameter file can be asked without its recording how well other parameters explain the same torques, and
 what a change of parameters does to them.
@@ -15,7 +15,7 @@ from ident_service.model.information import Information
 
 
 def information_document(information: Information) -> list[dict[str, Any]]:
-    """One entry per joint: equations, the base parameters it feels (from 0), its triangle row by row."""
+    """Return one entry per joint: equations, the base parameters it feels (from 0), its triangle row by row."""
     joints = []
     for support, factor, rows in zip(information.supports, information.factors, information.rows, strict=True):
         size = len(support) + 1
@@ -27,7 +27,7 @@ def information_document(information: Information) -> list[dict[str, Any]]:
 
 
 def information_from(joints: list[dict[str, Any]], base: int) -> Information:
-    """The inverse of `information_document`.
+    """Return the information of a document, the inverse of `information_document`.
 
     Args:
         joints: as it was written.

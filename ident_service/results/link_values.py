@@ -1,8 +1,8 @@
-"""Say which link values no such link is likely to have: information, no verdict, as no torque depends on them.
+"""Name implausible link values, as information without a verdict: no torque depends on them.
 
 Motion shows base parameters; of the bodies behind them one near to likely bodies is chosen (`model/likely_bodies.py`).
 Where data press against the feasible set, little is left to choose from, and a link may come out as heavy as the arm or
-as a point beside it. Who reads a mass in a URDF should be told.
+as a point beside it. Readers of a mass in a URDF should know.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from ident_service.estimation.identify import Estimate
 from ident_service.model.likely_bodies import likely_bodies, lines_of
 from ident_service.results.evidence.bodies import ellipsoid
 
-MASSES = 10.0  # times a likely mass, or a part of it
+MASSES = 10.0  # factor above or below a likely mass
 _REACH = 1.0 / 3.0  # of the arm's, from a likely centre, or the link's own length
 _SIZE, _TIMES = 0.5, 3.0  # of the arm's reach, and times a likely size
 
@@ -24,7 +24,7 @@ WHAT_THEN = (
 
 
 def implausible_links(estimate: Estimate) -> tuple[str, ...]:
-    """Name the links whose chosen values are implausible: which value, and beside which bound.
+    """Return the links whose chosen values are implausible: which value, and beside which bound.
 
     Args:
         estimate: with link values; one without, or with values that a prior or custom knowledge asked for, has none

@@ -1,4 +1,4 @@
-"""From identified parameters on disk to a model that computes: what `ident_service.results.load_model` does."""
+"""Load identified parameters from disk as a dynamic model, for `ident_service.results.load_model`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ident_service.results.run_folder import ARM, MANIFEST, PARAMETERS
 
 
 def dynamic_model(path: Path, arm: str | Path | None) -> DynamicModel:
-    """See `ident_service.results.load_model`."""
+    """Load the dynamic model of identified parameters; see `ident_service.results.load_model`."""
     found = _identified(path, arm)
     if found.delta is None:
         raise ModelError(
@@ -46,7 +46,7 @@ def _identified(path: Path, arm: str | Path | None) -> IdentifiedArm:
 
 
 def _as_identified(config: ArmConfig, content: dict[str, object], joints: int) -> ArmConfig:
-    """The arm with the friction's shape that a parameter file was fitted with."""
+    """Return the arm with the friction's shape that a parameter file was fitted with."""
     friction = content.get("friction")
     known = friction if isinstance(friction, dict) else {}
     fitted = {

@@ -1,7 +1,6 @@
-"""The manifest of a folder: name and SHA-256 of every file in it.
+"""Write and verify the manifest of a folder: name and SHA-256 of every file in it.
 
-Nothing is believed of a folder that is read before every file has the hash that its manifest names. Boundary: files and
-hashes; what the files mean is `run_folder.py`.
+Nothing is believed of a folder that is read before every file has the hash that its manifest names.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ _REMEDY = "identify again, or copy the folder again"
 
 
 def named_files(folder: Path) -> Mapping[str, str]:
-    """Name to SHA-256, as the manifest says; no file is read but the manifest.
+    """Return name to SHA-256, as the manifest says; no file is read but the manifest.
 
     Raises:
         UsageError: no such folder, or no manifest in it.
@@ -53,7 +52,7 @@ def named_files(folder: Path) -> Mapping[str, str]:
 
 
 def verified_files(folder: Path, *, but: frozenset[str] = frozenset()) -> Mapping[str, str]:
-    """Name to SHA-256, each found to be true of a file of its own, not of a link.
+    """Return name to SHA-256, each verified on a regular file, not on a link.
 
     Args:
         folder: to be read.
@@ -77,13 +76,13 @@ def verified_files(folder: Path, *, but: frozenset[str] = frozenset()) -> Mappin
 
 
 def file_sha256(path: Path) -> str:
-    """SHA-256 of a file's content."""
+    """Return the SHA-256 of a file's content."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def write_manifest(folder: Path) -> None:
-    """Name and SHA-256 of every file in the folder, for verification on another machine."""
+    """Write name and SHA-256 of every file in the folder, for verification on another machine."""
     manifest = {
         "format": "ident-run",
         "version": 1,
@@ -94,6 +93,6 @@ def write_manifest(folder: Path) -> None:
 
 
 def hashes(folder: Path) -> dict[str, str]:
-    """Name to SHA-256 of every file in a folder but its manifest and hidden ones."""
+    """Return name to SHA-256 of every file in a folder but its manifest and hidden ones."""
     paths = [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")]
     return {path.name: file_sha256(path) for path in paths if path.name != MANIFEST}

@@ -1,8 +1,7 @@
-"""What a motion asks of every joint over time, drawn against the joint's limits.
+"""Draw position, velocity, acceleration and torque of every joint over time, against the joint's limits.
 
 One row per joint, one column per quantity. Every panel reaches from limit to limit, so that equal heights are equal
-shares of what is allowed and a joint close to its limits is seen at once. Boundary: arrays in, SVG text out; the
-pencil is `drawing.py`.
+shares of what is allowed and a joint close to its limits is seen at once.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ _LONGEST_NAME = 20
 
 @dataclass(frozen=True)
 class MotionTraces:
-    """A motion of all joints, sampled, and what the joints may do.
+    """Sampled motion of all joints, with their limits.
 
     Limits are optional, as a whole (None) or for single joints (infinite or huge): there is then no line, and no share.
 
@@ -63,7 +62,7 @@ class MotionTraces:
     ramps: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be drawn.
+        """Refuse a motion that cannot be drawn.
 
         Raises:
             UsageError: nothing to draw, shapes that do not belong together, values that are no numbers, time that does
@@ -92,20 +91,20 @@ class MotionTraces:
             raise UsageError(f"cannot draw a motion: a ramp begins before it ends, unlike one of {self.ramps}")
 
     def limits(self, quantity: str) -> tuple[Array, Array]:
-        """Lowest and highest value allowed, each of shape (joints,); infinite where there is no limit."""
+        """Return lowest and highest value allowed, each of shape (joints,); infinite where there is no limit."""
         if quantity == "position":
             return -self._limit(self.lower, -1.0), self._limit(self.upper, 1.0)
         limit = self._limit(getattr(self, f"{quantity}_limit"), 1.0)
         return -limit, limit
 
     def _limit(self, limit: Array | None, sign: float) -> Array:
-        """How far in one direction, shape (joints,)."""
+        """Return a limit times `sign`, infinite where there is none, shape (joints,)."""
         if limit is None:
             return np.full(len(self.names), np.inf)
         return np.where(sign * limit >= LARGEST, np.inf, sign * limit)
 
     def shares(self, quantity: str) -> Array:
-        """Largest share of the way from the middle to a limit, shape (joints,).
+        """Return the largest share of the way from the middle to a limit, shape (joints,).
 
         1 is at a limit. NaN where a joint has no limits on both sides, or the quantity is not given.
         """
@@ -119,7 +118,7 @@ class MotionTraces:
 
 
 def joints_over_time(traces: MotionTraces, title: str = "Motion of the joints") -> str:
-    """Small multiples: one row per joint; position, velocity, acceleration and torque over time as far as given.
+    """Draw position, velocity, acceleration and torque over time as far as given, one row per joint.
 
     Args:
         traces: the motion and its limits.
@@ -192,7 +191,7 @@ def _panel(canvas: Canvas, traces: MotionTraces, quantity: str, joint: int, left
 
 
 def _range(values: Array, low: float, high: float) -> tuple[float, float]:
-    """From limit to limit, or as far as the values go, with room for the lines' own width."""
+    """Return the range from limit to limit, or as far as the values go, with room for the lines' own width."""
     reach = [float(values.min()), float(values.max()), *(limit for limit in (low, high) if np.isfinite(limit))]
     lowest, highest = min(reach), max(reach)
     if highest - lowest <= 1e-9 * max(abs(lowest), abs(highest)):
@@ -203,7 +202,7 @@ def _range(values: Array, low: float, high: float) -> tuple[float, float]:
 
 
 def _ticks(axes: Axes, low: float, high: float) -> Iterator[float]:
-    """The limits, and as many round values between them as can be read."""
+    """Yield the limits, and as many round values between them as can be read."""
     taken = [float(axes.y(limit)) for limit in (low, high) if np.isfinite(limit)]
     yield from (limit for limit in (low, high) if np.isfinite(limit))
     candidates = [0.0] if taken and axes.low_y < 0.0 < axes.high_y else round_values(axes.low_y, axes.high_y, 5)
@@ -214,7 +213,7 @@ def _ticks(axes: Axes, low: float, high: float) -> Iterator[float]:
 
 
 def _summary(traces: MotionTraces, given: list[str]) -> str:
-    """The largest share of every quantity and whose it is."""
+    """Return the largest share of every quantity and its joint, in words."""
     parts = []
     for quantity in given:
         shares = traces.shares(quantity)
@@ -225,7 +224,7 @@ def _summary(traces: MotionTraces, given: list[str]) -> str:
 
 
 def _percent(share: float) -> str:
-    """Whole percents, rounded so that a limit is never crossed or reached by rounding alone."""
+    """Format whole percents, rounded so that a limit is never crossed or reached by rounding alone."""
     percent = 100.0 * share
     if 0.0 < percent < 0.5:
         return "< 1 %"

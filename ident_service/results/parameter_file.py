@@ -1,4 +1,4 @@
-"""`parameters.json`: written from an estimate, read from anywhere, always held against its schema (conventions).
+"""Write `parameters.json` from an estimate, and read it from anywhere, always validated against its schema.
 
 Only the expressions and their values are required to read one, so that any paper's table can be tested.
 """
@@ -45,7 +45,7 @@ _TABLE = (
 
 @dataclass(frozen=True)
 class ParameterFile:
-    """A parameter file that has been read.
+    """Parameter file that has been read.
 
     Attributes:
         base: the grouping its expressions define; link parameters that no expression names are free.
@@ -132,7 +132,7 @@ def _require_document(content: Any, path: Path) -> None:
 
 
 def parameters_document(estimate: Estimate, described: ArmConfig | None = None) -> dict[str, Any]:
-    """Make the content of `parameters.json` for an estimate, its feasibility certified in exact arithmetic.
+    """Return the content of `parameters.json` for an estimate, its feasibility certified in exact arithmetic.
 
     Args:
         estimate: what was identified.
@@ -230,7 +230,7 @@ def parameters_document(estimate: Estimate, described: ArmConfig | None = None) 
 
 
 def convex_document(estimate: Estimate) -> dict[str, Any]:
-    """State as JSON values what was solved through cvxpy: custom knowledge and the second opinion, where there are."""
+    """Return results through cvxpy as JSON values: custom knowledge and the second opinion, where there are."""
     document: dict[str, Any] = {}
     if (known := estimate.custom) is not None:
         document["custom"] = {
@@ -265,7 +265,7 @@ def _changes(config: ArmConfig, described: ArmConfig | None) -> dict[str, Any]:
 
 
 def write_parameters(path: Path, document: dict[str, Any]) -> None:
-    """Write a parameter document after holding it against the schema; floats round-trip.
+    """Write a parameter document after validating it against the schema; floats round-trip.
 
     Raises:
         ParameterError: the document does not fit the schema.
@@ -276,7 +276,7 @@ def write_parameters(path: Path, document: dict[str, Any]) -> None:
 
 
 def _names_in(expressions: tuple[str, ...], printed: Sequence[str]) -> tuple[str, ...]:
-    """List the ten of every link up to the highest number, with the joint terms that expressions mention."""
+    """Return the ten parameter names of every link up to the highest number, with the joint terms mentioned."""
     mentioned = {name for expression in expressions for name in parse_expression(expression)}
     try:
         found = {split_name(name) for name in sorted(mentioned)}
@@ -314,7 +314,7 @@ def _errors(error: TorqueError, names: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _commit() -> str | None:
-    """Commit of the source this runs from, where it runs from a checkout."""
+    """Return the commit of the source this runs from; None where it is no checkout."""
     root = Path(__file__).parent.parent.parent
     if not (root / ".git").exists():
         return None

@@ -1,4 +1,4 @@
-"""A payload as JSON held against its schema, as words, and as the parameters of the arm that carries it."""
+"""Present a payload as JSON validated by its schema, as text, and as the parameters of the arm that carries it."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _WORDS: Mapping[Word, tuple[str, str]] = {
     ),
 }
 _ROUNDING = 1e-12  # of the largest value of a quantity; less is printed as zero
-# What no longer holds for an arm with a load, or is about other recordings.
+# Entries that no longer hold for an arm with a load, or are about other recordings.
 _OF_ARM_ALONE = (
     "white_standard_deviations",
     "noise_standard_deviations",
@@ -50,7 +50,7 @@ _STALE = ("bootstrap", "essential", "recording_quality", "validation", "fit", "i
 
 
 def payload_document(payload: Payload, arm: KnownArm, arm_sha256: str, recordings: Sequence[Mapping[str, str]]) -> Any:
-    """The content of `payload.json`.
+    """Return the content of `payload.json`.
 
     Args:
         payload: what was found.
@@ -105,7 +105,7 @@ def payload_document(payload: Payload, arm: KnownArm, arm_sha256: str, recording
 
 
 def _certificate(payload: Payload) -> dict[str, Any] | None:
-    """Proof that the body's own base parameters are those of a real body."""
+    """Return the proof that the body's own base parameters are those of a real body; None without a body."""
     if payload.body is None:
         return None
     base, delta = payload.base, payload.body.delta
@@ -124,7 +124,7 @@ def write_payload(path: Path, document: Any) -> None:
 
 
 def payload_text(payload: Payload, arm: KnownArm) -> str:
-    """Several lines of plain text, ending with a line break."""
+    """Describe a payload in several lines of plain text, ending with a line break."""
     word, meaning = _WORDS[payload.verdict]
     names, test = arm.model.chain.names, payload.test
     lines = [
@@ -174,7 +174,7 @@ def payload_text(payload: Payload, arm: KnownArm) -> str:
 
 
 def rounded(values: Array) -> Array:
-    """The ten of a body with zeros for what is rounding beside its inertia, its first moments or its mass."""
+    """Return the ten parameters of a body with zeros for mere rounding, per kind of quantity."""
     shown = np.array(values, dtype=float)
     for quantity in (slice(0, 6), slice(6, 9), slice(9, 10)):
         part = shown[quantity]
@@ -183,7 +183,7 @@ def rounded(values: Array) -> Array:
 
 
 def loaded_config(config: ArmConfig) -> ArmConfig:
-    """The arm with a load: bounds of its last link's body and of its total mass were about the arm without."""
+    """Return the arm's configuration with a load, without bounds that hold only for the arm without it."""
     joints = dict(config.joints)
     if joints:
         last = list(joints)[-1]
@@ -199,7 +199,7 @@ def loaded_parameters(
     recorded: Equations,
     recordings: Sequence[Mapping[str, str]],
 ) -> tuple[dict[str, Any], Array | None]:
-    """The content of `parameters.json` of the arm with its payload, or without what was taken off.
+    """Return the content of `parameters.json` of the arm with its payload, or without what was taken off.
 
     Args:
         content: of the arm's parameter file.
@@ -271,7 +271,7 @@ def loaded_parameters(
 
 
 def _moved(content: Mapping[str, Any], arm: KnownArm, payload: Payload) -> Array | None:
-    """The arm's own link parameters with the body on the last one; nothing else moves."""
+    """Return the arm's own link parameters with the body added to, or taken off, the last one."""
     table = content.get("link_parameters")
     if table is None or payload.body is None or tuple(table["names"]) != arm.base.names:
         return None
@@ -284,7 +284,7 @@ def _moved(content: Mapping[str, Any], arm: KnownArm, payload: Payload) -> Array
 
 
 def _care(content: Mapping[str, Any]) -> Array:
-    """Tell by how much the arm's standard deviations are more careful than its covariance, shape (base,)."""
+    """Return the factors by which the arm's standard deviations exceed those of its covariance, shape (base,)."""
     table = content["base_parameters"]
     told = np.array([np.inf if one is None else one for one in table["standard_deviations"]], float)
     variances = np.array([np.inf if row[k] is None else row[k] for k, row in enumerate(table["covariance"])], float)

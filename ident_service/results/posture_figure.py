@@ -1,7 +1,6 @@
-"""The arm along its motion as a stick figure, from the side and from above, among what it must not touch.
+"""Draw the arm along its motion as a stick figure, from the side and from above, with its obstacles.
 
-Both views are orthographic and have the same scale, so lengths can be compared between them. Boundary: points in, SVG
-text out; where links are and how close they come to anything is computed elsewhere, the pencil is `drawing.py`.
+Both views are orthographic and have the same scale, so lengths can be compared between them.
 """
 
 from __future__ import annotations
@@ -24,9 +23,9 @@ _MOST_POSTURES, _MOST_WAYPOINTS = 24, 3000  # more can neither be told apart nor
 
 
 def stick_figure(postures: Postures, title: str = "The arm along its motion") -> str:
-    """Side view (x-z) and top view (x-y) of an arm along its motion.
+    """Draw side view (x-z) and top view (x-y) of an arm along its motion.
 
-    Postures fade in from early to late; the tool's way is a thin line through all of them. The posture of smallest
+    Postures fade in from early to late; the tool's path is a thin line through all of them. The posture of smallest
     clearance stands out with the names of the pair and their distance. Half-spaces are drawn where they meet the
     vertical or horizontal plane through the base frame's origin.
 
@@ -106,7 +105,7 @@ def _view(canvas: Canvas, axes: Axes, view: tuple[int, int], postures: Postures,
 
 
 def _extent(postures: Postures) -> tuple[Array, Array]:
-    """Lowest and highest corner of what both views show [m], each of shape (3,).
+    """Return the lowest and highest corner of what both views show [m], each of shape (3,).
 
     All of the arm, and of what is around it as much as is near it, so that a whole hall does not make it small.
     """
@@ -138,7 +137,7 @@ def _extent(postures: Postures) -> tuple[Array, Array]:
 
 
 def _evenly(count: int, most: int) -> list[int]:
-    """Numbers from 0 to `count` - 1: all, or `most` of them, evenly, the first and the last one included."""
+    """Return numbers from 0 to `count` - 1: all, or `most` of them, evenly, the first and the last one included."""
     return [int(k) for k in np.linspace(0, count - 1, min(count, most)).round()]
 
 
@@ -154,7 +153,7 @@ def _closest_words(postures: Postures) -> str:
 
 
 def _grid(canvas: Canvas, axes: Axes, view: tuple[int, int]) -> float:
-    """Round coordinates [m], equally far apart both ways; returns how far."""
+    """Draw round coordinates [m], equally far apart both ways; return their distance [m]."""
     values = round_values(axes.low_x, axes.high_x, 8)
     step = values[1] - values[0]
     for value in values:
@@ -182,7 +181,7 @@ def _scale_bar(canvas: Canvas, axes: Axes, length: float) -> None:
 
 
 def _legend(canvas: Canvas, right: float, postures: Postures) -> None:
-    """What the strokes mean, from right to left."""
+    """Draw the legend of strokes, from right to left."""
     entries = [("tool", "tool's way", 92.0)]
     if postures.workspace is not None:
         entries.append(("workspace", "workspace", 108.0))

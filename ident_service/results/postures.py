@@ -1,6 +1,6 @@
-"""An arm along a motion and what is around it, as points: what a stick figure shows.
+"""Hold an arm along a motion and its surroundings as points, for a stick figure.
 
-Lengths in m, points in the base frame. Boundary: data and its checks; nothing is drawn or computed here.
+Lengths in m, points in the base frame.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ident_service.results.drawing import Array, require_drawable
 
 @dataclass(frozen=True)
 class Box:
-    """An obstacle with eight corners [m], shape (8, 3), in any order."""
+    """Obstacle with eight corners [m], shape (8, 3), in any order."""
 
     name: str
     corners: Array
@@ -24,7 +24,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Plane:
-    """An obstacle that fills `normal . x < offset` [m]; `normal` has shape (3,) and points to free space."""
+    """Obstacle that fills `normal . x < offset` [m]; `normal` has shape (3,) and points to free space."""
 
     name: str
     normal: Array
@@ -33,7 +33,7 @@ class Plane:
 
 @dataclass(frozen=True)
 class Rod:
-    """An obstacle of all points within `radius` of the line between `ends` [m], shape (2, 3)."""
+    """Obstacle of all points within `radius` of the line between `ends` [m], shape (2, 3)."""
 
     name: str
     ends: Array
@@ -42,7 +42,7 @@ class Rod:
 
 @dataclass(frozen=True)
 class Closest:
-    """Where a motion comes closest to touching.
+    """Posture and pair of smallest clearance along a motion.
 
     Attributes:
         posture: number of the posture.
@@ -59,7 +59,7 @@ class Closest:
 
 @dataclass(frozen=True)
 class Postures:
-    """An arm along a motion, as points in the base frame.
+    """Arm along a motion, as points in the base frame.
 
     Attributes:
         frames: origins of links, base and tool among them [m], shape (postures, points, 3).
@@ -79,7 +79,7 @@ class Postures:
     closest: Closest | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be drawn.
+        """Refuse postures that cannot be drawn.
 
         Raises:
             UsageError: no postures, shapes that do not belong together, values that are no numbers, branches or a

@@ -1,4 +1,4 @@
-"""A folder of results is replaced as a whole, and nothing but an earlier result ever is.
+"""Replace a folder of results as a whole, and nothing but an earlier result.
 
 What an earlier result left behind would stand beside a manifest that does not name it; a file of the same name that a
 person has put there, or a recording, would be lost. So a folder that holds anything else is refused.
@@ -15,7 +15,7 @@ from ident_service.errors import ParameterError, UsageError
 from ident_service.results.files import exchange_folders, staging_beside
 from ident_service.results.manifest import MANIFEST, file_sha256, named_files
 
-# Of identifications and payloads; never a recording, which is made once.
+# Endings of files of identifications and payloads; never of recordings, which are made once.
 _MADE = (".json", ".urdf", ".txt", ".html", ".py", ".dat-s")
 _TOLD = 3
 
@@ -40,7 +40,7 @@ def require_replaceable(folder: Path) -> None:
 
 
 def _others(folder: Path) -> list[str]:
-    """Name what a folder holds beside an unchanged earlier result."""
+    """Return the names of what a folder holds beside an unchanged earlier result, with the reasons."""
     found = sorted(path.name for path in folder.iterdir())
     try:
         named = dict(named_files(folder)) if MANIFEST in found else {}
@@ -61,7 +61,7 @@ def _why(path: Path, name: str) -> str:
 
 @contextmanager
 def replacing_folder(folder: Path) -> Iterator[Path]:
-    """A place to build a folder of results in; it takes the place of an earlier result when the block ends well.
+    """Yield a place to build a folder of results in, which replaces an earlier result when the block ends well.
 
     Raises:
         UsageError: the folder holds anything but an earlier result, before or after the block, or cannot be written.

@@ -1,4 +1,4 @@
-"""Evidence and report beside the parameters they belong to: written with them, and made again from a folder."""
+"""Write evidence and report beside the parameters they belong to, and make a report again from a folder."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def read_reported(folder: Path) -> Results:
 
 
 def read_evidence_of(results: Results) -> Evidence:
-    """The evidence of a folder that has been read.
+    """Read the evidence of a folder whose other results have been read.
 
     Raises:
         UsageError: there is none.
@@ -118,5 +118,5 @@ def make_report(folder: Path, out: Path | None = None) -> Path:
 
 
 def _others(sha256: Mapping[str, str]) -> dict[str, str]:
-    """Hashes of what the page can name: not its own."""
+    """Return the hashes of all files but the page itself, which cannot name its own."""
     return {name: digest for name, digest in sha256.items() if name != REPORT_PAGE}

@@ -1,4 +1,4 @@
-"""Which rows a torque error is computed on and what both torques went through, so that two figures can be compared."""
+"""Describe the rows and filters that a torque error is computed with, so that two figures can be compared."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def how_fitted(estimate: Estimate) -> tuple[str, ...]:
 
 
 def _noise_and_model(estimate: Estimate) -> str:
-    """Say how much of the deviations is noise and how much error of the model, as far as repetitions tell."""
+    """Describe how much of the deviations is noise and how much error of the model, as far as repetitions tell."""
     if estimate.noise_deviations is None:
         return "Most of the motion is not repeated, so that noise and error of the model cannot be told apart."
     variances = np.diag(estimate.covariance)

@@ -1,4 +1,4 @@
-"""Everything of one identification in one folder: the arm, parameters, URDF, report, and a manifest with hashes.
+"""Write and read one identification in one folder: arm, parameters, URDF, report, and a manifest with hashes.
 
 Nothing is believed of a folder that is read before every file has the hash that its manifest names.
 """
@@ -35,7 +35,7 @@ ARM, VERIFIER = "arm.json", "verify.py"
 
 @dataclass(frozen=True)
 class Results:
-    """A folder of results that has been read and is what its manifest says.
+    """Folder of results that has been read and is what its manifest says.
 
     Attributes:
         folder: where it is.
@@ -51,7 +51,7 @@ class Results:
 
 
 def read_results(folder: Path) -> Results:
-    """Read what `write_results` and `write_manifest` wrote, here or on another machine.
+    """Read a folder of results that `write_results` and `write_manifest` wrote, here or on another machine.
 
     Raises:
         UsageError: no such folder, or nothing was identified in it.

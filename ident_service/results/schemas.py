@@ -1,7 +1,4 @@
-"""The published JSON Schemas of the files that results are kept in; every writer and reader is held against them.
-
-Boundary: from content to its mistakes in words; what the content means is each file's own module.
-"""
+"""Validate result files against their published JSON Schemas, when written and when read."""
 
 from __future__ import annotations
 
@@ -16,13 +13,13 @@ import jsonschema_rs
 
 from ident_service.errors import ParameterError
 
-_MOST = 10  # mistakes that are told
-# Each mistake holds a copy of what is wrong: 16 MB of them took 5 GB. So they are looked for in so much of a document.
+_MOST = 10  # mistakes that are reported
+# Each mistake holds a copy of what is wrong: 16 MB of them took 5 GB. So only these parts of a document are checked.
 _VALUES, _ENTRIES, _KEYS, _CHARACTERS = 20_000, 200, 1000, 1000
 
 
 def require_schema(content: Any, name: str, where: object, what: str) -> None:
-    """Hold a document against `NAME.schema.json`.
+    """Validate a document against `NAME.schema.json`.
 
     Args:
         content: JSON values.

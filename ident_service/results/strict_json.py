@@ -1,4 +1,4 @@
-"""JSON as its standard has it: numbers that a double can hold, and no NaN or infinity, which Python would read."""
+"""Parse standard JSON: numbers that a double can hold, and no NaN or infinity, which Python would read."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 
 
 def strict_json(text: str) -> Any:
-    """The content of a JSON text.
+    """Parse a JSON text strictly.
 
     Raises:
         ValueError: not JSON, or a number that is none.

@@ -1,4 +1,4 @@
-"""What a person at a terminal wants to know of an estimate: verdict, errors (table 8), parameters (table 6)."""
+"""Summarise an estimate for a person at a terminal: verdict, errors (table 8), parameters (table 6)."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def _errors(candidate: Candidate) -> list[tuple[TorqueError, TorqueError]]:
 
 
 def _found_before(estimate: Estimate) -> list[str]:
-    """What the recordings said before the parameters: delay, shape of the friction, torque constants, prior."""
+    """Describe what was found before the parameters: delay, shape of the friction, torque constants, prior."""
     model, prepared = estimate.model, estimate.prepared
     lines = []
     if (payload := model.config.payload) is not None:
@@ -107,7 +107,7 @@ def _found_before(estimate: Estimate) -> list[str]:
 
 
 def parameter_table(estimate: Estimate) -> str:
-    """Every base parameter: estimate, standard deviation, verdict (table 6)."""
+    """Return every base parameter as text: estimate, standard deviation, verdict (table 6)."""
     lines = [f"{'base parameter':58s} {'estimate':>12s} {'deviation':>10s}  verdict"]
     for expression, value, deviation, unit, verdict in zip(
         estimate.base.expressions,
@@ -137,7 +137,7 @@ def _feasibility(estimate: Estimate) -> str:
 
 
 def _convex(estimate: Estimate) -> list[str]:
-    """State custom knowledge and the second opinion, where there are."""
+    """Describe custom knowledge and the second opinion, where there are."""
     lines = []
     if (known := estimate.custom) is not None:
         function = known.function

@@ -1,7 +1,7 @@
-"""What an arm must not touch, seen along an axis of the base frame.
+"""Draw what an arm must not touch, seen along an axis of the base frame.
 
 A view is the pair of axes it shows: (0, 2) from the side, (0, 1) from above. Solids are drawn as their outline,
-half-spaces where they meet the plane of the view through the base frame's origin. Boundary: one thing in one view.
+half-spaces where they meet the plane of the view through the base frame's origin.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ident_service.results.postures import Box, Plane, Rod
 def draw_obstacle(
     canvas: Canvas, axes: Axes, view: tuple[int, int], obstacle: Box | Plane | Rod
 ) -> tuple[float, float] | None:
-    """Draw an obstacle; returns the middle of what is seen of it [px], or None where the view does not meet it."""
+    """Draw an obstacle; return the middle of what is seen of it [px], or None where the view does not meet it."""
     if isinstance(obstacle, Rod):
         ends = obstacle.ends[:, list(view)]
         (xa, xb), (ya, yb) = axes.x(ends[:, 0]), axes.y(ends[:, 1])
@@ -46,7 +46,7 @@ def draw_obstacle(
 
 
 def write_name(canvas: Canvas, axes: Axes, words: str, x: float, y: float) -> None:
-    """A name in the middle of what it names, moved so that it stays inside the view."""
+    """Write a name in the middle of the object it names, moved so that it stays inside the view."""
     half = 3.2 * len(words) + 4
     x = min(max(x, axes.left + half), axes.left + axes.width - half)
     y = min(max(y + 3.5, axes.top + 14), axes.top + axes.height - 6)
@@ -54,7 +54,7 @@ def write_name(canvas: Canvas, axes: Axes, words: str, x: float, y: float) -> No
 
 
 def _hull(points: Array) -> Array:
-    """Corners of the smallest convex polygon around points of shape (points, 2), in order (Andrew's monotone chain)."""
+    """Return the corners of the convex hull of points, shape (points, 2), in order (Andrew's monotone chain)."""
     rows = sorted({(x, y) for x, y in points.tolist()})
 
     def half(way: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -74,7 +74,7 @@ def _hull(points: Array) -> Array:
 
 
 def _fills(axes: Axes, outline: Array) -> bool:
-    """Does a convex outline, in order, shape (corners, 2), have all of a view inside?"""
+    """Return whether a convex outline, in order, shape (corners, 2), contains the whole view."""
     if len(outline) < 3:
         return False
     along = np.roll(outline, -1, axis=0) - outline
@@ -84,7 +84,7 @@ def _fills(axes: Axes, outline: Array) -> bool:
 
 
 def _behind(axes: Axes, normal: Array, offset: float) -> tuple[Array, Array]:
-    """The part of a view with `normal . x < offset`, and its border there.
+    """Return the part of a view with `normal . x < offset`, and its border there.
 
     Returns:
         Corners of the part, shape (corners, 2), and the ends of the border, shape (2, 2); of length 0 if there is none.

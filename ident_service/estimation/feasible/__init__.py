@@ -1,1 +1,1 @@
-"""The feasible set and the optimisation problems over it: test, correction, constrained regression, priors."""
+"""Define the feasible set and solve the problems over it: test, correction, constrained regression, priors."""

@@ -1,4 +1,4 @@
-"""One named condition on delta: an affine map into symmetric matrices or numbers, with the scale it is judged by.
+"""Represent one condition on delta: an affine map into symmetric matrices or numbers, with its reference scale.
 
 Margins in SI units mix kg, kg m^2 and N m. Dividing each row by the reference of its unit makes them comparable; the
 references are those of a body of 1 kg and 0.1 m and of a small joint:
@@ -38,7 +38,7 @@ REFERENCE_FRICTION = 0.1  # N m, N m s/rad and what else friction is measured in
 
 
 def reference(name: str) -> float:
-    """The reference scale of a link parameter, by its name."""
+    """Return the reference scale of a link parameter, by its name."""
     symbol = name.rstrip("0123456789")
     if symbol == "m":
         return REFERENCE_MASS
@@ -54,10 +54,10 @@ def link_of(name: str) -> str:
 
 @dataclass(frozen=True)
 class Block:
-    """One condition on delta.
+    """Named condition on delta: an affine map into a symmetric matrix or into numbers that must be positive.
 
     Attributes:
-        name: what it says, for people.
+        name: of the condition, for people.
         size: rows of the symmetric matrix; 0 for a list of numbers.
         F: affine map, shape (entries, parameters); entries of a matrix are its upper triangle, column by column.
         f: constant part, shape (entries,).
@@ -71,15 +71,15 @@ class Block:
     scale: tuple[float, ...] = ()
 
     def smallest(self, delta: Array) -> float:
-        """Smallest eigenvalue, or smallest number, of the block at `delta`."""
+        """Return the smallest eigenvalue, or smallest number, of the block at `delta`."""
         return self._smallest(delta, np.ones(self.size or len(self.f)))
 
     def smallest_scaled(self, delta: Array) -> float:
-        """The largest t with the block at `delta` minus t times its reference scale still positive."""
+        """Return the largest t with the block at `delta` minus t times its reference scale still positive."""
         return self._smallest(delta, self.references())
 
     def largest_scaled(self, delta: Array) -> float:
-        """The largest of the numbers' magnitudes at `delta`, each divided by its reference scale."""
+        """Return the largest of the numbers' magnitudes at `delta`, each divided by its reference scale."""
         return float(np.max(np.abs(self.F @ delta + self.f) / self.references()))
 
     def _smallest(self, delta: Array, scale: Array) -> float:
@@ -99,15 +99,15 @@ class Block:
         return np.flatnonzero(np.any(self.F != 0.0, axis=0))
 
     def identity(self) -> Array:
-        """Entries of the identity matrix (or of ones), shape (entries,)."""
+        """Return the entries of the identity matrix (or of ones), shape (entries,)."""
         return self._diagonal(np.ones(self.size or len(self.f)))
 
     def references(self) -> Array:
-        """Reference scale per row of the matrix or per number, shape (size,) or (entries,)."""
+        """Return the reference scale per row of the matrix or per number, shape (size,) or (entries,)."""
         return np.array(self.scale) if self.scale else np.ones(self.size or len(self.f))
 
     def reference_identity(self) -> Array:
-        """Entries of S, the diagonal of the reference scales, shape (entries,)."""
+        """Return the entries of S, the diagonal of the reference scales, shape (entries,)."""
         return self._diagonal(self.references())
 
     def _diagonal(self, values: Array) -> Array:
@@ -125,7 +125,7 @@ def symmetric(entries: Array, size: int) -> Array:
 
 
 def matrix_block(name: str, rows: list[list[Row]], scale: tuple[float, ...], index: dict[str, int]) -> Block:
-    """A symmetric matrix whose entries are sums of link parameters."""
+    """Return the block of a symmetric matrix whose entries are sums of link parameters."""
     size = len(rows)
     F = np.zeros((size * (size + 1) // 2, len(index)))
     for entry, (i, j) in enumerate(triangle_entries(size)):
@@ -135,7 +135,7 @@ def matrix_block(name: str, rows: list[list[Row]], scale: tuple[float, ...], ind
 
 
 def linear_block(name: str, rows: Sequence[tuple[Row, float]], scale: float, index: dict[str, int]) -> Block:
-    """Numbers that are sums of link parameters and a constant, all of one unit."""
+    """Return the block of numbers that are sums of link parameters and a constant, all of one unit."""
     F = np.zeros((len(rows), len(index)))
     for entry, (row, _) in enumerate(rows):
         for parameter, coefficient in row.items():

@@ -37,20 +37,20 @@ from ident_service.model.likely_bodies import LikelyBodies
 _ITERATIONS = 200
 _CONVERGED = 1e-10  # Newton's decrement: the distance from the minimiser in the metric of f
 _QUADRATIC = 1e-2  # decrement from which Newton's method at least halves it with every step, unless rounding forbids
-_STEP = 0.99  # of the way to the boundary, at most
-_LONGEST = 10.0  # Newton's steps at a time
-_HALVINGS = 50  # of the part of a step that is looked at
+_STEP = 0.99  # largest share of the distance to the boundary in one step
+_LONGEST = 10.0  # largest multiple of Newton's step
+_HALVINGS = 50  # bisections of the step length
 _KEPT = 0.5  # share of the margin, at most the paper's, that is left where data press against the set
 
 
 @dataclass(frozen=True)
 class Near:
-    """How far base parameters may move.
+    """Ellipsoid that base parameters may move in.
 
     Attributes:
         origin: base parameters that they move from [SI], shape (base,).
         metric: N above, shape (rows, base).
-        moves: which of them may, shape (base,).
+        moves: which base parameters may move, shape (base,).
     """
 
     origin: Array
@@ -58,7 +58,7 @@ class Near:
     moves: NDArray[np.bool_]
 
     def moved(self, beta: Array) -> Array:
-        """N x of other base parameters, shape (rows,); they are near where its length is below 1."""
+        """Return N x of other base parameters, shape (rows,); they are near where its length is below 1."""
         return np.asarray(self.metric @ (beta - self.origin))
 
 
@@ -144,9 +144,11 @@ def central(
 
 
 def _length(changes: Array, away: Array, going: Array, decrement: float) -> float:
-    """Minimise f along Newton's step, with mu the `changes`, and |N x| that of `away` + s `going`.
+    """Return the step length s that minimises f along Newton's step.
 
-    There it is -sum log(1 + s mu) - log(1 - |N x|^2) and linear in s besides, with the slope -decrement^2 at 0.
+    `changes` are the mu below, and |N x| is that of `away` + s `going`.
+
+    There f is -sum log(1 + s mu) - log(1 - |N x|^2) and linear in s besides, with the slope -decrement^2 at 0.
     """
     c, b, a = float(away @ away), float(away @ going), float(going @ going)
 
@@ -201,7 +203,7 @@ def _matrices(
 
 
 def _root(block: Block, likely: LikelyBodies | None) -> Array:
-    """A root of S_b, shape (size, size)."""
+    """Return a root of S_b, shape (size, size)."""
     scales = np.diag(np.sqrt(block.references()))
     if likely is None:
         return scales

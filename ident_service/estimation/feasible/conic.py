@@ -1,4 +1,4 @@
-"""The door to Clarabel: minimise a linear or convex quadratic objective over affine maps into cones.
+"""Call Clarabel: minimise a linear or convex quadratic objective over affine maps into cones.
 
 Every problem of this package is written as `F x + f in K` with K zero, the non-negative numbers, a second-order cone,
 the exponential cone or the positive semidefinite matrices, the latter by the entries of their upper triangle, column by
@@ -24,7 +24,7 @@ from ident_service.model.chain import Array
 
 @dataclass(frozen=True)
 class Solution:
-    """An optimum.
+    """Optimum of a conic problem.
 
     Attributes:
         x: the variables, shape (variables,).
@@ -49,7 +49,7 @@ class Solution:
 
 @dataclass(frozen=True)
 class _Pose:
-    """One way to pose a problem: share of the way to the boundary per step, scaling passes, coordinates."""
+    """Options of one solver attempt: share of the way to the boundary per step, scaling passes, coordinates."""
 
     step: float
     equilibrations: int
@@ -65,10 +65,10 @@ _FINAL = (clarabel.SolverStatus.PrimalInfeasible, clarabel.SolverStatus.DualInfe
 
 @dataclass
 class ConicProblem:
-    """Constraints gathered one by one, then solved.
+    """Conic problem: constraints are added one by one, then it is solved.
 
     Attributes:
-        variables: how many.
+        variables: number of variables.
         rough: whether seven digits are enough, and a problem that is hard may stay unsolved.
     """
 
@@ -78,28 +78,28 @@ class ConicProblem:
     _scales: list[Array] = field(default_factory=list)
 
     def zero(self, F: Array, f: Array) -> None:
-        """`F x + f = 0` entry by entry; F of shape (rows, variables)."""
+        """Add `F x + f = 0` entry by entry; F of shape (rows, variables)."""
         self._add(Rows("zero", F, f), np.ones(len(f)))
 
     def nonnegative(self, F: Array, f: Array) -> None:
-        """`F x + f >= 0` entry by entry; F of shape (rows, variables)."""
+        """Add `F x + f >= 0` entry by entry; F of shape (rows, variables)."""
         self._add(Rows("nonnegative", F, f), np.ones(len(f)))
 
     def second_order(self, F: Array, f: Array) -> None:
-        """The first entry of `F x + f` is at least the norm of the others."""
+        """Add the condition that the first entry of `F x + f` is at least the norm of the others."""
         self._add(Rows("second_order", F, f), np.ones(len(f)))
 
     def exponential(self, F: Array, f: Array) -> None:
-        """The three entries (a, b, c) of `F x + f` satisfy b exp(a / b) <= c."""
+        """Add the condition b exp(a / b) <= c on the three entries (a, b, c) of `F x + f`."""
         self._add(Rows("exponential", F, f), np.ones(len(f)))
 
     def semidefinite(self, F: Array, f: Array, size: int) -> None:
-        """`F x + f` is the upper triangle of a positive semidefinite matrix of `size` rows."""
+        """Add the condition that `F x + f` is the upper triangle of a positive semidefinite matrix of `size` rows."""
         scale = np.array([1.0 if i == j else np.sqrt(2.0) for i, j in triangle_entries(size)])
         self._add(Rows("semidefinite", F * scale[:, None], f * scale, size), scale)
 
     def copy(self) -> ConicProblem:
-        """The same problem, to be given further constraints."""
+        """Return a copy of the problem that further constraints can be added to."""
         return ConicProblem(self.variables, list(self._rows), list(self._scales), rough=self.rough)
 
     def _add(self, rows: Rows, scale: Array) -> None:
@@ -107,7 +107,7 @@ class ConicProblem:
         self._scales.append(scale)
 
     def minimise(self, objective: Array, name: str, quadratic: Array | None = None) -> Solution:
-        """Solve.
+        """Minimise an objective over the constraints.
 
         Args:
             objective: linear coefficients, shape (variables,).
@@ -180,5 +180,5 @@ def _cone(rows: Rows) -> object:
 
 
 def triangle_entries(size: int) -> list[tuple[int, int]]:
-    """Row and column of each entry of an upper triangle, column by column."""
+    """Return row and column of each entry of an upper triangle, column by column."""
     return [(i, j) for j in range(size) for i in range(j + 1)]

@@ -1,4 +1,4 @@
-"""Whether any arm at all could fulfil a set of conditions, asked when a problem over them has no solution."""
+"""Check whether any arm could fulfil a set of conditions, after a problem over them had no solution."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _SHARE = 1e-3
 
 
 class ConditionsError(ParameterError, SolverError):
-    """No parameters at all fulfil the conditions; `blocks` are the ones that contradict each other."""
+    """Report that no parameters at all fulfil the conditions; `blocks` are the conflicting ones."""
 
     def __init__(self, problem: str, status: str, blocks: tuple[str, ...]) -> None:
         SolverError.__init__(self, problem, status)
@@ -24,7 +24,7 @@ class ConditionsError(ParameterError, SolverError):
 
 
 def contradiction(conditions: FeasibleSet) -> tuple[str, ...]:
-    """Name the conditions that contradict each other whatever the data; none where some delta fulfils all of them.
+    """Return the names of the conditions that conflict whatever the data; none where some delta fulfils all of them.
 
     Below the inset that every problem keeps, the multipliers of the largest margin name the blocks of the proof.
 
@@ -44,7 +44,7 @@ def contradiction(conditions: FeasibleSet) -> tuple[str, ...]:
 
 
 def interior_point(conditions: FeasibleSet) -> Array | None:
-    """Find link parameters well inside a set, shape (parameters,); None where the conditions contradict each other.
+    """Return link parameters well inside a set, shape (parameters,); None where the conditions conflict.
 
     Raises:
         SolverError: the solver stopped without an optimum.

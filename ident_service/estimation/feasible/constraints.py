@@ -1,4 +1,4 @@
-"""What an arm's configuration knows about its bodies, as blocks linear in delta (eqs. 25, 26, 28 and beyond).
+"""Build the conditions on bodies from an arm's configuration, as blocks linear in delta (eqs. 25, 26, 28 and beyond).
 
 Beyond the paper: a convex hull around the centre of mass; an ellipsoid (x - c)^T Q^-1 (x - c) <= 1 around all mass of
 a link, which a density inside it can only satisfy if
@@ -35,7 +35,7 @@ _ODD = {"xy": ("lz", "Lxz", "Lyz"), "yz": ("lx", "Lxy", "Lxz"), "xz": ("ly", "Lx
 
 
 def configured(config: ArmConfig, links: Sequence[int], index: Index) -> list[Block]:
-    """Every condition of the configuration that must be positive.
+    """Return every block of the configuration that must be positive.
 
     Args:
         config: of the arm.
@@ -58,7 +58,7 @@ def configured(config: ArmConfig, links: Sequence[int], index: Index) -> list[Bl
 
 
 def symmetries(config: ArmConfig, links: Sequence[int], index: Index) -> list[Block]:
-    """The odd moments that symmetry planes make zero, one block per plane; none stands twice."""
+    """Return the odd moments that symmetry planes make zero, one block per plane; none stands twice."""
     blocks = []
     for link, body in _bodies(knowledge_with_payload(config), links):
         gone: set[str] = set()
@@ -104,7 +104,7 @@ def _box(link: int, box: Box, index: Index) -> Block:
 
 
 def _hull(link: int, points: Sequence[Vector3], index: Index) -> Block:
-    """Half-spaces n . r + d <= 0 of the hull, times the mass: -(n . l) - d m > 0."""
+    """Return the half-spaces n . r + d <= 0 of the hull, times the mass: -(n . l) - d m > 0."""
     from scipy.spatial import ConvexHull, QhullError  # loads for 0.1 s, and few arms have a hull
 
     try:
@@ -140,7 +140,7 @@ def _ellipsoid(link: int, body: Ellipsoid, index: Index) -> Block:
 
 
 def signs(positive: Sequence[JointTerm], links: Sequence[int], index: Index) -> list[Block]:
-    """Joint terms that must be positive (eq. 28), where the model has them.
+    """Return the blocks of joint terms that must be positive (eq. 28), where the model has them.
 
     Args:
         positive: the terms.

@@ -1,4 +1,4 @@
-"""The constrained least squares posed a second time, in cvxpy: for `constraints.custom`, and as a second opinion.
+"""Formulate the constrained least squares in cvxpy, for `constraints.custom` and as a second opinion.
 
 The problem is that of `nearest.py` and `priors.py`: the same blocks with the same inset, the same equalities, the same
 bound of each link's tr(P) = m + tr(L)/2, the same residual and prior. The formulation is another one: the variable is
@@ -42,14 +42,14 @@ _OPTIONS: dict[str, tuple[dict[str, Any], ...]] = {
         | {"max_iter": 200, "max_threads": 1}
         for tolerance in (1e-9, 1e-8, 1e-7)
     ),
-    # Accelerated, SCS now and then wanders for as long as it is let, on one processor and not on another.
+    # With acceleration SCS sometimes does not converge, on one processor and not on another.
     "SCS": ({"eps_abs": 1e-7, "eps_rel": 1e-7, "max_iters": 100_000, "acceleration_lookback": 0},),
 }
 
 
 @dataclass(frozen=True)
 class ConvexEstimate:
-    """An optimum found through cvxpy.
+    """Estimate found through cvxpy.
 
     Attributes:
         estimate: the parameters.
@@ -179,7 +179,7 @@ def _sigma(fit: LeastSquares, prior: Prior | None) -> float:
 
 
 class _Posed:
-    """One problem, to be solved with several options and bounds."""
+    """Constrained least squares in cvxpy, to be solved with several options and bounds."""
 
     def __init__(
         self,
@@ -211,7 +211,7 @@ class _Posed:
         self._iterations, self._seconds = 0, 0.0
 
     def _block(self, block: Block, inset: float) -> cp.Constraint:
-        """State a condition with the inset of eq. 21."""
+        """Return the constraint of one block, with the inset of eq. 21."""
         import cvxpy as cp
 
         entries = (block.F * self._scales) @ self._x + (block.f - inset * block.identity())
@@ -288,7 +288,7 @@ class _Posed:
         )
 
     def _active(self) -> tuple[str, ...]:
-        """Name what has a multiplier that counts, as `posing.pressing` does, the custom constraints among it."""
+        """Return the names of the active constraints, custom ones too, by multiplier as `posing.pressing` does."""
         named = [(block.name, one) for block, one in zip(self._conditions.blocks, self._blocks, strict=True)]
         if self._custom is not None:
             named += [(f"{self._custom.name}, constraint {k}", one) for k, one in enumerate(self._known, 1)]

@@ -1,4 +1,4 @@
-"""Feasibility test (BPFT, eq. 51), correction (BPFC, eqs. 52-56) and constrained regression (FBPE-OLS, eq. 74).
+"""Solve the feasibility problems: test (BPFT, eq. 51), correction (BPFC, eqs. 52-56), regression (FBPE-OLS, eq. 74).
 
 All three look for delta, written as the pair (beta, delta_d) through the bijection of eqs. 42-49. Norms are
 second-order cones: the Schur complements of eqs. 54 and 73 say the same with many more entries.
@@ -46,13 +46,13 @@ __all__ = [
     "feasibility_test",
 ]
 
-EQUALITY_TOLERANCE = 1e-6  # of an equality in a test, in units of its reference scale
-_LARGEST_MARGIN = 1e3  # where nothing in the table bounds the margin, any larger one says no more
+EQUALITY_TOLERANCE = 1e-6  # largest violation of an equality in a test, in units of its reference scale
+_LARGEST_MARGIN = 1e3  # bound of the margin, where nothing in the table bounds it
 
 
 @dataclass(frozen=True)
 class FeasibilityTest:
-    """Answer of the BPFT.
+    """Result of the base parameter feasibility test (BPFT).
 
     Attributes:
         feasible: whether a real body could have these base parameters.
@@ -74,7 +74,7 @@ class FeasibilityTest:
 
 
 def feasibility_test(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> FeasibilityTest:
-    """Could a real body have these base parameters? (BPFT, eq. 51, as a largest margin).
+    """Test whether a real body could have these base parameters (BPFT, eq. 51, as a largest margin).
 
     Args:
         beta: base parameters in SI units, shape (base,).
@@ -127,7 +127,7 @@ def _largest_margin(
 
 
 def _shares(conditions: FeasibleSet, solution: Solution) -> tuple[tuple[str, float], ...]:
-    """What each multiplier weighs against S: optimality of t makes the weights add up to 1."""
+    """Return each block's share of the scaled margin: multipliers weighed by S, which sum to 1 at the optimum."""
     weights = [
         max(float(np.sum(block.reference_identity() * dual)), 0.0)
         for block, dual in zip(conditions.blocks, solution.duals, strict=False)
@@ -149,7 +149,7 @@ def _unequal(delta: Array, conditions: FeasibleSet) -> FeasibilityTest:
 def feasibility_correction(
     beta: Array, base: BaseParameters, conditions: FeasibleSet, covariance: Array | None = None
 ) -> FeasibleEstimate:
-    """The feasible base parameters nearest to `beta` (BPFC, eq. 55).
+    """Return the feasible base parameters nearest to `beta` (BPFC, eq. 55).
 
     Args:
         beta: base parameters in SI units, shape (base,).
@@ -175,7 +175,7 @@ def feasibility_correction(
 def constrained_least_squares(
     fit: LeastSquares, base: BaseParameters, conditions: FeasibleSet, prior: Prior | None = None
 ) -> FeasibleEstimate:
-    """The feasible base parameters that explain the torques best (FBPE-OLS, eq. 74).
+    """Return the feasible base parameters that explain the torques best (FBPE-OLS, eq. 74).
 
     `objective` is |rho_1 - R_1 beta|, the part of the residual that beta can change (eq. 70). With a prior, what is
     minimised is |rho_1 - R_1 beta|^2 / sigma^2 + weight * divergence(delta, prior), see `priors.py`.

@@ -1,4 +1,4 @@
-"""The set of parameters that a real body could have, as a list of named blocks (3.1 to 3.3).
+"""Define the set of parameters that a real body could have, as a list of named blocks (3.1 to 3.3).
 
 Each block is an affine map of delta into symmetric matrices or numbers that must be positive:
 
@@ -55,7 +55,7 @@ class _Group:
 
 @dataclass(frozen=True)
 class FeasibleSet:
-    """All conditions on delta, in the order of `names`.
+    """All conditions on delta, whose entries are in the order of `names`.
 
     Attributes:
         kind: which condition on inertias.
@@ -91,15 +91,15 @@ class FeasibleSet:
         return tuple(frozenset(link_of(self.names[column]) for column in block.felt) for block in self.blocks)
 
     def scaled_margin(self, delta: Array) -> tuple[float, str]:
-        """The largest t with D(delta) - t S >= 0, S the reference scales, and the block that allows no more."""
+        """Return the largest t with D(delta) - t S >= 0, S the reference scales, and the block that limits it."""
         return min((block.smallest_scaled(delta), block.name) for block in self.blocks)
 
     def violation(self, delta: Array) -> tuple[float, str]:
-        """The largest deviation from an equality, in units of its reference scale, and its name; zero without any."""
+        """Return the largest deviation from an equality, over its reference scale, and its name; zero without any."""
         return max(((block.largest_scaled(delta), block.name) for block in self.equalities), default=(0.0, ""))
 
     def equality_rows(self) -> tuple[Array, Array]:
-        """All equalities as E delta + e = 0, in units of their reference scales; shapes (rows, parameters), (rows,)."""
+        """Return all equalities as E delta + e = 0, over their reference scales; (rows, parameters), (rows,)."""
         E = [block.F / block.references()[:, None] for block in self.equalities]
         e = [block.f / block.references() for block in self.equalities]
         return np.vstack([np.zeros((0, len(self.names))), *E]), np.concatenate([np.zeros(0), *e])
@@ -112,7 +112,7 @@ def feasible_set(
     *,
     positive: Sequence[JointTerm] = (),
 ) -> FeasibleSet:
-    """The feasible set of an arm, or of a bare table of parameters.
+    """Return the feasible set of an arm, or of a bare table of parameters.
 
     Args:
         kind: which condition on inertias.

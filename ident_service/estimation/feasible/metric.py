@@ -1,4 +1,4 @@
-"""The metric of a covariance, in which a correction does not depend on the choice of base columns (3.4, eq. 52)."""
+"""Compute the metric of a covariance, which makes a correction independent of the base columns (3.4, eq. 52)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _LARGEST_CONDITION = 1e13  # of the correlations, beyond which their inverse is 
 
 
 def whitening(covariance: Array, base: BaseParameters) -> Array:
-    """W with W^T W the inverse of a covariance, shape (base, base).
+    """Return W with W^T W the inverse of a covariance, shape (base, base).
 
     Args:
         covariance: of the base parameters, SI units, shape (base, base).

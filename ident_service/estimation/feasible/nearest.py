@@ -1,4 +1,4 @@
-"""The feasible point nearest to a target: the shape that BPFC (eq. 55) and FBPE (eq. 74) share."""
+"""Find the feasible point nearest to a target, as BPFC (eq. 55) and FBPE (eq. 74) both do."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.likely_bodies import LikelyBodies
 
-_AT_TARGET = 1e-8  # of the target's size: a distance that is none
+_AT_TARGET = 1e-8  # share of the target's size below which a distance is zero
 # Weights of the distance (in units of the largest column) in the objective, in turn. A solve that was hard may have
 # ended far from the optimum although the solver calls it one: then the others are tried, and the nearest point counts.
 _WEIGHTS = (8.0, 30.0, 1.0)
@@ -35,7 +35,7 @@ HARD = 45  # iterations; an easy problem takes 10 to 30
 
 @dataclass(frozen=True)
 class FeasibleEstimate:
-    """A feasible point that is optimal for something.
+    """Feasible parameters that minimise an objective.
 
     Attributes:
         beta: base parameters, shape (base,).
@@ -75,7 +75,7 @@ class FeasibleEstimate:
 
 
 def hold(problem: ConicProblem, conditions: FeasibleSet, to_delta: Array, inside: Array) -> None:
-    """Every block of the set with its inset (eq. 21, `insets`), every equality exactly; delta = to_delta x."""
+    """Add every block of the set with its inset (eq. 21, `insets`) and every equality exactly; delta = to_delta x."""
     for block, inset in zip(conditions.blocks, inside, strict=True):
         constrain(problem, block, block.times(to_delta), block.f - inset * block.identity())
     E, e = conditions.equality_rows()

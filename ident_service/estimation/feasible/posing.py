@@ -1,4 +1,4 @@
-"""What all feasibility problems share: delta from (beta, delta_d), blocks into cones, optima that lie too far out.
+"""Formulate the feasibility problems: delta from (beta, delta_d), blocks as cones, bounds on far-off optima.
 
 Where nothing bounds the mass of a link that hardly shows in beta, an optimum may only be approached as masses grow
 beyond all limits, and where a solver stops on that way depends on rounding, so on the processor. Every estimate
@@ -21,9 +21,9 @@ from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 
-EPSILON = 1e-6  # eq. 21, the paper's margin, for links of about the size that the reference scales are of
-_LEAST_INSET = 1e-11  # what a solver can tell from the boundary
-MULTIPLIER = 1e-6  # smaller ones are the interior-point method's own distance from the boundary
+EPSILON = 1e-6  # eq. 21: the paper's margin, for links of about the size of the reference scales
+_LEAST_INSET = 1e-11  # smallest distance from the boundary that a solver resolves
+MULTIPLIER = 1e-6  # smaller multipliers are the interior-point method's own distance from the boundary
 # Bounds of tr(P) to try, in turn: kg and kg m^2, times the largest base parameter or bound if that is above 1.
 OF_TESTS = (np.inf, 1e4, 1e3, 1e2)
 OF_TABLES = (1e4, 1e3, 1e2)  # the nearest feasible table; the paper's table 1 takes masses of thousands of kg to print
@@ -46,12 +46,12 @@ class Lift:
         self.of_dependent[self.dependent, np.arange(len(self.dependent))] = 1.0
 
     def delta(self, beta: Array, dependent: Array) -> Array:
-        """Link parameters, shape (parameters,)."""
+        """Return the link parameters, shape (parameters,)."""
         return np.asarray(self.of_beta @ beta + self.of_dependent @ dependent)
 
 
 def insets(conditions: FeasibleSet, base: BaseParameters, beta: Array) -> Array:
-    """Give how far inside each block the estimates stay: eq. 21 for links of usual size, less for smaller ones.
+    """Return the distance that estimates keep inside each block: eq. 21 for usual links, less for smaller ones.
 
     A millionth of a kg m^2 is what the finger of a hand has. How small a link is shows in the base parameters that its
     own parameters lead.
@@ -118,7 +118,7 @@ def minimise(
     accept: Callable[[Array], bool] = lambda _: True,
     reaches: Sequence[float] = OF_TESTS,
 ) -> Solution:
-    """Solve within the first reach that allows it.
+    """Solve within the first bound on the links' tr(P) (a reach) that has an acceptable optimum.
 
     Args:
         problem: constraints gathered.
@@ -145,7 +145,7 @@ def minimise(
         try:
             solution = bounded.minimise(objective, name, quadratic)
         except SolverError as error:
-            # Without a reach, that is about the problem itself.
+            # Without a bound, infeasibility is that of the problem itself.
             if error.status.endswith("Infeasible") and bounded is problem:
                 raise
             status = status or error.status
@@ -168,7 +168,7 @@ def largest(conditions: FeasibleSet, size: float) -> float:
 
 
 def traces(conditions: FeasibleSet) -> Array:
-    """Rows tr(P_k) = m + tr(L)/2 per link, shape (links, parameters)."""
+    """Return the rows tr(P_k) = m + tr(L)/2 per link, shape (links, parameters)."""
     index = {name: column for column, name in enumerate(conditions.names)}
     links = [name[1:] for name in conditions.names if name.startswith("m") and name[1:].isdigit()]
     rows = np.zeros((len(links), len(index)))
@@ -179,7 +179,7 @@ def traces(conditions: FeasibleSet) -> Array:
 
 
 def pressing(conditions: FeasibleSet, duals: Sequence[Array]) -> tuple[str, ...]:
-    """Blocks with a multiplier that counts: relaxing them would let the optimum improve; the most decisive first."""
+    """Return the names of the active constraints, those with a large multiplier, the most decisive first."""
     weights = [float(np.abs(dual).max()) for dual in duals[: len(conditions.blocks)]]
     order = sorted(range(len(weights)), key=lambda i: -weights[i])
     floor = max(MULTIPLIER, 1e-3 * max(weights))
@@ -187,7 +187,7 @@ def pressing(conditions: FeasibleSet, duals: Sequence[Array]) -> tuple[str, ...]
 
 
 def project(delta: Array, conditions: FeasibleSet) -> Array:
-    """The nearest delta that fulfils the equalities to the last digit."""
+    """Return the nearest delta that fulfils the equalities to the last digit."""
     E, e = conditions.equality_rows()
     if len(e) == 0:
         return delta
@@ -200,7 +200,7 @@ def project(delta: Array, conditions: FeasibleSet) -> Array:
 
 
 def check(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> None:
-    """Refuse what does not belong together.
+    """Refuse base parameters, grouping and feasible set that do not belong together.
 
     Raises:
         ParameterError: shapes or names do not fit.

@@ -1,4 +1,4 @@
-"""Estimates drawn towards known link parameters delta0, as from CAD, in units of the residual's variance.
+"""Estimate with a prior on the link parameters, as from CAD, in units of the residual's variance.
 
     minimise  |R_1 beta - rho_1|^2 / sigma^2 + weight * d(delta, delta0)    over the feasible set
 
@@ -34,16 +34,16 @@ from ident_service.model.chain import Array
 from ident_service.model.layout import INERTIAL
 from ident_service.model.likely_bodies import LikelyBodies
 
-_ROOM = 0.9  # of what base parameters may move, that the way to likely bodies may take
+_ROOM = 0.9  # share of the allowed change of base parameters that moving to likely bodies may use
 _TRIANGLE = [(i, j) for i in range(4) for j in range(i + 1)]  # entries of Z, row by row
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known beforehand, and how much it counts.
+    """Prior values of the link parameters, and their weight.
 
     Attributes:
-        kind: which divergence.
+        kind: of divergence.
         names: link parameters.
         delta: their values [SI], shape (parameters,).
         weight: of one unit of divergence against one residual variance; 0 for none.
@@ -70,18 +70,18 @@ class Prior:
 
     @cached_property
     def scales(self) -> Array:
-        """Reference scale per parameter, shape (parameters,)."""
+        """Return the reference scale per parameter, shape (parameters,)."""
         return np.array([reference(name) for name in self.names])
 
     @cached_property
     def euclidean(self) -> NDArray[np.intp]:
-        """Columns of delta whose squared difference counts."""
+        """Return the columns of delta whose squared difference counts."""
         inertial = [name.rstrip("0123456789") in INERTIAL for name in self.names]
         return np.flatnonzero(np.ones(len(self.names)) if self.kind == "euclidean" else ~np.array(inertial))
 
     @cached_property
     def whitened(self) -> tuple[Block, ...]:
-        """Per link, Q as an affine map of delta.
+        """Return Q per link, as an affine map of delta.
 
         Raises:
             ParameterError: a link whose prior pseudo-inertia is not positive definite.
@@ -102,7 +102,7 @@ class Prior:
         return tuple(blocks)
 
     def divergence(self, delta: Array) -> float:
-        """Divergence of delta from the prior; infinite outside the positive pseudo-inertias if `entropic`."""
+        """Return the divergence of delta from the prior; infinite outside positive pseudo-inertias if `entropic`."""
         columns = self.euclidean
         total = float(np.sum(((delta - self.delta)[columns] / self.scales[columns]) ** 2))
         if self.kind == "entropic":
@@ -115,7 +115,7 @@ class Prior:
 
 
 def residual_deviation(fit: LeastSquares) -> float:
-    """Standard deviation of the residual that the fit's own deviations are made from (eq. 81).
+    """Return the standard deviation of the residual that the fit's own deviations are made from (eq. 81).
 
     Raises:
         ParameterError: no parameter was seen, or the residual is exactly zero.
@@ -131,7 +131,7 @@ def residual_deviation(fit: LeastSquares) -> float:
 
 
 def towards_prior(fit: LeastSquares, base: BaseParameters, conditions: FeasibleSet, prior: Prior) -> FeasibleEstimate:
-    """Constrained least squares with a prior.
+    """Solve the constrained least squares with a prior.
 
     Raises:
         ParameterError: the prior is about other link parameters, or the residual has no variance.
@@ -159,7 +159,7 @@ def _towards_prior(
     residual[:, :n] = fit.R1 @ base.K * prior.scales / sigma
     residual[:, n : n + rows] = -np.eye(rows)
     problem.zero(residual, -fit.rho1 / sigma)
-    # Divided by 1 + weight, neither part overwhelms the solver's sense of scale.
+    # Divided by 1 + weight, so that the objective keeps its scale whatever the weight.
     data, known = 1.0 / (1.0 + prior.weight), prior.weight / (1.0 + prior.weight)
     objective, quadratic = np.zeros(variables), np.zeros(variables)
     quadratic[n : n + rows] = 2.0 * data
@@ -196,7 +196,7 @@ def roomier(
     likely: LikelyBodies,
     near: Near,
 ) -> FeasibleEstimate:
-    """Leave the boundary of the set for bodies like the likely ones, by less than what is as good as the same.
+    """Move an estimate off the boundary of the set, towards likely bodies, within the uncertainty `near`.
 
     Newton's method (`central.py`) needs room to begin: between links of tonnes whose masses cancel there is none.
 
@@ -210,7 +210,7 @@ def roomier(
     Returns:
         `held` with other link values and nearly the same base parameters; `held` itself where the solver finds none.
     """
-    delta = held.delta.copy()  # friction is drawn to where it is
+    delta = held.delta.copy()  # friction keeps its value as prior
     links = np.array([name.rstrip("0123456789") in INERTIAL for name in conditions.names])
     delta[links] = likely.delta[links]
     delta = np.where(likely.drives > 0.0, likely.drives, delta)
@@ -227,9 +227,9 @@ def roomier(
 
 
 def _within(prior: Prior, base: BaseParameters, conditions: FeasibleSet, near: Near, inside: Array) -> Array:
-    """Link parameters of the least divergence from the prior whose base parameters are near others."""
+    """Return link parameters of least divergence from the prior whose base parameters lie within `near`."""
     n, links = len(prior.names), prior.whitened
-    problem = ConicProblem(n + 14 * len(links), rough=True)  # where Newton's method begins
+    problem = ConicProblem(n + 14 * len(links), rough=True)  # seven digits are enough to start Newton's method
     to_delta = np.zeros((n, n + 14 * len(links)))
     to_delta[:, :n] = np.diag(prior.scales)
     hold(problem, conditions, to_delta, inside)
@@ -251,7 +251,7 @@ def _within(prior: Prior, base: BaseParameters, conditions: FeasibleSet, near: N
 
 
 def _logdet(problem: ConicProblem, block: Block, to_delta: Array, start: int) -> None:
-    """Z from variable `start` on (10, row by row) and t (4) with sum t <= logdet Q."""
+    """Add Z from variable `start` on (10, row by row) and t (4) with sum t <= logdet Q."""
     entries = triangle_entries(8)
     place = {entry: row for row, entry in enumerate(entries)}
     lifted = np.zeros((len(entries), to_delta.shape[1]))
@@ -271,7 +271,7 @@ def _logdet(problem: ConicProblem, block: Block, to_delta: Array, start: int) ->
 
 @dataclass(frozen=True)
 class WeightChoice:
-    """A weight and what it was chosen from: the score of every weight tried, in the order of the grid."""
+    """Chosen weight, with the score of every weight tried, in the order of the grid."""
 
     weight: float
     weights: tuple[float, ...]
@@ -281,7 +281,7 @@ class WeightChoice:
 def choose_weight(
     fit_for_weight: Callable[[float], Array], score: Callable[[Array], float], grid: Sequence[float]
 ) -> WeightChoice:
-    """The weight whose estimate explains recordings best that the fit never saw.
+    """Return the weight whose estimate explains held-out recordings best.
 
     Args:
         fit_for_weight: base parameters for a weight, shape (base,).

@@ -1,4 +1,4 @@
-"""The same conic problem in coordinates of a point: shift, unit columns, and matrices made the identity there.
+"""Precondition a conic problem around a point: shift, unit columns, and matrices made the identity there.
 
 With x = x0 + C y and a congruence U S U^T of every matrix slack S, a problem keeps its optimum but not its rounding:
 what was a difference of large numbers far out becomes a number of order one. Multipliers of a slack mapped by M map
@@ -23,10 +23,10 @@ _FLOOR = 1e-6  # of the largest eigenvalue: scaling by smaller ones would magnif
 
 @dataclass(frozen=True)
 class Rows:
-    """`F x + f` in one cone.
+    """Constraint `F x + f` in one cone.
 
     Attributes:
-        cone: which.
+        cone: kind of cone.
         F: shape (rows, variables).
         f: shape (rows,).
         size: rows of the matrix, for `semidefinite`; off-diagonal entries carry sqrt(2).
@@ -40,7 +40,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class Pose:
-    """A problem ready for the solver and the way back from its answer.
+    """Scaled problem for the solver, with the maps back to the original variables.
 
     Attributes:
         rows: constraints on y.
@@ -61,16 +61,16 @@ class Pose:
     scale: float
 
     def point(self, y: Array) -> Array:
-        """The variables in the problem's own coordinates."""
+        """Return the variables in the problem's original coordinates."""
         return np.asarray(self.origin + _apply(self.columns, y))
 
     def duals(self, found: Sequence[Array]) -> list[Array]:
-        """Multipliers in the problem's own coordinates."""
+        """Return the multipliers in the problem's original coordinates."""
         return [self.scale * _transposed(M, z) for M, z in zip(self.maps, found, strict=True)]
 
 
 def restated(rows: Sequence[Rows], objective: Array, hessian: Array, around: Array, columns: Columns | None) -> Pose:
-    """Pose a problem around a point, or as it is.
+    """Return the problem preconditioned around a point, or unchanged.
 
     Args:
         rows: constraints.
@@ -111,7 +111,7 @@ def restated(rows: Sequence[Rows], objective: Array, hessian: Array, around: Arr
 
 
 def _apply(M: Array, values: Array) -> Array:
-    """M as a matrix, or as the diagonal of one."""
+    """Return the product of M, a matrix or the diagonal of one, with `values`."""
     if M.ndim == 2:
         return np.asarray(M @ values)
     return np.asarray(M * values if values.ndim == 1 else M[:, None] * values)
@@ -151,7 +151,7 @@ def _matrix(entries: Array, size: int) -> Array:
 
 
 def _congruence(U: Array) -> Array:
-    """M with svec(U S U^T) = M svec(S), shape (entries, entries)."""
+    """Return M with svec(U S U^T) = M svec(S), shape (entries, entries)."""
     i, j, weight = _entries(len(U))
     # (U S U^T)_ab = sum_ij U_ai S_ij U_bj, each off-diagonal entry of S counted from both sides.
     both = U[np.ix_(i, i)] * U[np.ix_(j, j)] + U[np.ix_(i, j)] * U[np.ix_(j, i)]

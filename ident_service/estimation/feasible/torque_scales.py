@@ -1,4 +1,4 @@
-"""Constrained least squares that also finds what measured torques must be multiplied by.
+"""Solve constrained least squares together with factors of the measured torques.
 
 A joint's torque is known through a torque constant that may be off by some percent. With the joint's
 factor [R_j rho_j] of `[H_b | tau]`, its residual is R_j beta - k_j rho_j, linear in beta and k_j together; k_j lies
@@ -27,7 +27,7 @@ Bounds = Mapping[int, tuple[float, float]]
 
 @dataclass(frozen=True)
 class ScaledEstimate:
-    """A feasible estimate and what the torques it explains were multiplied by.
+    """Feasible estimate with the factors of the torques that it explains.
 
     Attributes:
         estimate: parameters; its objective is the whole weighted residual norm.
@@ -41,7 +41,7 @@ class ScaledEstimate:
 
 
 def scale_bounds(config: ArmConfig, joints: Sequence[str]) -> dict[int, tuple[float, float]]:
-    """Bounds by joint index, from `constraints.torque_constant`.
+    """Return the bounds of torque factors by joint index, from `constraints.torque_constant`.
 
     Raises:
         ParameterError: bounds for a joint that the arm does not have.
@@ -59,7 +59,7 @@ def constrained_least_squares_with_scales(
     bounds: Bounds,
     weights: Array | None = None,
 ) -> ScaledEstimate:
-    """The feasible base parameters, and torque factors within bounds, that explain the torques best.
+    """Return the feasible base parameters, and bounded torque factors, that explain the torques best.
 
     Where every joint is free the residual shrinks with all factors together, so they end at lower bounds; at least one
     fixed joint makes the factors mean something.
@@ -122,7 +122,7 @@ def constrained_least_squares_with_scales(
 
 
 def _stacked(information: Information, free: Sequence[int], weights: Array) -> Array:
-    """Triangular factor of the columns [W | -omega_j of each free joint | -omega of the others]."""
+    """Return the triangular factor of the columns [W | -omega_j of each free joint | -omega of the others]."""
     if weights.shape != (information.joints,):
         raise ParameterError(f"{weights.shape=} but there are {information.joints} joints")
     rows = []

@@ -1,1 +1,1 @@
-"""Proofs in exact arithmetic that parameters are feasible or not, their verifier, and export for other solvers."""
+"""Prove in exact arithmetic that parameters are feasible or not, and export the problems for other solvers."""

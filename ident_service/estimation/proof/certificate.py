@@ -1,4 +1,4 @@
-"""Certificates: from an estimate to a proof of feasibility or infeasibility in exact decimals (BPFT, eq. 51).
+"""Certify that an estimate is feasible or infeasible, by a proof in exact decimals (BPFT, eq. 51).
 
 Floating-point solvers only suggest; what they suggest is rounded, repaired so that all equations hold exactly, and
 checked with `fractions` before it is called a proof:
@@ -50,7 +50,7 @@ _CONTRADICTION = 1e-9
 
 @dataclass(frozen=True)
 class Certificate:
-    """A proof, or the admission that there is none.
+    """Proof of feasibility or infeasibility, or the statement that there is none.
 
     Attributes:
         verdict: what is proven.
@@ -116,7 +116,7 @@ def stated_arm(
     units: Sequence[str] = (),
     expressions: Sequence[str] | None = None,
 ) -> Arm:
-    """State what a certificate of an arm has to be about, in the decimals that a file holds.
+    """Return the data of an arm that its certificate has to be about, in the decimals that a file holds.
 
     Args:
         name: of the arm.
@@ -169,7 +169,7 @@ def _undecided(conditions: FeasibleSet, margin: float | None, reason: str) -> Ce
 
 
 def _smallest_file(certificate: Certificate, expressions: Sequence[str], beta: Array) -> str:
-    """The least parameter file that holds the certificate."""
+    """Return the least parameter file that holds the certificate."""
     return json.dumps(
         {
             "format": "ident-parameters",
@@ -195,7 +195,7 @@ def _witness(statement: Statement, conditions: FeasibleSet, delta: Array) -> dic
 
 
 def _body(statement: Statement, conditions: FeasibleSet) -> dict[str, str] | None:
-    """Find a body that meets all conditions, whatever the base parameters; None where they contradict each other."""
+    """Return a body that meets all conditions, whatever the base parameters; None where the conditions conflict."""
     try:
         delta = interior_point(conditions)
     except SolverError:
@@ -213,7 +213,7 @@ def _meeting(
     equations: Sequence[Mapping[str, Fraction]],
     right: Sequence[Fraction],
 ) -> dict[str, str] | None:
-    """Write the values that meet equations and conditions exactly, as texts; None where rounding breaks that."""
+    """Return values that meet equations and conditions exactly, as texts; None where rounding breaks that."""
     exact = repair(equations, right, values, lambda _: 1.0)
     if exact is None or not all(block.is_positive(exact) for block in statement.blocks):
         return None
@@ -260,7 +260,7 @@ def _dual(
 
 
 def _null_space(base: BaseParameters, conditions: FeasibleSet) -> Array:
-    """Directions of delta that change neither beta nor an equality, shape (parameters, directions)."""
+    """Return the directions of delta that change neither beta nor an equality, shape (parameters, directions)."""
     null = np.zeros((len(base.names), len(base.dependent)))
     null[base.base] = -np.linalg.solve(base.K[:, base.base], base.K[:, base.dependent])
     null[base.dependent, np.arange(len(base.dependent))] = 1.0
@@ -270,7 +270,7 @@ def _null_space(base: BaseParameters, conditions: FeasibleSet) -> Array:
 
 
 def _multipliers(statement: Statement, Z: Sequence[Sequence[Fraction]], y: Sequence[Fraction]) -> dict[str, Any]:
-    """The multipliers of a proof as texts: of base parameters in their order, of conditions by name."""
+    """Return the multipliers of a proof as texts: of base parameters in their order, of conditions by name."""
     texts = {
         block.name: [rational_text(z) for z in row] for block, row in zip(statement.blocks, Z, strict=True) if any(row)
     }
@@ -279,13 +279,13 @@ def _multipliers(statement: Statement, Z: Sequence[Sequence[Fraction]], y: Seque
         row = y[place : place + len(block.entries)]
         place += len(block.entries)
         if any(row):
-            # Of equalities it is E delta + e that is multiplied, as of blocks.
+            # Multipliers of equalities apply to E delta + e, as those of blocks do.
             texts[block.name] = [rational_text(-factor) for factor in row]
     return {"base": [rational_text(factor) for factor in y[: len(statement.K)]], "multipliers": texts}
 
 
 def _set_document(statement: Statement, conditions: FeasibleSet) -> dict[str, Any]:
-    """The set, its links, and every condition that the set's name does not imply already."""
+    """Return the set, its links, and every condition that the set's name does not imply already."""
     implied = {block.name: block for block in _implied(conditions)}
     blocks = [_block_document(block) for block in statement.blocks if implied.get(block.name) != block]
     equalities = [_block_document(block) for block in statement.equalities]
@@ -304,7 +304,7 @@ def _block_document(block: ExactBlock) -> dict[str, Any]:
 
 
 def _bounds(beta: Array, names: Sequence[str], bound: float) -> list[Block]:
-    """Bounds that no arm exceeds, for sets that are unbounded along a direction which is not diagonal."""
+    """Return bounds that no arm exceeds, for sets that are unbounded along a direction which is not diagonal."""
     most = bound * 10.0 ** max(0, int(np.ceil(np.log10(max(float(np.abs(beta).max(initial=0.0)), 1.0)))))
     index = {name: column for column, name in enumerate(names)}
     blocks = []

@@ -1,4 +1,4 @@
-"""Dual matrices that disprove feasibility, found numerically.
+"""Find dual matrices that disprove feasibility, numerically.
 
 The alternative to BPFT (eq. 51) with `D > 0`: Z >= 0, not zero, with `<F_k d, Z_k>` summing to zero for every d with
 `K d = 0` and `sum_k <F_k(delta) + f_k, Z_k> <= 0` at any delta with `K delta = beta`. Of all such Z an interior-point
@@ -29,7 +29,7 @@ _INTERIOR = 1e-9
 
 
 def dual_candidates(blocks: Sequence[Block], null: Array, delta: Array) -> Iterator[list[Array]]:
-    """Multipliers with a negative value, best first; none where no strictly feasible dual is found.
+    """Yield multipliers with a negative value, best first; none where no strictly feasible dual is found.
 
     Args:
         blocks: the conditions.
@@ -110,7 +110,7 @@ def _reduce(blocks: Sequence[Block], null: Array) -> list[Part]:
 
 
 def _most_interior(parts: Sequence[Part], A: Array, trace: Array) -> Array | None:
-    """The Z of trace 1 on the subspace whose smallest eigenvalue is largest, where that is positive."""
+    """Return the Z of trace 1 on the subspace whose smallest eigenvalue is largest, where that is positive."""
     count = len(trace)
     problem = ConicProblem(count + 1)
     unit = split(parts, np.eye(count))

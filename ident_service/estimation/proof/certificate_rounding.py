@@ -1,7 +1,4 @@
-"""From floating point to exact statements: what is to be proven, and multipliers rounded to decimals that prove it.
-
-Boundary: pure computation, no I/O.
-"""
+"""Round floating-point statements and multipliers to exact decimals that still prove the statement."""
 
 from __future__ import annotations
 
@@ -25,7 +22,7 @@ Key = tuple[int, int]  # block and entry of a multiplier; block -1 for the multi
 
 @dataclass(frozen=True)
 class Statement:
-    """What is to be proven, in numbers as they are printed.
+    """Statement to be proven, in exact numbers as they are printed.
 
     Attributes:
         names: link parameters.
@@ -43,17 +40,17 @@ class Statement:
 
     @property
     def rows(self) -> list[Mapping[str, Fraction]]:
-        """Left-hand sides of all linear equations on delta: K, then the equalities."""
+        """Return the left-hand sides of all linear equations on delta: K, then the equalities."""
         return [*self.K, *(entry.coefficients for block in self.equalities for entry in block.entries)]
 
     @property
     def right(self) -> list[Fraction]:
-        """Their right-hand sides."""
+        """Return the right-hand sides of the equations whose left-hand sides are `rows`."""
         return [*self.beta, *(-entry.constant for block in self.equalities for entry in block.entries)]
 
 
 def exact_block(block: Block, names: Sequence[str]) -> ExactBlock:
-    """The block with its coefficients as decimals."""
+    """Return the block with its coefficients as decimals."""
     entries = tuple(
         Affine({names[int(column)]: printed(row[column]) for column in np.flatnonzero(row)}, printed(constant))
         for row, constant in zip(block.F, block.f, strict=True)
@@ -62,17 +59,17 @@ def exact_block(block: Block, names: Sequence[str]) -> ExactBlock:
 
 
 def printed(value: float) -> Fraction:
-    """The number that a file shows: the shortest decimal that reads back as this float."""
+    """Return the number that a file shows: the shortest decimal that reads back as this float."""
     return Fraction(repr(float(value)))
 
 
 def trace(block: ExactBlock, z: Sequence[Fraction]) -> Fraction:
-    """Trace of a multiplier, or sum of its numbers."""
+    """Return the trace of a multiplier, or the sum of its numbers."""
     return sum((v for v, n in zip(z, counts(block), strict=True) if n == 1), Fraction(0))
 
 
 def counts(block: ExactBlock) -> list[int]:
-    """How often each entry counts in an inner product of symmetric matrices."""
+    """Return how often each entry counts in an inner product of symmetric matrices."""
     return [1 if i == j else 2 for i, j in triangle(block.size)] if block.size else [1] * len(block.entries)
 
 
@@ -124,7 +121,7 @@ def prove(
 
 
 def _smallest(block: ExactBlock, z: Array) -> float:
-    """Smallest eigenvalue on the rows that facial reduction left, zero where it left none."""
+    """Return the smallest eigenvalue on the rows that facial reduction left, zero where it left none."""
     if block.size == 0:
         return float(min(z[z != 0.0], default=0.0))
     matrix = np.zeros((block.size, block.size))
@@ -153,7 +150,7 @@ def repair(
         equations: coefficients by unknown.
         right: right-hand sides.
         values: what is nearly a solution.
-        weight: how readily an unknown may change.
+        weight: the larger, the sooner an unknown is changed.
 
     Returns:
         The values that solve the equations, or None where these contradict each other.

@@ -1,4 +1,4 @@
-"""The cone of dual matrices, and the interior-point path in it that never leaves the interior.
+"""Follow the central path in the cone of dual matrices, always in the interior.
 
 A point is one vector: per block the upper triangle of a matrix, column by column, with sqrt(2) beside the diagonal, so
 that inner products of vectors are those of matrices. Pure computation, no I/O.
@@ -22,7 +22,7 @@ _CENTRED = 0.1  # Newton decrement
 
 @dataclass(frozen=True)
 class Part:
-    """One block of the dual cone: a matrix over `rows` of its block, or the numbers `rows` of a list.
+    """Block of the dual cone: a matrix over `rows` of its block, or the numbers `rows` of a list.
 
     Attributes:
         block: index in the list of blocks.
@@ -42,17 +42,17 @@ class Part:
 
 
 def identity(part: Part) -> Array:
-    """Entries of the identity matrix, or of ones, shape (entries,)."""
+    """Return the entries of the identity matrix, or of ones, shape (entries,)."""
     return part.duplication.T @ np.eye(len(part.rows)).ravel() if part.matrix else np.ones(len(part.rows))
 
 
 def split(parts: Sequence[Part], z: Array) -> list[Array]:
-    """The rows of `z` that belong to each part, shape (entries, ...) each."""
+    """Return the rows of `z` that belong to each part, shape (entries, ...) each."""
     return np.split(z, np.cumsum([len(part.entries) for part in parts])[:-1])
 
 
 def central_path(parts: Sequence[Part], c: Array, z: Array, normals: Array) -> Iterator[Array]:
-    """Points of the central path of `minimise c.z` with a negative value.
+    """Yield points of the central path of `minimise c.z` with a negative value.
 
     Args:
         parts: the cone.
@@ -77,7 +77,7 @@ def central_path(parts: Sequence[Part], c: Array, z: Array, normals: Array) -> I
 
 
 def _centre(parts: Sequence[Part], c: Array, z: Array, normals: Array) -> Array | None:
-    """Newton's method for `minimise c.z - log det Z` across the normals; None where it stalls.
+    """Minimise `c.z - log det Z` across the normals by Newton's method; None where it stalls.
 
     With Z = L L^T, the map X -> L X L^T takes the identity to Z and the barrier's Hessian to the identity: each step is
     a projection, small and accurate however close to the boundary Z is.
@@ -104,7 +104,7 @@ def _centre(parts: Sequence[Part], c: Array, z: Array, normals: Array) -> Array 
 
 
 def _step_length(slope: float, spectrum: Array) -> float:
-    """The minimum over a of `slope a - sum log(1 + a spectrum)`, by bisection on its derivative, 1 at most."""
+    """Return the minimiser a of `slope a - sum log(1 + a spectrum)`, by bisection on its derivative, 1 at most."""
     lowest = float(spectrum.min())
     low, high = 0.0, min(1.0, -0.99 / lowest) if lowest < 0.0 else 1.0
     if slope - float(np.sum(spectrum / (1.0 + high * spectrum))) <= 0.0:
@@ -119,14 +119,14 @@ def _step_length(slope: float, spectrum: Array) -> float:
 
 
 def _spectrum(part: Part, entries: Array) -> Array:
-    """Eigenvalues of a matrix block, or its numbers."""
+    """Return the eigenvalues of a matrix block, or its numbers."""
     if not part.matrix:
         return entries
     return np.asarray(np.linalg.eigvalsh((part.duplication @ entries).reshape(len(part.rows), -1)), dtype=float)
 
 
 def colouring(parts: Sequence[Part], z: Array) -> list[Array] | None:
-    """Per part the map of entries X -> L X L^T with Z = L L^T; None outside the interior of the cone."""
+    """Return per part the map of entries X -> L X L^T with Z = L L^T; None outside the interior of the cone."""
     maps = []
     for part, piece in zip(parts, split(parts, z), strict=True):
         if not part.matrix:

@@ -1,4 +1,4 @@
-"""The feasibility problems in SDPA sparse format (.dat-s), as the paper's authors handed them to a solver (section 5).
+"""Write the feasibility problems in SDPA sparse format (.dat-s), as used by the paper's authors (section 5).
 
 `minimise c^T x  subject to  sum_i x_i F_i - F_0 >= 0`, block-diagonal, with norms as Schur complements (eqs. 54, 73).
 Conditions that are numbers, and each equality as two of them, stand in diagonal blocks. Writer only, pure computation,
@@ -24,7 +24,7 @@ _LARGEST_MARGIN = 1e3  # as in the feasibility test: nothing may bound the margi
 
 
 def bpft_sdpa(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> str:
-    """BPFT (eq. 51) as a largest margin: minimise -t over (t, delta_d) with D(beta, delta_d) - t 1 >= 0.
+    """Write BPFT (eq. 51) as a largest margin: minimise -t over (t, delta_d) with D(beta, delta_d) - t 1 >= 0.
 
     Args:
         beta: base parameters in SI units, shape (base,).
@@ -47,7 +47,7 @@ def bpft_sdpa(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> str
 
 
 def bpfc_sdpa(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> str:
-    """BPFC (eq. 55): minimise u over (u, beta, delta_d) with [[u, (b - beta)^T], [b - beta, 1]] >= 0 (eq. 54).
+    """Write BPFC (eq. 55): minimise u over (u, beta, delta_d) with [[u, (b - beta)^T], [b - beta, 1]] >= 0 (eq. 54).
 
     Args:
         beta: base parameters b in SI units, shape (base,).
@@ -65,7 +65,7 @@ def bpfc_sdpa(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> str
 
 
 def fbpe_sdpa(fit: LeastSquares, base: BaseParameters, conditions: FeasibleSet) -> str:
-    """FBPE-OLS (eq. 74): minimise u over (u, beta, delta_d) with U_rho(u, beta) >= 0 (eq. 73).
+    """Write FBPE-OLS (eq. 74): minimise u over (u, beta, delta_d) with U_rho(u, beta) >= 0 (eq. 73).
 
     Args:
         fit: unconstrained estimate, for R_1, rho_1 and |rho_2|.
@@ -84,7 +84,7 @@ def fbpe_sdpa(fit: LeastSquares, base: BaseParameters, conditions: FeasibleSet) 
 
 @dataclass
 class _File:
-    """Blocks gathered one by one, then written.
+    """SDPA file: blocks are added one by one, then it is written.
 
     Attributes:
         title: what the problem is.
@@ -100,11 +100,11 @@ class _File:
     _entries: list[tuple[int, int, int, int, float]] = field(default_factory=list)
 
     def matrix(self, name: str, size: int, F: Array, f: Array) -> None:
-        """A symmetric matrix `F x + f`, upper triangle column by column, that must be positive semidefinite."""
+        """Add a symmetric matrix `F x + f`, upper triangle column by column, that must be positive semidefinite."""
         self._add(name, size, triangle_entries(size), F, f)
 
     def numbers(self, name: str, F: Array, f: Array) -> None:
-        """Numbers `F x + f` that must not be negative."""
+        """Add numbers `F x + f` that must not be negative."""
         self._add(name, -len(f), [(i, i) for i in range(len(f))], F, f)
 
     def _add(self, name: str, size: int, places: Sequence[tuple[int, int]], F: Array, f: Array) -> None:
@@ -119,7 +119,7 @@ class _File:
             ]
 
     def text(self) -> str:
-        """The file."""
+        """Return the text of the file."""
         values = [*self.objective, *(entry[-1] for entry in self._entries)]
         if not np.all(np.isfinite(values)):
             raise ParameterError(f"{self.title}: a coefficient is not finite")
@@ -135,7 +135,7 @@ class _File:
 def _nearest(
     title: str, metric: Array, target: Array, offset: float, base: BaseParameters, conditions: FeasibleSet
 ) -> str:
-    """Minimise u with `u - offset >= |target - metric beta|^2`."""
+    """Return the text of the problem: minimise u with `u - offset >= |target - metric beta|^2`."""
     lift = Lift(base)
     n, dependents = base.size, len(lift.dependent)
     names = ["u", *(f"beta_{i} = {text}" for i, text in enumerate(base.expressions, 1))]
@@ -159,7 +159,7 @@ def _nearest(
 def _conditions(
     file: _File, conditions: FeasibleSet, fixed: Array, to_delta: Array, inset: float, *, margin: bool
 ) -> None:
-    """Every block of D at `delta = to_delta x + fixed`, less the inset, or less t, which is then the first variable."""
+    """Add every block of D at `delta = to_delta x + fixed`, less the inset, or less t, the first variable then."""
     for block in conditions.blocks:
         F, f = block.F @ to_delta, block.f + block.F @ fixed - inset * block.identity()
         if margin:

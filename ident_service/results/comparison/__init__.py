@@ -1,1 +1,1 @@
-"""Two or more parameter sets side by side, and what has changed between them: as a document, words and a page."""
+"""Compare two or more parameter sets, and present the changes as a document, text and a page."""

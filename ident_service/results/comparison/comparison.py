@@ -1,10 +1,10 @@
-"""Two or more parameter sets against each other: the first is the reference that the others are compared with.
+"""Compare two or more parameter sets: the first is the reference that the others are compared with.
 
 Parameters are the same where their expressions are: two runs of one arm, or two arms of one kind. What only one side
 has is listed and left out. Whether anything has changed is `estimation/drift.py`'s to say; where a side has no
 covariance, as tables in papers, there are differences and no verdict.
 
-The shape of friction (way of pre-sliding, Stribeck velocity) may be fitted to each recording. With another shape the
+The shape of friction (pre-sliding distance, Stribeck velocity) may be fitted to each recording. With another shape the
 same parameter is another quantity, and no covariance knows of it: friction of such a joint is not compared, and without
 it nothing is called unchanged.
 """
@@ -33,7 +33,7 @@ Verdict = Literal["unchanged", "changed", "impossible"]
 
 @dataclass(frozen=True)
 class Crossed:
-    """Both sides' parameters on the torques that the second side was identified from."""
+    """Torque errors of both sides' parameters on the data that the second side was identified from."""
 
     reference: TorqueError
     own: TorqueError
@@ -41,7 +41,7 @@ class Crossed:
 
 @dataclass(frozen=True)
 class Pair:
-    """One side against the reference.
+    """Comparison of one side with the reference.
 
     Attributes:
         side: the one that is compared.
@@ -79,33 +79,33 @@ class Pair:
 
     @property
     def verdict(self) -> Verdict:
-        """In one word."""
+        """Return the verdict in one word; `impossible` also where friction of another shape was left out."""
         if self.drift is None or (self.drift.verdict == "unchanged" and self.other_shape):
             return "impossible"
         return self.drift.verdict
 
     @property
     def contradicted(self) -> bool:
-        """Whether nothing has changed by the test, and the values in use predict other torques nevertheless."""
+        """Return whether the test finds no change, though the values in use predict other torques."""
         return self.verdict == "unchanged" and self.in_use.matters
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A reference and what was compared with it."""
+    """Reference and the sides that were compared with it."""
 
     reference: Side
     pairs: tuple[Pair, ...]
 
     @property
     def verdict(self) -> Verdict:
-        """`changed` where any has changed, else `impossible` where any cannot be tested."""
+        """Return `changed` where any side has changed, else `impossible` where any cannot be tested."""
         words = [pair.verdict for pair in self.pairs]
         return "changed" if "changed" in words else "impossible" if "impossible" in words else "unchanged"
 
 
 def compare(sides: Sequence[Side]) -> Comparison:
-    """Compare parameter sets.
+    """Compare parameter sets with the first of them.
 
     Args:
         sides: two or more; the first is the reference.
@@ -197,7 +197,7 @@ def _other_shape(reference: Side, side: Side) -> tuple[int, ...]:
 
 
 def _shaped(name: str, joints: Sequence[int]) -> bool:
-    """Whether what a parameter means hangs on the shape of the friction of these joints."""
+    """Return whether a parameter's meaning depends on the shape of the friction of these joints."""
     return (
         name.startswith("f") and not name.startswith("fo") and int(name.lstrip("abcdefghijklmnopqrstuvwxyz")) in joints
     )
@@ -213,7 +213,7 @@ def _names(side: Side, joints: Sequence[int]) -> list[str]:
 
 
 def _crossed(reference: Side, side: Side, places: tuple[NDArray[np.intp], NDArray[np.intp]]) -> Crossed | None:
-    """With the values as they are used, held in a feasible set or not."""
+    """Return torque errors with the values in use, held in a feasible set or not; None where tables differ."""
     size = side.file.base.size
     if side.information is None or len(places[0]) != size or size != reference.file.base.size:
         return None

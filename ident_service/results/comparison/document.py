@@ -1,4 +1,4 @@
-"""A comparison as JSON, held against its schema before it is written."""
+"""Write a comparison as JSON, validated against its schema."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ident_service.results.schemas import require_schema
 
 
 def comparison_document(comparison: Comparison) -> dict[str, Any]:
-    """The content of `comparison.json`."""
+    """Return the content of `comparison.json`."""
     return {
         "format": "ident-comparison",
         "version": 1,

@@ -1,4 +1,4 @@
-"""The drawings of a comparison: friction of both over velocity, joint by joint, and every parameter's z."""
+"""Draw a comparison: friction of both sides over velocity, joint by joint, and every parameter's z."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _LARGEST_Z = 1e3
 
 
 def friction_curves(reference: Side, pair: Pair, place: int) -> list[Figure]:
-    """One figure per joint with friction on both sides.
+    """Return one figure per joint with friction on both sides.
 
     Args:
         reference: the first side.
@@ -67,7 +67,7 @@ def friction_curves(reference: Side, pair: Pair, place: int) -> list[Figure]:
 
 
 def z_figure(found: Drift, place: int) -> Figure:
-    """Every parameter's difference in standard deviations, on a scale that shows 1 as well as 1000."""
+    """Draw every parameter's difference in standard deviations, on a scale that shows 1 as well as 1000."""
     size = len(found.z)
     shown = _squeezed(np.clip(found.z, -_LARGEST_Z, _LARGEST_Z))
     canvas = Canvas(WIDTH, _TOP + _HEIGHT + _BOTTOM)
@@ -86,7 +86,7 @@ def z_figure(found: Drift, place: int) -> Figure:
     for k in range(size):
         x, y = float(axes.x(k + 1.0)), float(axes.y(shown[k]))
         beyond = found.p[k] < ALPHA
-        # Shape tells what colour tells.
+        # Shape repeats what colour shows.
         if beyond:
             canvas.rectangle("bad", x - 3.6, y - 3.6, 7.2, 7.2)
         else:
@@ -104,7 +104,7 @@ def z_figure(found: Drift, place: int) -> Figure:
 
 
 def _levels(limit: float) -> tuple[float, ...]:
-    """Standard deviations to mark on a squeezed scale up to a limit, so far apart that their numbers can be read."""
+    """Return the standard deviations to mark on a squeezed scale up to a limit, far enough apart to be read."""
     levels = (0.0, 1.0, 3.0, 10.0, 30.0) if limit < 4.5 else (0.0, 1.0, 10.0, 100.0, 1000.0)
     return tuple(level for level in levels if np.arcsinh(level) <= limit)
 
@@ -114,7 +114,7 @@ def _squeezed(z: Array) -> Array:
 
 
 def _friction(side: Side) -> dict[int, dict[JointTerm, float]]:
-    """Per joint, from 1, the value of each friction term that is a base parameter of its own."""
+    """Return per joint, from 1, the value of each friction term that is a base parameter of its own."""
     found: dict[int, dict[JointTerm, float]] = {}
     for name, value in zip(side.leading, side.file.values.tolist(), strict=True):
         symbol = name.rstrip("0123456789")
@@ -124,7 +124,7 @@ def _friction(side: Side) -> dict[int, dict[JointTerm, float]]:
 
 
 def _units(side: Side, joint: int) -> tuple[str, str]:
-    """Of torque and velocity; a file that does not say is taken for an arm of turning joints."""
+    """Return the units of torque and velocity of a joint; a revolute joint's where the file does not say."""
     units = dict(zip(side.leading, side.content["base_parameters"].get("units", []), strict=False))
     slides = any(units.get(f"{symbol}{joint}") in ("N", "N s/m") for symbol in _TERMS)
     return ("N", "m/s") if slides else ("N m", "rad/s")
@@ -143,7 +143,7 @@ def _curve(side: Side, terms: Mapping[JointTerm, float], at: Array, joint: int) 
 
 
 def _fastest(pair: Pair, joint: int) -> float:
-    """Of the compared motion, where it is known."""
+    """Return the largest velocity of the friction curves, from the compared motion; 1 where none is known."""
     if pair.compared is not None:
         first, second = pair.compared
         motion, name = second.motion or first.motion, f"fv{joint}"

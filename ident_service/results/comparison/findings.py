@@ -1,4 +1,4 @@
-"""What has changed, as findings that a person can act on.
+"""Describe changes of parameters as findings that a person can act on.
 
 A body that explains the change stands for the effects on all links that it has in the base parameters; friction and
 drive inertia are base parameters of their own joint, and are findings beside it.
@@ -18,16 +18,16 @@ EXPLAINS = 0.9  # of the squared change of torque; a single cause that explains 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that has changed.
+    """Description of one change, for a person.
 
     Attributes:
-        what: and of which joint or link.
+        what: name of the changed quantity, and of its joint or link.
         sigma: length of the change in standard deviations.
         joint: the one whose torque changes most for its size; empty where no motion is known.
         torque_share: of that joint's torque, by which its prediction changes; None likewise.
         residual_share: of what is unexplained of it; None likewise.
-        size: how much, in words; may be empty.
-        meaning: what it may mean.
+        size: of the change, in words; may be empty.
+        meaning: possible meaning, in words.
     """
 
     what: str
@@ -40,7 +40,7 @@ class Finding:
 
 
 def findings(pair: Pair) -> tuple[Finding, ...]:
-    """What has changed between the reference and a side; nothing where nothing has."""
+    """Return the changes between the reference and a side; empty where nothing has changed."""
     found, compared = pair.drift, pair.compared
     if found is None or compared is None or found.verdict != "changed":
         return ()
@@ -56,7 +56,7 @@ def findings(pair: Pair) -> tuple[Finding, ...]:
 
 
 def joint_name(pair: Pair, number: int) -> str:
-    """Of a joint counted from 1: its name where a side knows it."""
+    """Return the name of a joint counted from 1, or its number where the side knows no name."""
     names = pair.side.joints
     return names[number - 1] if names is not None and number <= len(names) else str(number)
 
@@ -67,7 +67,7 @@ def _links(pair: Pair) -> int:
 
 
 def _whole(pair: Pair, found: Drift, cause: Cause | None, links: int) -> Finding:
-    """The change of all parameters together."""
+    """Return the change of all parameters together, as a finding."""
     joint, torque, residual = "", None, None
     if found.torque_share is not None and found.residual_share is not None:
         worst = int(found.residual_share.argmax())

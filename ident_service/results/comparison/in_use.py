@@ -1,4 +1,4 @@
-"""The values that two sides are used with, which need not be those that are tested.
+"""Compare the values that two sides are used with, which need not be those that are tested.
 
 Tests are made of unconstrained values, to which the covariances belong. Exports, models and torque errors are made of
 the values held in a feasible set, so these may differ where the arm has not changed: by another set, another method, or
@@ -37,11 +37,11 @@ class InUse:
 
     @property
     def matters(self) -> bool:
-        """Whether their difference changes some joint's torque by as much as a change of the arm would have to."""
+        """Return whether the difference of the values in use changes some joint's torque by a relevant amount."""
         return self.shares is not None and relevant(self.shares)
 
     def worst(self) -> tuple[int, float] | None:
-        """The joint, from 0, whose torque they change by the largest share, and that share."""
+        """Return the joint, from 0, whose torque the difference changes by the largest share, and that share."""
         if self.shares is None:
             return None
         joint = int(np.argmax(self.shares[0]))
@@ -53,7 +53,7 @@ def values_in_use(
     places: Sequence[NDArray[np.intp]],
     compared: tuple[Identified, Identified] | None,
 ) -> InUse:
-    """Of two sides.
+    """Return the values in use of the shared parameters of two sides.
 
     Args:
         sides: the reference and the other.

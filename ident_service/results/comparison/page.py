@@ -1,6 +1,6 @@
-"""A comparison as one self-contained HTML page: no network, no script.
+"""Write a comparison as one self-contained HTML page: no network, no script.
 
-Boundary: a comparison in, text out. Look and words of a page are the report's.
+Look and words of the page are those of the report.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _NOTHING = Cell("\u2014")
 
 
 def comparison_html(comparison: Comparison) -> str:
-    """A whole HTML document."""
+    """Return a comparison as a whole HTML document."""
     reference = comparison.reference
     arm = reference.content.get("arm", {}).get("name", "")
     title = f"Comparison of {arm}".strip() if arm else "Comparison of parameters"

@@ -1,4 +1,4 @@
-"""What takes part in a comparison: a folder of results, or a parameter file, with what can be tested of it.
+"""Read the sides of a comparison, folders of results or parameter files, with their testable values.
 
 Nothing is judged here; `comparison.py` does that.
 """
@@ -26,13 +26,13 @@ from ident_service.results.information_document import information_from
 from ident_service.results.parameter_file import ParameterFile, read_parameters
 from ident_service.results.run_folder import PARAMETERS, read_results
 
-_DECIMALS = 9  # of a coefficient of an expression, in which two arms of one kind agree
+_DECIMALS = 9  # of coefficients; expressions that agree to these are the same parameter
 Key = tuple[tuple[str, float], ...]
 
 
 @dataclass(frozen=True)
 class Side:
-    """One parameter set of a comparison.
+    """Parameter set that takes part in a comparison.
 
     Attributes:
         path: folder or file as it was given.
@@ -48,18 +48,18 @@ class Side:
 
     @property
     def name(self) -> str:
-        """A short one: of the folder, or of the file where it is not called as in a folder of results."""
+        """Return a short name: of the folder, or of the file where it is not called as in a folder of results."""
         path = self.path.absolute()
         return path.parent.name if path.name == PARAMETERS else path.name
 
     @property
     def content(self) -> Mapping[str, Any]:
-        """Everything in the parameter file."""
+        """Return everything in the parameter file."""
         return self.file.content
 
     @cached_property
     def keys(self) -> tuple[Key, ...]:
-        """Each base parameter's expression in a form that does not depend on how it is written."""
+        """Return each base parameter's expression in a form that does not depend on how it is written."""
         expressions = self.content["base_parameters"]["expressions"]
         return tuple(
             tuple(sorted((name, round(value, _DECIMALS)) for name, value in parse_expression(expression).items()))
@@ -68,18 +68,18 @@ class Side:
 
     @cached_property
     def leading(self) -> tuple[str, ...]:
-        """The link parameter that each base parameter is named after."""
+        """Return the link parameter that each base parameter is named after."""
         return tuple(self.file.base.names[column] for column in self.file.base.base)
 
     @cached_property
     def joints(self) -> tuple[str, ...] | None:
-        """Names of the arm's joints; None where the file does not say."""
+        """Return the names of the arm's joints; None where the file does not say."""
         arm = self.content.get("arm")
         return None if arm is None else tuple(arm["joints"])
 
     @cached_property
     def covariance(self) -> Array | None:
-        """Of the unconstrained estimate, shape (base, base), infinite on the diagonal where nothing was seen.
+        """Return the covariance of the unconstrained estimate, shape (base, base), infinite where unseen; None without.
 
         Raises:
             ParameterError: it is none.
@@ -90,7 +90,7 @@ class Side:
         size = self.file.base.size
         if len(rows) != size or any(len(row) != size for row in rows):
             raise ParameterError(f"{self.path}: covariance is not {size} by {size}")
-        # Where nothing was seen, what belongs to it is no number either.
+        # Covariances with an unseen parameter are null in the file, too.
         unseen = np.array([rows[k][k] is None for k in range(size)])
         matrix = np.array([[0.0 if value is None else value for value in row] for row in rows], dtype=float)
         matrix[unseen, :] = matrix[:, unseen] = 0.0
@@ -104,7 +104,7 @@ class Side:
 
     @property
     def unconstrained(self) -> Array | None:
-        """Values before they were held in a feasible set, shape (base,); None where the file does not have them."""
+        """Return the values before they were held in a feasible set, shape (base,); None where the file has none."""
         values = self.content["base_parameters"].get("unconstrained_values")
         if values is None and self.content.get("feasible_set") == "none":
             return self.file.values
@@ -112,7 +112,7 @@ class Side:
 
     @cached_property
     def information(self) -> Information | None:
-        """Of the recordings that were fitted to.
+        """Return the information of the recordings that were fitted to; None where the file has none.
 
         Raises:
             ParameterError: it does not fit the parameters.
@@ -126,7 +126,7 @@ class Side:
             raise ParameterError(f"{self.path}: {error}") from None
 
     def identified(self, places: NDArray[np.intp], *, free: bool) -> Identified | None:
-        """What can be tested of some of its parameters; None where it has no covariance.
+        """Return the testable values of some parameters, with their covariance; None without a covariance.
 
         Args:
             places: which, in the order of the comparison.

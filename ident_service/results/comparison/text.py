@@ -1,4 +1,4 @@
-"""A comparison for a person at a terminal."""
+"""Describe a comparison in text, for a person at a terminal."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LEFT_OUT = (
 
 
 def comparison_text(comparison: Comparison) -> str:
-    """Several lines of plain text, ending with a line break."""
+    """Describe a comparison in several lines of plain text, ending with a line break."""
     lines = [f"reference: {_called(comparison.reference)}"]
     for pair in comparison.pairs:
         lines += [f"compared:  {_called(pair.side)}", "", *_pair(comparison, pair)]
@@ -69,7 +69,7 @@ def _pair(comparison: Comparison, pair: Pair) -> list[str]:
 
 
 def verdict_lines(pair: Pair) -> list[str]:
-    """The verdict and what it rests on."""
+    """Return the verdict and what it rests on, in lines."""
     if pair.drift is None or pair.verdict == "impossible":
         return [f"NO VERDICT: {pair.reason}"]
     if pair.drift.verdict == "unchanged":
@@ -83,7 +83,7 @@ def verdict_lines(pair: Pair) -> list[str]:
 
 
 def contradiction(pair: Pair) -> str:
-    """Why an arm that has not changed has values in use that predict other torques; empty where they do not."""
+    """Return why an unchanged arm has values in use that predict other torques; empty where they do not."""
     worst = pair.in_use.worst()
     if not pair.contradicted or worst is None:
         return ""
@@ -106,7 +106,7 @@ def contradiction(pair: Pair) -> str:
 
 
 def tested_line(pair: Pair) -> str:
-    """Which values the tests are about; empty where nothing is tested."""
+    """Return which values the tests are about, in words; empty where nothing is tested."""
     if pair.compared is None:
         return ""
     if not pair.free:
@@ -116,14 +116,14 @@ def tested_line(pair: Pair) -> str:
 
 
 def shortened(rows: Sequence[str]) -> list[str]:
-    """The first few of many, and how many more there are."""
+    """Return the first few of many rows, and how many more there are."""
     if len(rows) <= _MOST:
         return list(rows)
     return [*rows[:_MOST], f"and {len(rows) - _MOST} more (all of them in the JSON)"]
 
 
 def finding_line(finding: Finding) -> str:
-    """One finding in one line."""
+    """Return one finding in one line."""
     parts = [f"{finding.sigma:.3g} sigma"]
     if finding.torque_share is not None:
         parts.append(f"{finding.torque_share:.2%} of the torque of joint {finding.joint}")

@@ -1,1 +1,1 @@
-"""What a report draws that `parameters.json` does not say: made once, kept beside it, checked when it is read."""
+"""Gather, store and read the evidence that a report draws beside `parameters.json`."""

@@ -1,4 +1,4 @@
-"""The links as bodies: how far inside each condition they lie, and the ellipsoids that move as they do.
+"""Compute bodies of the links: their margins in each condition, and the ellipsoids that move as they do.
 
 A solid ellipsoid of uniform density with half axes a_1, a_2, a_3 and mass m has second moments m a_i^2 / 5 about
 its centre. So the ellipsoid with a link's mass, centre and inertia has a_i = sqrt(5 s_i / m), with s_i the eigenvalues
@@ -19,7 +19,7 @@ from ident_service.results.evidence.evidence import Array, Body, Condition, Pose
 
 
 def conditions_of(estimate: Estimate) -> tuple[Condition, ...]:
-    """Every condition of the feasible set at the link parameters; none where there are no link parameters."""
+    """Return every condition of the feasible set at the link parameters; none where there are no link parameters."""
     if estimate.delta is None:
         return ()
     found = []
@@ -32,7 +32,7 @@ def conditions_of(estimate: Estimate) -> tuple[Condition, ...]:
 
 
 def bounds_of(tight: tuple[str, ...], conditions: FeasibleSet, base: BaseParameters) -> tuple[tuple[str, ...], ...]:
-    """Per base parameter, the conditions of `tight` that the first link parameter of its sum takes part in."""
+    """Return per base parameter the active conditions (`tight`) that involve the first link parameter of its sum."""
     touched = {
         block.name: set(np.flatnonzero(np.any(block.F != 0.0, axis=0)).tolist())
         for block in (*conditions.blocks, *conditions.equalities)
@@ -41,7 +41,7 @@ def bounds_of(tight: tuple[str, ...], conditions: FeasibleSet, base: BaseParamet
 
 
 def posed(model: ArmModel, delta: Array | None, positions: Array) -> Posed | None:
-    """The arm, its bodies on it, in the posture of a motion that shows most.
+    """Return the arm, with its bodies, in the most telling posture of a motion.
 
     Args:
         model: the arm.
@@ -61,7 +61,7 @@ def posed(model: ArmModel, delta: Array | None, positions: Array) -> Posed | Non
 
 
 def _most_telling(points: Array) -> int:
-    """The posture whose frames lie farthest from each other, as seen from the side and from above."""
+    """Return the posture whose frames lie farthest from each other, as seen from the side and from above."""
     seen = np.zeros(len(points))
     for view in ((0, 2), (0, 1)):
         flat = points[:, :, view]
@@ -71,7 +71,7 @@ def _most_telling(points: Array) -> int:
 
 
 def ellipsoid(inertial: Array) -> tuple[float, Array, Array | None]:
-    """The solid ellipsoid that moves as a body does.
+    """Return the solid ellipsoid that moves as a body does.
 
     Args:
         inertial: the ten parameters of eq. 13, about the link frame's origin, shape (10,).
@@ -85,7 +85,7 @@ def ellipsoid(inertial: Array) -> tuple[float, Array, Array | None]:
         return m, np.zeros(3), None
     center = np.array([lx, ly, lz]) / m
     L = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    # About the origin; the centre's own share goes (Steiner).
+    # Shift from the origin to the centre of mass (Steiner).
     second = 0.5 * np.trace(L) * np.eye(3) - L - m * np.outer(center, center)
     values, vectors = np.linalg.eigh(second)
     if values[0] <= 0.0:

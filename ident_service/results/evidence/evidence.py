@@ -1,7 +1,7 @@
-"""What a person needs to see before believing an estimate, and what `parameters.json` does not say.
+"""Represent the evidence that a person needs to believe an estimate, beyond `parameters.json`.
 
-Boundary: data. It is gathered in `making.py`, kept in `evidence.json` (`file.py`), and drawn by the
-report. The correlation of the parameters is not here, because the parameter file has their covariance.
+The data are gathered in `making.py`, kept in `evidence.json` (`file.py`), and drawn by the report. The correlation of
+the parameters is not here, because the parameter file has their covariance.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Role = Literal["identification", "validation"]
 
 @dataclass(frozen=True)
 class Estimated:
-    """One estimate among those that stand side by side.
+    """Estimate among those that stand side by side, with its torque errors.
 
     Attributes:
         name: for tables; `CAD` for the arm's prior parameters.
@@ -27,7 +27,7 @@ class Estimated:
         margin: of the feasibility test, whose sign is the verdict; None where it was not tested.
         identification: relative torque error on what was fitted to (eq. 84) [percent]; None where it was not computed.
         validation: likewise on every recording that was never fitted to.
-        moving: as `identification`, without rows of joints near standstill, whose friction nobody knows.
+        moving: as `identification`, without rows of joints near standstill, whose friction is unknown.
         moving_validation: likewise on every recording that was never fitted to.
         moving_joints: as `moving` and `moving_validation`, joint by joint, each in percent of the joint's own torque;
             one row for what was fitted to, then one per recording that was not; empty where it was not told.
@@ -45,7 +45,7 @@ class Estimated:
 
 @dataclass(frozen=True)
 class JointTrace:
-    """A joint's torque along a recording, in stretches of time that are equally long.
+    """Torque of one joint along a recording, in stretches of time that are equally long.
 
     Of every stretch the lowest and the highest sample are kept, so that no peak is lost however few stretches there
     are; where a stretch is a single sample the two are the same.
@@ -67,7 +67,7 @@ class JointTrace:
 
 @dataclass(frozen=True)
 class Spectrum:
-    """What is left of a joint's torque, by frequency and by lag.
+    """Residual of a joint's torque, by frequency and by lag.
 
     Attributes:
         frequency: increasing [Hz], shape (lines,).
@@ -86,7 +86,7 @@ class Spectrum:
 
 @dataclass(frozen=True)
 class Traced:
-    """A recording against the chosen estimate.
+    """Traces and spectra of one recording against the chosen estimate.
 
     Attributes:
         name: of the file.
@@ -109,7 +109,7 @@ class Traced:
 
 @dataclass(frozen=True)
 class Friction:
-    """A drive's friction: torque less everything that the model has of rigid bodies.
+    """Friction of one drive: torque less everything that the model has of rigid bodies.
 
     Attributes:
         velocity: of the points [rad/s or m/s], shape (points,).
@@ -128,10 +128,10 @@ class Friction:
 
 @dataclass(frozen=True)
 class Condition:
-    """How far inside one condition of the feasible set the link parameters lie.
+    """Margin of the link parameters in one condition of the feasible set.
 
     Attributes:
-        name: what it says.
+        name: of the condition, for people.
         links: the links that it is about, counted from 0.
         margin: its smallest eigenvalue or number, SI units.
         scaled: the same in units of its reference scales, comparable between conditions.
@@ -145,7 +145,7 @@ class Condition:
 
 @dataclass(frozen=True)
 class Body:
-    """A link as the solid ellipsoid of uniform density that has its mass, centre and inertia, in the base frame.
+    """Link as the solid ellipsoid of uniform density that has its mass, centre and inertia, in the base frame.
 
     Attributes:
         mass: [kg].
@@ -160,7 +160,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Posed:
-    """The arm in one posture of its recordings, the bodies of its links on it.
+    """Arm in one posture of its recordings, with the bodies of its links.
 
     Attributes:
         points: of base, joint and link frames in the base frame [m], shape (points, 3).
@@ -175,7 +175,7 @@ class Posed:
 
 @dataclass(frozen=True)
 class Timing:
-    """How evenly a recording's samples were taken.
+    """Regularity of a recording's samples.
 
     Attributes:
         recording: name of the file.
@@ -188,7 +188,7 @@ class Timing:
         largest: the largest lateness or distance from the usual step [s].
         compute: the longest time a cycle computed [s]; None where it is not known.
         gaps: per gap, seconds after the first sample and its length [s], the longest first, at most 100.
-        gap_count: how many gaps there are.
+        gap_count: number of gaps.
         lost: frames lost; None where it is not known.
         invalid: per joint, the cycles in which it did not answer; empty where it is not known.
         oldest: per joint, the most cycles that a position was old; empty where it is not known.

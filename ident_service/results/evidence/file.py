@@ -1,4 +1,4 @@
-"""`evidence.json`: what was gathered, kept beside the parameters it belongs to and held against a schema."""
+"""Write and read `evidence.json`, kept beside the parameters it belongs to and validated against a schema."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from ident_service.results.strict_json import strict_json
 
 EVIDENCE = "evidence.json"
 MAX_BYTES = 64 * 2**20
-_LARGEST_LOG = 60.0  # ten to the power of
+_LARGEST_LOG = 60.0  # largest decimal logarithm
 
 
 def write_evidence(path: Path, evidence: Evidence) -> None:
-    """Write evidence after holding it against the schema.
+    """Write evidence after validating it against the schema.
 
     Raises:
         ParameterError: it does not fit the schema.
@@ -47,7 +47,7 @@ def write_evidence(path: Path, evidence: Evidence) -> None:
 
 
 def read_evidence(path: Path) -> Evidence:
-    """Read what `write_evidence` wrote.
+    """Read the evidence that `write_evidence` wrote.
 
     Raises:
         UsageError: no such file.
@@ -78,7 +78,7 @@ def _validate(content: Any, path: Path) -> None:
 
 
 def evidence_document(evidence: Evidence) -> dict[str, Any]:
-    """Evidence as JSON values."""
+    """Return evidence as JSON values."""
     return {
         "format": "ident-evidence",
         "version": 1,
@@ -157,7 +157,7 @@ def _recording_document(one: Traced) -> dict[str, Any]:
 
 
 def runs_of(numbers: np.ndarray[Any, np.dtype[np.int64]]) -> list[list[int]]:
-    """First number and length of every run of consecutive numbers."""
+    """Return first number and length of every run of consecutive numbers."""
     begins = np.flatnonzero(np.diff(numbers, prepend=numbers[0] - 2) != 1)
     return [[int(numbers[b]), int(n)] for b, n in zip(begins, np.diff(begins, append=len(numbers)), strict=True)]
 
@@ -249,7 +249,7 @@ def _require(holds: bool, words: str) -> None:
 
 
 def _numbers(values: Any) -> Array:
-    """Numbers that a pixel can be computed from."""
+    """Return numbers as an array, all small enough to be drawn."""
     array = np.array(values, float)
     _require(bool((np.abs(array) < LARGEST).all()), f"a number of {float(np.abs(array).max(initial=0.0)):.3g}")
     return array

@@ -1,4 +1,4 @@
-"""Friction as the recordings show it: measured torque less all that the estimate explains by rigid bodies.
+"""Extract friction from recordings: measured torque less all that the estimate explains by rigid bodies.
 
 Friction lives on the drives. Where drives move several joints (`d = C q`), joint torques are `C^T` times drive torques,
 so what is left of the joints' torques is solved for the drives' before it is shown against their velocity.
@@ -21,10 +21,10 @@ _TERMS: tuple[JointTerm, ...] = tuple(term for term in TERM_SYMBOLS if term != "
 
 
 class FrictionSeen:
-    """Points of friction against velocity, chunk after chunk, and the curve of the estimate through them."""
+    """Collector of friction points against velocity, chunk after chunk, with the estimate's curve."""
 
     def __init__(self, estimate: Estimate) -> None:
-        """Watch for the friction terms of `estimate`."""
+        """Prepare to collect the friction of `estimate`."""
         layout, base = estimate.model.layout, estimate.base
         columns: dict[int, tuple[JointTerm, int]] = {}
         for term in _TERMS:
@@ -36,7 +36,7 @@ class FrictionSeen:
         self._points = Scatter()
 
     def add(self, rows: Rows, torque: Array) -> None:
-        """Take the next equations, with their torques as the estimate counts them, shape (samples, joints)."""
+        """Add the next equations, with their torques as the estimate counts them, shape (samples, joints)."""
         if not self._places or not len(rows.time):
             return
         rigid = np.tensordot(self._estimate.beta[self._rigid], rows.H_b[:, self._rigid], axes=(0, 1)).T
@@ -44,7 +44,7 @@ class FrictionSeen:
         self._points.add(np.hstack([rows.velocity @ self._coupling.T, drives]))
 
     def found(self) -> tuple[Friction, ...]:
-        """One per drive; none where the model has no friction."""
+        """Return the friction of each drive; none where the model has no friction."""
         if not self._places:
             return ()
         points = self._points.rows()
@@ -66,7 +66,7 @@ class FrictionSeen:
 
 
 def friction_term(term: JointTerm, velocity: Array, layout: Layout, drive: int) -> Array:
-    """What a friction term is multiplied by in steady motion (`layout.py`), shape of `velocity`.
+    """Return the factor of a friction term in steady motion (`layout.py`), shape of `velocity`.
 
     Args:
         term: one of the model's friction terms.

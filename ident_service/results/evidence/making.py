@@ -1,4 +1,4 @@
-"""Gathers what a report shows while an estimate is still at hand: one more pass over each recording, nothing fitted.
+"""Gather the evidence of a report while an estimate is at hand: one more pass over each recording, nothing fitted.
 
 Memory does not grow with a recording: what is kept of it is an envelope, averaged spectra and a scatter.
 """
@@ -43,7 +43,7 @@ def gather_evidence(
     parameters_sha256: str,
     warnings: Sequence[str] = (),
 ) -> Evidence:
-    """Everything that a report shows of an estimate and its recordings.
+    """Return everything that a report shows of an estimate and its recordings.
 
     Args:
         estimate: made from `recordings` and judged on `validation`.
@@ -117,7 +117,7 @@ def _estimates(estimate: Estimate) -> tuple[Estimated, ...]:
 
 
 class _Seen:
-    """A recording, chunk after chunk, against the chosen estimate."""
+    """Collector of one recording's traces, chunk after chunk, against the chosen estimate."""
 
     def __init__(self, estimate: Estimate, most: int) -> None:
         self._estimate, self._most = estimate, most
@@ -129,7 +129,7 @@ class _Seen:
         self.torque: Array = np.zeros((0, 0))
 
     def add(self, rows: Rows) -> None:
-        """Take the next equations; `torque` is theirs afterwards, in the units of the estimate, (samples, joints)."""
+        """Add the next equations; `torque` then holds their torques in the units of the estimate, (samples, joints)."""
         self.torque = rows.torque * self._estimate.prepared.torque_scales
         if not len(rows.time):
             return
@@ -151,7 +151,7 @@ class _Seen:
         self._last = float(rows.time[-1])
 
     def traced(self, recording: Recording, role: Role) -> Traced:
-        """What came of it."""
+        """Return the recording's traces and spectra."""
         if self._envelope is None or self._welch is None:
             raise AssertionError("a recording that was identified from has equations")
         joints = len(self._envelope.extremes) // 3

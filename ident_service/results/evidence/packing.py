@@ -1,4 +1,4 @@
-"""Long arrays as short text that numpy and JavaScript read alike: little-endian 16-bit integers in base64.
+"""Pack long arrays as short text for numpy and JavaScript: little-endian 16-bit integers in base64.
 
 A packed array is `{"shape": [...], "low": a, "step": b, "data": "..."}` with value = a + b * (integer + 32768), so
 that it is off by at most half a step, which is the range of the array divided by 131070. Masks are
@@ -24,7 +24,7 @@ Packed = dict[str, Any]
 
 
 def packed(values: Array) -> Packed:
-    """An array of finite values, of any shape."""
+    """Pack an array of finite values, of any shape."""
     low, high = float(values.min(initial=np.inf)), float(values.max(initial=-np.inf))
     low, high = (low, high) if values.size else (0.0, 0.0)
     step = (high - low) / _LEVELS
@@ -34,7 +34,7 @@ def packed(values: Array) -> Packed:
 
 
 def unpacked(content: Mapping[str, Any], shape: tuple[int | None, ...]) -> Array:
-    """What `packed` made, as nearly as it kept it.
+    """Unpack an array that `packed` made, to its resolution.
 
     Args:
         content: of a file.
@@ -55,13 +55,13 @@ def unpacked(content: Mapping[str, Any], shape: tuple[int | None, ...]) -> Array
 
 
 def packed_mask(mask: Mask) -> Packed:
-    """A mask of shape (n,)."""
+    """Pack a mask of shape (n,)."""
     data = np.packbits(mask, bitorder="little").tobytes()
     return {"bits": len(mask), "data": base64.b64encode(data).decode("ascii")}
 
 
 def unpacked_mask(content: Mapping[str, Any], bits: int) -> Mask:
-    """What `packed_mask` made.
+    """Unpack a mask that `packed_mask` made.
 
     Raises:
         ParameterError: not a mask of this length.

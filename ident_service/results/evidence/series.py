@@ -1,7 +1,4 @@
-"""Long series made short in one pass and constant memory: envelopes, spectra, scatter.
-
-Boundary: numbers in, numbers out; nothing here knows what a torque is.
-"""
+"""Reduce long series in one pass and constant memory: envelopes, spectra, scatter."""
 
 from __future__ import annotations
 
@@ -27,14 +24,14 @@ class Envelope:
     """
 
     def __init__(self, series: int, most: int, width: float) -> None:
-        """Take `series` series into at most `most` stretches of `width` seconds, or more."""
+        """Prepare `series` series in at most `most` stretches of `width` seconds, or more."""
         self._most, self.width = most, width
         self._index: Index = np.zeros(0, np.int64)
         self._low, self._high = np.zeros((series, 0)), np.zeros((series, 0))
         self._any = np.zeros((series, 0), bool)
 
     def add(self, time: Array, values: Array, marked: Mask) -> None:
-        """Take the next samples.
+        """Add the next samples.
 
         Args:
             time: not decreasing, not below that of earlier samples [s], shape (samples,).
@@ -62,17 +59,17 @@ class Envelope:
 
     @property
     def time(self) -> Array:
-        """Middle of every stretch [s], shape (stretches,)."""
+        """Return the middle of every stretch [s], shape (stretches,)."""
         return np.asarray((self._index + 0.5) * self.width)
 
     @property
     def extremes(self) -> Array:
-        """Lowest and highest, shape (series, 2, stretches)."""
+        """Return the lowest and highest values, shape (series, 2, stretches)."""
         return np.stack([self._low, self._high], axis=1)
 
     @property
     def marked(self) -> Mask:
-        """Shape (series, stretches)."""
+        """Return whether each stretch has a marked sample, shape (series, stretches)."""
         return self._any
 
 
@@ -84,7 +81,7 @@ class Welch:
     """
 
     def __init__(self, series: int, rate: float) -> None:
-        """Take `series` series of `rate` samples a second."""
+        """Prepare `series` series of `rate` samples a second."""
         self.length = int(min(max(_SHORTEST_SEGMENT, round(_SECONDS * rate)), _LONGEST_SEGMENT))
         self.rate = rate
         self._waiting = np.zeros((series, 0))
@@ -94,7 +91,7 @@ class Welch:
         self._window = np.hanning(self.length + 1)[:-1]
 
     def add(self, values: Array, *, opens: bool = False) -> None:
-        """Take the next samples, shape (series, samples); they do not follow the earlier ones where `opens`."""
+        """Add the next samples, shape (series, samples); they do not follow the earlier ones where `opens`."""
         self._waiting = values if opens else np.hstack([self._waiting, values])
         self._samples += values.shape[1]
         half = self.length // 2
@@ -114,11 +111,11 @@ class Welch:
 
     @property
     def ready(self) -> bool:
-        """Whether there was a whole segment."""
+        """Return whether there was a whole segment."""
         return self._segments > 0
 
     def density(self) -> tuple[Array, Array]:
-        """Frequencies [Hz], shape (lines,), and densities, shape (series, lines), denser at low frequencies."""
+        """Return frequencies [Hz], shape (lines,), and densities, (series, lines), denser at low frequencies."""
         frequency = np.arange(1, self._density.shape[1]) * self.rate / self.length
         density = self._density[:, 1:] / max(self._segments, 1)
         edges = np.unique(np.geomspace(1, len(frequency) + 1, _LINES + 1).astype(int)) - 1
@@ -127,7 +124,7 @@ class Welch:
         return sums[0], sums[1:]
 
     def correlation(self) -> tuple[Array, Array]:
-        """Lags [s], shape (lags,), and autocorrelations, shape (series, lags); zero where a series is zero."""
+        """Return lags [s], shape (lags,), and autocorrelations, (series, lags); zero where a series is zero."""
         longest = max(1, min(self.length // 2, round(_LONGEST_LAG * self.rate)))
         step = max(1, longest // _LAGS)
         lags = np.arange(0, longest + 1, step)
@@ -137,21 +134,21 @@ class Welch:
 
     @property
     def white(self) -> float:
-        """What 95 % of the lags of white noise stay below."""
+        """Return the bound that 95 % of the lags of white noise stay below."""
         return 1.96 / float(np.sqrt(max(self._samples, 1)))
 
 
 class Scatter:
-    """Some of many points, evenly in time as long as they are gathered, evenly in x when they are handed out."""
+    """Subset of many points, spread evenly in time as they come."""
 
     def __init__(self, most: int = 8192) -> None:
-        """Keep at most `most` of the rows that come."""
+        """Prepare to keep at most `most` of the rows that come."""
         self._most, self._step, self._seen = most, 1, 0
         self._rows: list[Array] = []
         self._kept = 0
 
     def add(self, rows: Array) -> None:
-        """Take the next rows, shape (samples, columns)."""
+        """Add the next rows, shape (samples, columns)."""
         first = -self._seen % self._step
         self._seen += len(rows)
         self._rows.append(rows[first :: self._step].copy())
@@ -161,17 +158,17 @@ class Scatter:
             self._rows, self._kept, self._step = [kept], len(kept), 2 * self._step
 
     def rows(self) -> Array:
-        """What was kept, shape (samples, columns)."""
+        """Return the kept rows, shape (samples, columns)."""
         return np.concatenate(self._rows)
 
 
 def spread(x: Array, y: Array, most: int = 400, bins: int = 50) -> tuple[Array, Array]:
-    """At most `most` of the points, so that no part of the range of x is left empty that has any.
+    """Return at most `most` of the points, so that no part of the range of x that has any is left empty.
 
     Args:
         x: shape (points,).
         y: likewise.
-        most: how many to keep.
+        most: number of points to keep.
         bins: equal parts of the range of x, each with an equal right to points.
     """
     if len(x) <= most:

@@ -1,4 +1,4 @@
-"""How evenly samples were taken: from the loop's account of its cycles where a recording has one, else from stamps."""
+"""Measure how evenly samples were taken: from the loop's account of its cycles where there is one, else from stamps."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from ident_service.results.evidence.evidence import Array, Timing
 _BINS = 60
 _GAPS = 100
 _MAX_STAMPS = 1 << 22  # samples looked at, more than an hour at 1 kHz
-_GAP = 1.9  # of the usual step
+_GAP = 1.9  # times the usual step; a longer step is a gap
 
 
 def timing(recording: Recording) -> Timing:
-    """How evenly a recording's samples were taken.
+    """Measure how evenly a recording's samples were taken.
 
     Args:
         recording: of two samples at least.
@@ -33,12 +33,12 @@ def timing(recording: Recording) -> Timing:
     longer = np.flatnonzero(steps > _GAP * usual)
     order = longer[np.argsort(-steps[longer], kind="stable")][:_GAPS]
     gaps = tuple(((int(stamps[k]) - int(stamps[0])) * 1e-9, int(steps[k]) * 1e-9) for k in order)
-    # The loop's account is of a whole run.
+    # The loop's account covers a whole run, so it is not used for a part of a recording.
     parts = [] if isinstance(recording, RangeRecording) else list(read_cycles(path))
     if parts:
         return _of_cycles(path.name, parts, 1e9 / usual, gaps, len(longer))
     off = np.abs(steps[steps <= _GAP * usual] - usual) * 1e-9
-    # What stamps in whole nanoseconds cannot tell is no jitter.
+    # Differences below the resolution of nanosecond stamps are not jitter.
     edges, counts = _histogram(np.where(off < 2e-9, 0.0, off))
     return Timing(
         recording=path.name,
@@ -58,7 +58,7 @@ def timing(recording: Recording) -> Timing:
 
 
 def _stamps(recording: Recording) -> NDArray[np.int64]:
-    """Of the first few million samples [ns]."""
+    """Return the stamps of the first few million samples [ns]."""
     kept, count = [], 0
     for block in recording.blocks():
         kept.append(block.stamp_ns)

@@ -1,1 +1,1 @@
-"""Exports of an identified arm: one file per format, each read back before it is kept."""
+"""Export an identified arm: one file per format, each read back before it is kept."""

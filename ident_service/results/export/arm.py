@@ -1,4 +1,4 @@
-"""What an export is made from: the arm, its base parameters, and one body that has them where there is one."""
+"""Assemble the input of an export: the arm, its base parameters, and one body that has them where there is one."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ident_service.results.run_folder import PARAMETERS, Results, read_results
 
 @dataclass(frozen=True)
 class IdentifiedArm:
-    """An arm with its identified parameters.
+    """Arm with its identified parameters.
 
     Attributes:
         model: the arm, with what the recordings said of its friction's shape.
@@ -48,14 +48,14 @@ class IdentifiedArm:
 
     @property
     def sigma_said(self) -> str:
-        """What the standard deviations belong to, where it is not the values beside them; else empty."""
+        """Return what the standard deviations belong to, where it is not the values beside them; else empty."""
         if self.feasible_set == "none" or not any(deviation is not None for deviation in self.sigma):
             return ""
         return f"standard deviations are of the unconstrained fit; values are held in the set {self.feasible_set}"
 
     @cached_property
     def base_delta(self) -> Array:
-        """Link parameters with the base parameters and nothing but base columns, shape (layout.size,).
+        """Return link parameters with the base parameters in base columns alone, shape (layout.size,).
 
         No body has them, and all torques are theirs (eq. 37).
         """
@@ -64,7 +64,7 @@ class IdentifiedArm:
         return delta
 
     def body(self) -> Array:
-        """Link parameters that a body has, shape (layout.size,).
+        """Return link parameters that a body has, shape (layout.size,).
 
         Raises:
             ModelError: no body has these base parameters.
@@ -78,7 +78,7 @@ class IdentifiedArm:
 
 
 def identified_arm(config: ArmConfig, parameters: ParameterFile, source: str, where: Path) -> IdentifiedArm:
-    """Put an arm and a parameter file together.
+    """Combine an arm and a parameter file.
 
     Args:
         config: the arm, its friction's shape as identified.
@@ -119,7 +119,7 @@ def identified_arm(config: ArmConfig, parameters: ParameterFile, source: str, wh
 
 
 def read_identified(folder: Path) -> IdentifiedArm:
-    """The arm of a folder of results, every file in it found to be what its manifest names.
+    """Read the arm of a folder of results, every file verified by its manifest.
 
     Raises:
         UsageError: no such folder, or nothing was identified in it.

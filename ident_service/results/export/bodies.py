@@ -1,4 +1,4 @@
-"""Bodies as ten parameters: moved to other frames, and whether there could be such a body (eq. 17, pseudo-inertia)."""
+"""Transform bodies of ten parameters between frames, and test whether there could be such a body (eq. 17)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ident_service.model.chain import Array
 
 
 def pseudo_inertia(parameters: Array) -> Array:
-    """The second moments of a body's mass, shape (4, 4); positive definite for real bodies.
+    """Return the second moments of a body's mass, shape (4, 4); positive definite for real bodies.
 
     Args:
         parameters: of eq. 13, shape (10,).
@@ -25,7 +25,7 @@ def pseudo_inertia(parameters: Array) -> Array:
 
 
 def moved(parameters: Array, rotation: Array, translation: Array) -> Array:
-    """The same body seen from another frame.
+    """Return the body's parameters in another frame.
 
     Args:
         parameters: of eq. 13, shape (10,).
@@ -40,7 +40,7 @@ def moved(parameters: Array, rotation: Array, translation: Array) -> Array:
 
 
 def about_center(parameters: Array) -> tuple[float, Array, Array]:
-    """Mass [kg], centre of mass [m], shape (3,), and inertia about it [kg m^2], shape (3, 3); no massless one."""
+    """Return mass [kg], centre of mass [m], (3,), and inertia about it [kg m^2], (3, 3); needs a nonzero mass."""
     xx, xy, xz, yy, yz, zz, *first, m = parameters
     center = np.array(first) / m
     about_origin = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
@@ -48,13 +48,13 @@ def about_center(parameters: Array) -> tuple[float, Array, Array]:
 
 
 def about_origin(mass: float, center: Array, inertia: Array) -> Array:
-    """The inverse of `about_center`, shape (10,)."""
+    """Return the ten parameters of a body, the inverse of `about_center`, shape (10,)."""
     L = inertia + mass * (center @ center * np.eye(3) - np.outer(center, center))
     return np.array([L[0, 0], L[0, 1], L[0, 2], L[1, 1], L[1, 2], L[2, 2], *(mass * center), mass])
 
 
 def is_real(parameters: Array) -> bool:
-    """Whether some distribution of positive mass has these parameters."""
+    """Return whether some distribution of positive mass has these parameters."""
     mass = parameters[9]
     if not mass > 0.0:
         return False
@@ -65,7 +65,7 @@ def is_real(parameters: Array) -> bool:
 
 
 def rotation_rpy(roll: float, pitch: float, yaw: float) -> Array:
-    """Rz(yaw) Ry(pitch) Rx(roll), the fixed-axis angles of URDF and SDF [rad], shape (3, 3)."""
+    """Return Rz(yaw) Ry(pitch) Rx(roll), the fixed-axis angles of URDF and SDF [rad], shape (3, 3)."""
     (cr, sr), (cp, sp), (cy, sy) = ((np.cos(angle), np.sin(angle)) for angle in (roll, pitch, yaw))
     return np.array(
         [
@@ -77,7 +77,7 @@ def rotation_rpy(roll: float, pitch: float, yaw: float) -> Array:
 
 
 def joint_bodies(model: ArmModel, delta: Array) -> Array:
-    """Each link's ten parameters in its joint's frame, shape (joints, 10).
+    """Return each link's ten parameters in its joint's frame, shape (joints, 10).
 
     Raises:
         ModelError: a link without positive mass.
@@ -96,7 +96,7 @@ def joint_bodies(model: ArmModel, delta: Array) -> Array:
 
 
 def require_real(model: ArmModel, bodies: Array, reader: str) -> None:
-    """Refuse bodies for readers that refuse them.
+    """Refuse bodies without a real mass distribution, for readers that refuse them.
 
     Raises:
         ModelError: no distribution of mass has the inertia of a link.

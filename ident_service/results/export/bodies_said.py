@@ -1,4 +1,4 @@
-"""What a reader of link values should know: that they are one body of many, and which of them no arm would have."""
+"""Write notes for readers of link values: they are one body of many, and some are those of no real link."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _LEAST_MASS = 1e-3  # [kg]
 
 
 def body_notes(arm: IdentifiedArm) -> tuple[str, ...]:
-    """Notes for files with link values; none for an arm that no body is."""
+    """Return notes for files with link values; none for an arm that no body is."""
     if arm.delta is None:
         return ()
     count, size = arm.verdicts.count("unidentified"), arm.base.size
@@ -44,7 +44,7 @@ def _implausible(model: ArmModel, delta: Array) -> tuple[str, ...]:
 
 
 def reach(model: ArmModel) -> float:
-    """Longest way from the first joint, wherever that is mounted, along the frames and the last link [m]."""
+    """Return the longest way from the first joint, wherever mounted, along the frames and the last link [m]."""
     chain = model.chain
     ways = np.zeros(chain.joints)
     for k, parent in enumerate(chain.parents):

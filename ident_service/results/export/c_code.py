@@ -1,4 +1,4 @@
-"""Formulas on a tape as lines of C99, one operation a line, and such lines run again from their text.
+"""Print formulas of a tape as lines of C99, one operation a line, and run such lines from their text.
 
 The reader knows nothing of the tape: what it computes is what the text says.
 """
@@ -28,7 +28,7 @@ _RESULT = re.compile(rf"^    ([a-zA-Z]+)\[(\d+)\] = ({_OPERAND});$")
 
 
 def c_lines(tape: Tape, inputs: Mapping[int, str], outputs: Sequence[tuple[str, Value]]) -> list[str]:
-    """The body of a function, indented.
+    """Return the body of a C function, indented.
 
     Args:
         tape: what was recorded.

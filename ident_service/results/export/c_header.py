@@ -1,4 +1,4 @@
-"""A C99 header with the arm's dynamics in base parameters: nothing but <math.h>, no memory, C++ too.
+"""Write a C99 header with the arm's dynamics in base parameters: nothing but <math.h>, no memory, C++ too.
 
 The state of friction with pre-sliding is the caller's.
 
@@ -40,12 +40,12 @@ _Formulas = Callable[[Tape, dict[int, Value], dict[str, list[Symbol]]], list[Val
 
 
 def c_prefix(arm: IdentifiedArm) -> str:
-    """What every name in the header begins with."""
+    """Return the prefix of every name in the header."""
     return identifier(arm.model.config.name)
 
 
 def c_header(arm: IdentifiedArm) -> str:
-    """The header, read back and found to have the torques and the mass matrix of the base parameters.
+    """Return the header, read back and found to have the torques and the mass matrix of the base parameters.
 
     Raises:
         ModelError: what is read back differs.
@@ -105,7 +105,7 @@ def _preface(arm: IdentifiedArm, name: str) -> str:
 
 
 def turning_said(arm: IdentifiedArm) -> tuple[str, ...]:
-    """What a reader should know of friction with pre-sliding; nothing where there is none."""
+    """Return notes on friction with pre-sliding, for the header's reader; none where there is none."""
     name = c_prefix(arm)
     return tuple(
         f"{name}_inverse_dynamics and {name}_friction are without {words}; with {name}_turned and "
@@ -187,7 +187,7 @@ def _functions(arm: IdentifiedArm) -> list[tuple[str, tuple[str, ...], str, _For
 
 
 def _turned(tape: Tape, share: Array, step: list[Symbol], before: Symbol, way: float) -> Value:
-    """One step of Dahl's law (`model/presliding.py`) of one drive."""
+    """Return the friction state of one drive after one step of Dahl's law (`model/presliding.py`)."""
     travelled: Value = sum((float(c) * x for c, x in zip(share, step, strict=True) if c), 0.0)
     if not isinstance(travelled, Symbol):
         return before  # a drive that moves no joint
@@ -295,7 +295,7 @@ def _check(arm: IdentifiedArm, text: str) -> None:
 def _turning_pairs(
     arm: IdentifiedArm, delta: Array, run: Callable[[str, dict[str, Array]], Array]
 ) -> list[tuple[str, Array, Array]]:
-    """Friction with a state, as read back and as meant, after small steps and after none."""
+    """Return friction with a state, as read back and as meant, after small steps and after none."""
     if not turning_said(arm):
         return []
     model, ways = arm.model, presliding_ways(arm.model)

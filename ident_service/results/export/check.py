@@ -1,4 +1,4 @@
-"""What is read back must predict the same torques as what was meant, on random states."""
+"""Check that an export, read back, predicts the torques of the parameters on random states."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ States = tuple[Array, Array, Array]
 
 
 def random_states(joints: int, samples: int = _STATES) -> States:
-    """Position, velocity and acceleration, the same ones every time, each of shape (samples, joints)."""
+    """Return position, velocity and acceleration, always the same ones, each of shape (samples, joints)."""
     rng = np.random.default_rng(_SEED)
     position, velocity, acceleration = rng.uniform(-3.0, 3.0, size=(3, samples, joints))
     velocity[::4] *= 0.02  # where the friction of slow motion differs from that of fast
@@ -35,25 +35,25 @@ def random_states(joints: int, samples: int = _STATES) -> States:
 
 
 def gravity_of(model: ArmModel) -> tuple[float, float, float]:
-    """Gravity in the base frame [m/s^2]."""
+    """Return gravity in the base frame [m/s^2]."""
     x, y, z = (float(component) for component in model.chain.gravity)
     return x, y, z
 
 
 def disagreement(found: Array, meant: Array) -> float:
-    """Largest difference, relative to the largest value meant."""
+    """Return the largest difference, relative to the largest value meant."""
     if not np.all(np.isfinite(found)):
         return np.inf
     return float(np.abs(found - meant).max() / max(np.abs(meant).max(), np.finfo(float).tiny))
 
 
 def torque(model: ArmModel, delta: Array, states: States) -> Array:
-    """Torque of an arm with some link parameters at states of shape (samples, joints); same shape."""
+    """Return the torque of an arm with some link parameters at states of shape (samples, joints); same shape."""
     return np.asarray(np.einsum("jps,p->sj", joint_regressor(model.chain, model.layout, *states), delta))
 
 
 def with_terms(model: ArmModel, delta: Array, terms: Collection[JointTerm]) -> Array:
-    """Link parameters without the joint terms that are not named."""
+    """Return the link parameters with all joint terms zero that are not named."""
     kept, layout = np.array(delta, dtype=float), model.layout
     for term in layout.terms:
         if term not in terms:
@@ -62,14 +62,14 @@ def with_terms(model: ArmModel, delta: Array, terms: Collection[JointTerm]) -> A
 
 
 def carried(model: ArmModel, delta: Array, terms: Collection[JointTerm]) -> Carried:
-    """Which values a format with some joint terms carries: no negative ones, and of joints with an own drive only."""
+    """Return which values a format with some joint terms supports: none negative, of joints with an own drive only."""
     drives = joint_drives(model.chain, model.layout, delta)
     known = [term for term in JOINT_TERMS if term in terms and term in model.layout.terms]
     return {term: drives.own & (drives.of(term) >= 0.0) for term in known}
 
 
 def require_same_torques(model: ArmModel, delta: Array, written: WrittenArm, has: Carried, name: str) -> None:
-    """See that an arm read in a file predicts the torques of the parameters, as far as the format carries them.
+    """Check that an arm read from a file predicts the parameters' torques, as far as the format supports them.
 
     Args:
         model: the arm.
@@ -116,7 +116,7 @@ _WORDS: dict[JointTerm, str] = {
 
 
 def left_out(model: ArmModel, delta: Array, has: Carried) -> tuple[str, ...]:
-    """The joint terms with a value that a file does not carry, in words."""
+    """Return the joint terms with a value that a file does not carry, in words."""
     found = []
     for term in model.layout.terms:
         values = model.layout.term_values(term, delta)
@@ -128,7 +128,7 @@ def left_out(model: ArmModel, delta: Array, has: Carried) -> tuple[str, ...]:
 
 
 def presliding_left_out(model: ArmModel, delta: Array) -> tuple[str, ...]:
-    """Pre-sliding of dry friction, in words, where a drive has it: what has no memory does not carry it."""
+    """Return the drives' pre-sliding, in words, which a format without friction state does not carry."""
     layout, ways = model.layout, presliding_ways(model)
     dry = [layout.term_values(term, delta) for term in ("coulomb", "stribeck") if term in layout.terms]
     said = [

@@ -1,4 +1,4 @@
-"""The formats, and writing several of them: all of them appear, or none.
+"""Define the export formats, and write several of them: all of them appear, or none.
 
 What each format carries is said where it is written; what of this arm it did not carry comes with the answer.
 """
@@ -23,7 +23,7 @@ from ident_service.results.files import appearing_folder, write_atomically
 
 @dataclass(frozen=True)
 class Export:
-    """One file of an export.
+    """File of an export, with the data that it does not carry.
 
     Attributes:
         format: of `FORMATS`.
@@ -81,7 +81,7 @@ def _c(arm: IdentifiedArm) -> Export:
 
 
 def _notes(arm: IdentifiedArm) -> tuple[str, ...]:
-    """Of the formats with base and link values."""
+    """Return the notes of the formats with base and link values."""
     notes = (_BASE_ONLY,) if arm.delta is None else body_notes(arm)
     return (*notes, arm.sigma_said) if arm.sigma_said else notes
 
@@ -97,7 +97,7 @@ FORMATS: dict[str, Callable[[IdentifiedArm], Export]] = {
 
 
 def known_formats(words: str) -> tuple[str, ...]:
-    """Formats named in a list with commas, each once.
+    """Parse formats named in a list with commas, each once.
 
     Raises:
         UsageError: none, or one that is not there.
@@ -111,7 +111,7 @@ def known_formats(words: str) -> tuple[str, ...]:
 
 
 def export_texts(arm: IdentifiedArm, formats: Sequence[str]) -> tuple[Export, ...]:
-    """The files of an export, each read back and found to say what the parameters say.
+    """Return the files of an export, each read back and found to say what the parameters say.
 
     Raises:
         UsageError: no such format.

@@ -1,4 +1,4 @@
-"""JSON with everything that is known of an arm: kinematics, bodies, drives, friction, base parameters.
+"""Write JSON with everything that is known of an arm: kinematics, bodies, drives, friction, base parameters.
 
 Bodies and placements are as pinocchio takes them, so that a dozen lines load the file into it (`docs/exports.md`).
 """
@@ -26,7 +26,7 @@ _FORMAT, _VERSION = "ident-dynamics", 1
 
 
 def json_export(arm: IdentifiedArm, name: str) -> str:
-    """The arm as JSON, after the same torques were read out of it.
+    """Return the arm as JSON, after the same torques were computed from it.
 
     Args:
         arm: with link parameters or without.
@@ -98,7 +98,7 @@ def _body(parameters: Array) -> dict[str, Any]:
 
 
 def _check(arm: IdentifiedArm, text: str, name: str) -> None:
-    """Build the arm from the text, and ask it for torques."""
+    """Build the arm from the text, and check its values and torques."""
     content = json.loads(text)
     if content["base_parameters"]["values"] != arm.beta.tolist():
         raise ModelError(f"{name}: the base parameters read back differ; it was not written")

@@ -1,4 +1,4 @@
-"""MJCF: bodies, armature, damping, dry friction, limits and motors; gravity as in the arm's description.
+"""Write MJCF: bodies, armature, damping, dry friction, limits and motors; gravity as in the arm's description.
 
 A drive that moves several joints becomes a fixed tendon, whose armature, damping and frictionloss are those of the
 drive; MuJoCo knows the armature of tendons since 3.3.1. Bodies' frames are joint frames.
@@ -26,7 +26,7 @@ _ATTRIBUTES = dict(zip(JOINT_TERMS, ("armature", "damping", "frictionloss"), str
 
 
 def mjcf_export(model: ArmModel, delta: Array, name: str, said: tuple[str, ...] = ()) -> tuple[str, tuple[str, ...]]:
-    """The arm as MJCF, after pinocchio has read the same torques out of it.
+    """Return the arm as MJCF, after pinocchio has read it back with the same torques.
 
     Args:
         model: the arm.
@@ -56,7 +56,7 @@ def mjcf_export(model: ArmModel, delta: Array, name: str, said: tuple[str, ...] 
 
 
 def _shared(model: ArmModel, delta: Array) -> Carried:
-    """Terms of drives that move several joints, or that share theirs, and are not negative."""
+    """Return per term which drives have no joint of their own alone, and a value that is not negative."""
     own = joint_drives(model.chain, model.layout, delta).own
     terms = [term for term in JOINT_TERMS if term in model.layout.terms]
     return {term: ~own & (model.layout.term_values(term, delta) >= 0.0) for term in terms}
@@ -123,7 +123,7 @@ def _add_tendons(root: ET.Element, model: ArmModel, delta: Array, shared: Carrie
 
 
 def _require_same_tendons(model: ArmModel, delta: Array, text: str, shared: Carried, name: str) -> None:
-    """Pinocchio reads no tendons: hold what the file says of them against what was meant."""
+    """Check the tendons in the file against the drives, as pinocchio reads no tendons."""
     chain, own = model.chain, joint_drives(model.chain, model.layout, delta).own
     section = xml_places(text, name).first("tendon")
     fixed = [] if section is None else list(section.all("fixed"))
@@ -140,7 +140,7 @@ def _require_same_tendons(model: ArmModel, delta: Array, text: str, shared: Carr
 
 
 def _quaternion(rotation: Array) -> Array:
-    """w, x, y, z of a rotation, w >= 0, shape (4,); from the largest component, so that none is divided by little."""
+    """Return w, x, y, z of a rotation, w >= 0, shape (4,), from the largest component for accuracy."""
     R = rotation
     squares = np.array([np.trace(R), R[0, 0], R[1, 1], R[2, 2]])
     largest = int(np.argmax(squares))

@@ -1,4 +1,4 @@
-"""The URDF that an arm was described with, its inertias and friction replaced and every other byte as it was.
+"""Edit the URDF that describes an arm: inertias and friction are replaced, every other byte stays.
 
 A movable link and what is bolted to it by fixed joints are one body, and only the whole of it is identified. Where the
 movable link with the identified body less the bolted ones is a real body, these keep their inertias; elsewhere the
@@ -36,7 +36,7 @@ _FRICTION: dict[JointTerm, str] = {"viscous": "damping", "coulomb": "friction"}
 
 
 def original_urdf(model: ArmModel, delta: Array, has: Carried) -> tuple[str, tuple[str, ...]]:
-    """The original file with identified values.
+    """Return the original file with identified values.
 
     Args:
         model: of an arm that a URDF describes.
@@ -90,7 +90,7 @@ def original_urdf(model: ArmModel, delta: Array, has: Carried) -> tuple[str, tup
 
 @dataclass(frozen=True)
 class _Bolt:
-    """A fixed joint, or one that is held still: the link it carries, and where."""
+    """Fixed joint, or one that is held still: the link it carries, and its placement."""
 
     child: str
     rotation: Array
@@ -98,7 +98,7 @@ class _Bolt:
 
 
 class _Robot:
-    """Links and joints of a URDF by name, and which links are bolted to which."""
+    """Links and joints of a URDF by name, with the links that are bolted to each."""
 
     def __init__(self, root: Element, name: str, held: Mapping[str, float]) -> None:
         self._name = name
@@ -119,7 +119,7 @@ class _Robot:
                 self._bolts.setdefault(_named(joint, "parent", name), []).append(bolt)
 
     def bolted_to(self, link: str) -> Iterator[tuple[str, Array | None]]:
-        """Links that move with a link, with their ten parameters seen from it; None for those without inertia."""
+        """Yield links that move with a link, with their ten parameters seen from it; None for those without inertia."""
         for bolt in self._bolts.get(link, []):
             own = _ten(self.links[bolt.child], self._name)
             further = [(bolt.child, own), *self.bolted_to(bolt.child)]
@@ -159,7 +159,7 @@ def _moved_by(joint: Element, position: float, name: str) -> tuple[Array, Array]
 
 
 def _ten(link: Element, name: str) -> Array | None:
-    """The ten parameters of a link in its own frame; None where it has no inertia."""
+    """Return the ten parameters of a link in its own frame; None where it has no inertia."""
     inertial = link.first("inertial")
     if inertial is None:
         return None
@@ -175,7 +175,7 @@ def _ten(link: Element, name: str) -> Array | None:
 
 
 def _inertial(text: str, link: Element, body: Array) -> Iterator[Edit]:
-    """Give a link its body; comments in its old one stay."""
+    """Yield edits that give a link its body; comments in its old one stay."""
     mass, center, inertia = about_center(body)
     wanted = {
         "origin": {"xyz": " ".join(repr(float(x) + 0.0) for x in center), "rpy": "0 0 0"},
@@ -206,7 +206,7 @@ def _removed(link: Element, name: str) -> Edit:
 
 
 def _kept(joint: Element, written: dict[str, str]) -> list[str]:
-    """Friction of the original file that is neither zero nor replaced."""
+    """Return the friction attributes of the original file that are neither zero nor replaced."""
     element = joint.first("dynamics")
     old = {} if element is None else element.attributes
     return [key for key in _FRICTION.values() if key in old and key not in written and old[key].strip("0. ")]

@@ -1,4 +1,4 @@
-"""SDF 1.9: links at their joints' frames, inertias about centres of mass, friction and limits per joint.
+"""Write SDF 1.9: links at their joints' frames, inertias about centres of mass, friction and limits per joint.
 
 The arm stands on `world`. SDF keeps gravity with the world and has no place for drive inertia. What is written is read
 back by `sdf_reader.py`, which follows the specification and knows nothing of this writer.
@@ -27,7 +27,7 @@ _ENTRIES = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (
 def sdf_export(
     model: ArmModel, delta: Array, name: str, said: tuple[str, ...] = ()
 ) -> tuple[str, tuple[str, ...], tuple[str, ...]]:
-    """The arm as SDF, after the same torques were read out of it.
+    """Return the arm as SDF, after it was read back with the same torques.
 
     Args:
         model: the arm.
@@ -53,7 +53,7 @@ def sdf_export(
 
 
 def _names(model: ArmModel) -> tuple[str, ...]:
-    """Joint names as SDF takes them: `::` separates scopes, `__x__` and `world` are its own."""
+    """Return joint names that SDF accepts: `::` separates scopes, `__x__` and `world` are reserved."""
     found = []
     for own in model.chain.names:
         name = " ".join(own.replace("::", "_").split()) or "joint"

@@ -1,4 +1,4 @@
-"""A reader of arms in SDF (specification 1.9: joint.sdf, link.sdf, inertial.sdf, pose.sdf), for what was written.
+"""Read exported arms in SDF (specification 1.9: joint.sdf, link.sdf, inertial.sdf, pose.sdf), to check them.
 
 A pose is relative to the frame it names, to the model where it names none, and to the child link for a joint; angles
 are fixed-axis roll, pitch, yaw [rad]. An axis is expressed in its joint's frame. Inertias are about the centre of mass,
@@ -109,7 +109,7 @@ class _Reader:
         return T
 
     def _link_pose(self, name: str) -> Array:
-        """Of a link in the model's frame."""
+        """Return the pose of a link in the model's frame."""
         T, seen = np.eye(4), set()
         while name not in ("", "__model__"):
             if name in seen:

@@ -1,4 +1,4 @@
-"""CSV: one parameter a row: base parameters, the link parameters of a body that has them, the shape of friction."""
+"""Write CSV, one parameter a row: base parameters, link parameters where a body has them, the shape of friction."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _HEADER = ("kind", "name", "unit", "value", "sigma", "verdict", "unconstrained_v
 
 
 def csv_export(arm: IdentifiedArm, name: str) -> str:
-    """All parameters as a table; numbers read back as the same ones.
+    """Return all parameters as a table; numbers read back as the same ones.
 
     Args:
         arm: with link parameters or without.
@@ -47,7 +47,7 @@ def csv_export(arm: IdentifiedArm, name: str) -> str:
 
 
 def _friction_shape(arm: IdentifiedArm) -> list[tuple[str, str, float]]:
-    """What in the friction is not linear, joint by joint: name, unit, value; none of what the arm has not."""
+    """Return the nonlinear friction numbers, joint by joint: name, unit, value; none that the arm has not."""
     model, layout = arm.model, arm.model.layout
     units = ["rad" if turns else "m" for turns in model.chain.revolute]
     ways = presliding_ways(model).tolist()

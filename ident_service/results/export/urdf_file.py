@@ -1,4 +1,4 @@
-"""URDF: the arm's own file with identified values where a URDF describes it, a generated one elsewhere.
+"""Write URDF: the arm's own file with identified values where a URDF describes it, a generated one elsewhere.
 
 URDF has a place for viscous and dry friction of a joint, none for gravity, drive inertia or any other term.
 """
@@ -32,7 +32,7 @@ _TERMS: tuple[JointTerm, ...] = ("viscous", "coulomb")
 def urdf_export(
     model: ArmModel, delta: Array, name: str, said: tuple[str, ...] = ()
 ) -> tuple[str, tuple[str, ...], tuple[str, ...]]:
-    """The identified URDF, after pinocchio has read the same torques out of it.
+    """Return the identified URDF, after pinocchio has read it back with the same torques.
 
     Args:
         model: the arm.
@@ -64,7 +64,7 @@ def urdf_export(
 
 
 def _commented(text: str, said: tuple[str, ...]) -> str:
-    """With comments at the end instead of those of an earlier export; every byte before is as it was."""
+    """Return the text with comments at the end instead of those of an earlier export; all else is as it was."""
     kept = _EARLIER.sub("", text)
     if not said:
         return kept
@@ -72,7 +72,7 @@ def _commented(text: str, said: tuple[str, ...]) -> str:
 
 
 def write_urdf(path: Path, model: ArmModel, delta: Array) -> None:
-    """Write the identified URDF, after pinocchio has read the same torques out of it.
+    """Write the identified URDF, after pinocchio has read it back with the same torques.
 
     Args:
         path: the file.

@@ -1,4 +1,4 @@
-"""Names of joints and arms as identifiers and comments of other languages, in which they may mean something."""
+"""Turn names of joints and arms into identifiers and comments that are safe in other languages."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from collections.abc import Iterable, Sequence
 
 
 def identifier(name: str) -> str:
-    """What a C identifier as near to the name as there is one begins with."""
+    """Return the C identifier nearest to a name, to begin other identifiers with."""
     text = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_") or "x"
     return f"n{text}" if text[0].isdigit() else text
 
 
 def unique(names: Iterable[str]) -> tuple[str, ...]:
-    """The same names, repeated ones numbered."""
+    """Return the names, repeated ones numbered."""
     taken: set[str] = set()
     found = []
     for name in names:
@@ -26,11 +26,11 @@ def unique(names: Iterable[str]) -> tuple[str, ...]:
 
 
 def comments(lost: Sequence[str], said: Sequence[str]) -> tuple[str, ...]:
-    """What a file says of itself: what its format has no place for, and what its reader should know."""
+    """Return a file's comments on itself: what its format has no place for, and notes for its reader."""
     parts = ([f"This format has no place for: {'; '.join(lost)}"] if lost else []) + list(said)
     return tuple(f" {plain(part)}. " for part in parts)
 
 
 def plain(text: str) -> str:
-    """Text that ends no comment, in C or in XML, and begins no other line."""
+    """Return text that ends no comment, in C or in XML, and begins no other line."""
     return re.sub(r"-{2,}", "-", re.sub(r"[^A-Za-z0-9 _.,:;+*()=^-]", "_", text))

@@ -1,4 +1,4 @@
-"""Where the elements of an XML text stand, so that a few can be changed and every other byte stays.
+"""Locate the elements of an XML text, so that a few can be changed and every other byte stays.
 
 Documents with a document type or entities are refused: nothing is expanded.
 """
@@ -17,7 +17,7 @@ _DEEPEST = 200
 
 @dataclass
 class Element:
-    """An element and its place, in bytes of the UTF-8 text.
+    """XML element and its place, in bytes of the UTF-8 text.
 
     Attributes:
         tag: its name.
@@ -38,22 +38,22 @@ class Element:
     children: list[Element] = field(default_factory=list)
 
     def all(self, tag: str) -> Iterator[Element]:
-        """Its own children of a name."""
+        """Return the element's own children of a name."""
         return (child for child in self.children if child.tag == tag)
 
     def first(self, tag: str) -> Element | None:
-        """The first of its own children of a name."""
+        """Return the first of the element's own children of a name; None where there is none."""
         return next(self.all(tag), None)
 
     @property
     def open(self) -> bool:
-        """Whether it has a last tag."""
+        """Return whether the element has an end tag."""
         return self.foot != self.head or self.end != self.head
 
 
 @dataclass(frozen=True)
 class Edit:
-    """Bytes to be replaced by others."""
+    """Replacement of bytes by other text."""
 
     start: int
     end: int
@@ -61,7 +61,7 @@ class Edit:
 
 
 def xml_places(text: str, name: str) -> Element:
-    """The root element of a text, with all others in it.
+    """Return the root element of a text, with all others in it.
 
     Raises:
         ModelError: not well-formed, a document type or entities in it, or more than 200 elements in one another.
@@ -102,7 +102,7 @@ def xml_places(text: str, name: str) -> Element:
 
 
 def _end_of_tag(data: bytes, start: int) -> int:
-    """The place after the `>` that ends a tag; one in an attribute's value does not."""
+    """Return the place after the `>` that ends a tag, not of one in an attribute's value."""
     quote = b""
     for at in range(start, len(data)):
         byte = data[at : at + 1]
@@ -116,7 +116,7 @@ def _end_of_tag(data: bytes, start: int) -> int:
 
 
 def edited(text: str, edits: Sequence[Edit]) -> str:
-    """The text with all edits, which do not overlap; those at one place in their order."""
+    """Return the text with all edits, which do not overlap; those at one place in their order."""
     data, parts, at = text.encode("utf-8"), [], 0
     for edit in sorted(edits, key=lambda edit: (edit.start, edit.end)):
         parts += [data[at : edit.start], edit.text.encode("utf-8")]
@@ -125,19 +125,19 @@ def edited(text: str, edits: Sequence[Edit]) -> str:
 
 
 def start_tag(tag: str, attributes: Mapping[str, str], *, closed: bool = True) -> str:
-    """A first tag, or a whole element without content."""
+    """Return a start tag, or a whole element without content."""
     listed = "".join(f" {key}={quoteattr(value)}" for key, value in attributes.items())
     return f"<{tag}{listed}{'/' if closed else ''}>"
 
 
 def with_attributes(element: Element, changes: Mapping[str, str]) -> Edit:
-    """Change or add attributes; the others keep their order and what is in the element stays."""
+    """Return an edit that changes or adds attributes; the others keep their order, the element's content stays."""
     attributes = {**element.attributes, **changes}
     return Edit(element.start, element.head, start_tag(element.tag, attributes, closed=not element.open))
 
 
 def with_child(text: str, element: Element, lines: Sequence[str]) -> Edit:
-    """Add lines at the end of an element's content, two columns further in than it.
+    """Return an edit that adds lines at the end of an element's content, two columns further in than it.
 
     Lines that begin with blanks go further in.
     """

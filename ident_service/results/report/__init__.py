@@ -1,1 +1,1 @@
-"""The report: evidence and parameters in, one self-contained page out. Files are the business of `report_files.py`."""
+"""Make the report: one self-contained page from evidence and parameters. `report_files.py` handles its files."""

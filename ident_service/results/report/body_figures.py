@@ -1,4 +1,4 @@
-"""The links as bodies: their ellipsoids on the arm, seen from the side and from above."""
+"""Draw the links' ellipsoids on the arm, seen from the side and from above."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ _GOOD = (
 
 
 def body_figures(evidence: Evidence) -> list[Figure]:
-    """The arm from the side and from above; none where there are no link parameters."""
+    """Return the arm from the side and from above; none where there are no link parameters."""
     if evidence.posed is None:
         return []
     return [_figure(evidence.joints, evidence.posed, name, view) for name, view in _VIEWS]
 
 
 def ellipse(axes: Array, view: tuple[int, int]) -> Array:
-    """Outline of an ellipsoid seen along an axis of the base frame, about its centre [m], shape (corners, 2).
+    """Return the outline of an ellipsoid seen along a base axis, about its centre [m], shape (corners, 2).
 
     Args:
         axes: half axes as rows [m], shape (3, 3).
@@ -83,7 +83,7 @@ def _figure(joints: tuple[str, ...], posed: Posed, name: str, view: tuple[int, i
 
 
 def _frame(canvas: Canvas, axes: Axes, view: tuple[int, int]) -> None:
-    """Round coordinates [m], equally far apart both ways."""
+    """Draw round coordinates [m], equally far apart both ways."""
     values = round_values(axes.low_x, axes.high_x, 6)
     step = values[1] - values[0]
     for value in values:
@@ -102,7 +102,7 @@ def _frame(canvas: Canvas, axes: Axes, view: tuple[int, int]) -> None:
 
 
 def _draw(canvas: Canvas, axes: Axes, view: tuple[int, int], body: Body, longest: float) -> bool:
-    """Draw a body's outline unless it is larger than the view; returns whether its centre lies outside of the view."""
+    """Draw a body's outline unless it is larger than the view; return whether its centre lies outside of the view."""
     center = body.center[list(view)]
     if body.axes is not None and _length(body.axes) <= longest:
         outline = center + ellipse(body.axes, view)
@@ -112,7 +112,7 @@ def _draw(canvas: Canvas, axes: Axes, view: tuple[int, int], body: Body, longest
 
 
 def _length(axes: Array) -> float:
-    """Of an ellipsoid from end to end [m]."""
+    """Return the largest diameter of an ellipsoid [m]."""
     return 2.0 * float(np.linalg.norm(axes, axis=1).max())
 
 

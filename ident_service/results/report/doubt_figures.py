@@ -1,4 +1,4 @@
-"""How sure each parameter is, and which parameters the recordings could not tell apart."""
+"""Draw the uncertainty of each parameter, and which parameters the recordings could not tell apart."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _PAIRS = 5
 
 
 def relative_deviations(parameters: ParameterFile) -> Array:
-    """Each standard deviation over the parameter's size, or over what is as good as zero; NaN where unknown."""
+    """Return each standard deviation over the larger of the parameter's size and a negligible one; NaN if unknown."""
     table = parameters.content["base_parameters"]
     deviations = np.array([np.nan if one is None else one for one in table.get("standard_deviations", [])], float)
     if len(deviations) != len(parameters.values):
@@ -29,7 +29,7 @@ def relative_deviations(parameters: ParameterFile) -> Array:
 
 
 def correlations(parameters: ParameterFile) -> Array | None:
-    """Correlation of the base parameters, shape (base, base), NaN where the data are blind; None without covariance."""
+    """Return the correlation of the base parameters, (base, base), NaN where unseen; None without covariance."""
     rows = parameters.content["base_parameters"].get("covariance")
     if rows is None or any(len(row) != len(rows) for row in rows):
         return None
@@ -39,7 +39,7 @@ def correlations(parameters: ParameterFile) -> Array | None:
 
 
 def strongest_pairs(correlation: Array) -> list[tuple[int, int, float]]:
-    """The pairs of parameters that are hardest to tell apart, the hardest first."""
+    """Return the pairs of parameters that are hardest to tell apart, the hardest first."""
     rows, columns = np.tril_indices(len(correlation), -1)
     values = np.nan_to_num(correlation[rows, columns])
     order = np.argsort(-np.abs(values), kind="stable")[:_PAIRS]
@@ -47,7 +47,7 @@ def strongest_pairs(correlation: Array) -> list[tuple[int, int, float]]:
 
 
 def deviation_figure(parameters: ParameterFile) -> Figure | None:
-    """Every parameter's relative standard deviation; None where the file has no deviations."""
+    """Draw every parameter's relative standard deviation; None where the file has no deviations."""
     shares = relative_deviations(parameters)
     if not np.isfinite(shares).any():
         return None
@@ -67,7 +67,7 @@ def deviation_figure(parameters: ParameterFile) -> Figure | None:
         canvas.text("soft halo", LEFT + 4, y - 3, f"{100 * level:g} %", size=FONT)
     for place in range(size):
         kind = _KINDS.get(verdicts[place] if place < len(verdicts) else "", "good")
-        # Shape tells what colour tells: a ring would not be seen at this size, but a square is.
+        # Shape repeats what colour shows: a ring would not be seen at this size, but a square is.
         x, y = float(axes.x(place + 1)), float(axes.y(shown[place]))
         if kind == "good":
             canvas.circle(kind, x, y, 3.4)
@@ -89,7 +89,7 @@ def deviation_figure(parameters: ParameterFile) -> Figure | None:
 
 
 def correlation_figure(parameters: ParameterFile) -> Figure | None:
-    """The lower half of the correlation matrix as a map; None where the file has no covariance."""
+    """Draw the lower half of the correlation matrix as a map; None where the file has no covariance."""
     correlation = correlations(parameters)
     if correlation is None:
         return None
@@ -126,7 +126,7 @@ def correlation_figure(parameters: ParameterFile) -> Figure | None:
 
 
 def _runs(values: Array) -> Sequence[tuple[int, int, float]]:
-    """Begin, end and value of every run of equal values."""
+    """Return begin, end and value of every run of equal values."""
     if not len(values):
         return []
     begins = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)

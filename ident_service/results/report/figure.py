@@ -1,4 +1,4 @@
-"""One figure of a report: a drawing, and the sentence that says what good and bad look like."""
+"""Represent one figure of a report: a drawing, and the sentence that says what good and bad look like."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ LEFT, RIGHT = 62.0, 12.0
 
 @dataclass(frozen=True)
 class Zoom:
-    """What the page's script needs to draw a time plot again over a shorter time.
+    """Data that the page's script needs to redraw a time plot over a shorter time.
 
     Attributes:
         recording: number of the recording.
@@ -31,12 +31,12 @@ class Zoom:
 
 @dataclass(frozen=True)
 class Figure:
-    """A drawing with its words.
+    """Drawing with its title, description and caption.
 
     Attributes:
         slug: name of its file, without an ending.
         title: what a screen reader says first.
-        description: what it shows, for who cannot see it.
+        description: content of the drawing, for readers who cannot see it.
         caption: what it says, what good looks like and what bad.
         canvas: the drawing.
         zoom: for time plots.
@@ -52,5 +52,5 @@ class Figure:
     wide: bool = False
 
     def svg(self, *, inline: bool = False) -> str:
-        """The drawing as a file of its own, or to stand in a page that has the style sheet."""
+        """Return the drawing as a file of its own, or for a page that has the style sheet."""
         return self.canvas.svg(self.title, self.description, inline=inline)

@@ -1,4 +1,4 @@
-"""All figures of a report by section, for the page and for files of their own."""
+"""Draw all figures of a report by section, for the page and for files of their own."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ident_service.results.report.torque_figures import torque_figures
 
 @dataclass(frozen=True)
 class Figures:
-    """The figures of every section.
+    """Figures of every section.
 
     Attributes:
         torque: per recording, one per joint.
@@ -36,13 +36,13 @@ class Figures:
     timing: tuple[Figure, ...]
 
     def all(self) -> tuple[Figure, ...]:
-        """In the order of the page."""
+        """Return all figures in the order of the page."""
         torque = tuple(figure for recording in self.torque for figure in recording)
         return torque + self.residual + self.friction + self.doubt + self.bodies + self.timing
 
 
 def figures(evidence: Evidence, parameters: ParameterFile) -> Figures:
-    """Draw everything."""
+    """Draw all figures of a report."""
     doubt = (deviation_figure(parameters), correlation_figure(parameters))
     return Figures(
         torque=tuple(tuple(torque_figures(evidence, place)) for place in range(len(evidence.recordings))),

@@ -1,4 +1,4 @@
-"""Friction against velocity: points from the recordings, the curve of the estimate through them."""
+"""Draw friction against velocity: points from the recordings, the curve of the estimate through them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _GOOD = (
 
 
 def friction_figures(evidence: Evidence) -> list[Figure]:
-    """One figure per drive; none where the model has no friction."""
+    """Draw one figure per drive; none where the model has no friction."""
     figures = []
     for drive, friction in enumerate(evidence.friction):
         name = evidence.joints[drive]

@@ -1,4 +1,4 @@
-"""HTML from texts: nothing that comes from a file or a name reaches the page unquoted."""
+"""Build HTML from texts, with everything that comes from a file or a name quoted."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ident_service.results.drawing import plain
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell of a table.
+    """Cell of a table.
 
     Attributes:
         words: what is read.
@@ -25,7 +25,7 @@ class Cell:
 
 
 def prose(words: str) -> str:
-    """Text in which no line ends between a number and its unit."""
+    """Return text in which no line ends between a number and its unit."""
     return plain(re.sub(r"(?<=\d) (N m|N|%|ms|s|Hz|kg|MB)(?=[\s.,;:)]|$)", _joined, words))
 
 
@@ -34,17 +34,17 @@ def _joined(unit: re.Match[str]) -> str:
 
 
 def paragraph(words: str, kind: str = "") -> str:
-    """A paragraph."""
+    """Return a paragraph as HTML."""
     return f"<p{_class(kind)}>{prose(words)}</p>"
 
 
 def items(rows: Iterable[str]) -> str:
-    """A list."""
+    """Return a list as HTML."""
     return "<ul>" + "".join(f"<li>{prose(row)}</li>" for row in rows) + "</ul>"
 
 
 def table(caption: str, heads: Sequence[str], rows: Iterable[Sequence[Cell]], *, kind: str = "") -> str:
-    """A table with a caption; the first cell of every row is its head.
+    """Return a table with a caption as HTML; the first cell of every row is its head.
 
     It stands in a region that scrolls by itself where it is wider than the page.
     """
@@ -61,12 +61,12 @@ def table(caption: str, heads: Sequence[str], rows: Iterable[Sequence[Cell]], *,
 
 
 def section(name: str, title: str, *content: str) -> str:
-    """A section under a heading, with a name to go to."""
+    """Return a section under a heading as HTML, with a name to link to."""
     return f'<section id="{name}"><h2>{plain(title)}</h2>' + "\n".join(content) + "</section>"
 
 
 def contents(names: Iterable[tuple[str, str]]) -> str:
-    """Where to go on the page: names and titles of sections."""
+    """Return the table of contents as HTML, from names and titles of sections."""
     links = "".join(f'<li><a href="#{name}">{plain(title)}</a></li>' for name, title in names)
     return f'<nav aria-label="Contents"><ul>{links}</ul></nav>'
 

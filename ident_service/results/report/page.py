@@ -1,7 +1,4 @@
-"""The page: one self-contained HTML file, no network, that reads without a script and zooms with one.
-
-Boundary: evidence, parameters and hashes in, text out.
-"""
+"""Write the report page: one self-contained HTML file, no network, that reads without a script and zooms with one."""
 
 from __future__ import annotations
 
@@ -57,7 +54,7 @@ _ARRIVAL = (
 
 
 def report_html(evidence: Evidence, parameters: ParameterFile, config: ArmConfig, sha256: Mapping[str, str]) -> str:
-    """The report of an identification.
+    """Return the report of an identification as HTML.
 
     Args:
         evidence: what was gathered while the estimate was at hand.
@@ -222,7 +219,7 @@ def _zoom(zoom: Zoom) -> str:
 
 
 def _data(place: int, traced: Traced) -> str:
-    """A recording for the script: what `evidence.json` has of it, names left out."""
+    """Return a recording for the script: its entries of `evidence.json` without the names."""
     joints: list[dict[str, Any]] = [
         {
             "torque": packed(joint.torque),
@@ -244,5 +241,5 @@ def _asset(name: str) -> str:
 
 
 def _hash(script: str) -> str:
-    """What a content security policy allows a script by."""
+    """Return the hash by which a content security policy allows a script."""
     return "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")

@@ -1,7 +1,4 @@
-"""What stands against using an estimate, each by a rule that the page states: verdict and warnings say the same.
-
-Boundary: evidence and parameters to facts and sentences; nothing is drawn.
-"""
+"""List the limitations of an estimate, each by a rule that the page states: verdict and warnings say the same."""
 
 from __future__ import annotations
 
@@ -23,7 +20,7 @@ _LONGEST = 60  # characters of a name in a sentence
 
 @dataclass(frozen=True)
 class PoorJoint:
-    """A joint whose torque is predicted poorly.
+    """Joint whose torque is predicted poorly.
 
     Attributes:
         name: of the joint.
@@ -37,12 +34,12 @@ class PoorJoint:
 
     @property
     def in_motion(self) -> bool:
-        """Whether it is poor where the joint moves, too."""
+        """Return whether the joint's torque is predicted poorly in motion, too."""
         return self.moving is None or self.moving > POOR
 
 
 def poor_joints(evidence: Evidence, parameters: ParameterFile) -> list[PoorJoint]:
-    """Joints off by more than 15 % of their own torque on what the fit never saw, or else on what it was fitted to."""
+    """Return joints off by more than 15 % of their own torque on unseen data, or else on the fitted data."""
     content = parameters.content
     unseen = content.get("validation", [])
     scores = unseen or ([content["fit"]] if "fit" in content else [])
@@ -57,7 +54,10 @@ def poor_joints(evidence: Evidence, parameters: ParameterFile) -> list[PoorJoint
 
 
 def unidentified(parameters: ParameterFile) -> list[tuple[str, float]]:
-    """Expression and relative deviation of every unidentified parameter, the least sure first; infinite if not seen."""
+    """Return expression and relative deviation of every unidentified parameter, the least certain first.
+
+    The deviation is infinite where the data do not see the parameter.
+    """
     table = parameters.content["base_parameters"]
     shares = np.nan_to_num(relative_deviations(parameters), nan=np.inf)
     found = [k for k, word in enumerate(table.get("verdicts", [])) if word == "unidentified"]
@@ -65,7 +65,7 @@ def unidentified(parameters: ParameterFile) -> list[tuple[str, float]]:
 
 
 def active_conditions(evidence: Evidence, parameters: ParameterFile) -> str:
-    """How many conditions the data pull against, in words; empty where there are none or no body has the parameters."""
+    """Return the number of active conditions, in words; empty where there are none or no body has the parameters."""
     found = parameters.content.get("feasibility", {})
     tight = found.get("tight", [])
     if not tight or found["margin"] <= 0.0:
@@ -76,7 +76,7 @@ def active_conditions(evidence: Evidence, parameters: ParameterFile) -> str:
 
 
 def reservations(evidence: Evidence, parameters: ParameterFile) -> list[str]:
-    """What stands against using the estimate, in sentences; empty where nothing does."""
+    """Return the limitations of the estimate, in sentences; empty where there are none."""
     found = [f"Must not be used: {reason}." for reason in parameters.content.get("unusable", [])]
     if parameters.content.get("feasibility", {}).get("margin", 1.0) <= 0.0:
         found.append("No real body has these parameters.")
@@ -96,7 +96,7 @@ def reservations(evidence: Evidence, parameters: ParameterFile) -> list[str]:
     if count := verdicts.count("unidentified"):
         found.append(f"{count} of {len(verdicts)} base parameters are unidentified: these recordings do not tell them.")
     fit = parameters.content.get("fit")
-    # A large number by itself is no reservation: it depends on units, and parameters may be identified in spite of it.
+    # A large number by itself is no limitation: it depends on units, and parameters may be identified in spite of it.
     if fit is not None and "unidentified" in verdicts and (fit["condition_number"] or np.inf) > ILL_CONDITIONED:
         size = "infinite" if fit["condition_number"] is None else number(fit["condition_number"])
         found.append(
@@ -107,7 +107,7 @@ def reservations(evidence: Evidence, parameters: ParameterFile) -> list[str]:
 
 
 def joints_in_words(joints: Sequence[PoorJoint]) -> str:
-    """Every joint with its errors."""
+    """List every joint with its errors, in words."""
     return ", ".join(
         f"{one.name} ({number(one.whole)} %"
         + (")" if one.in_motion or one.moving is None else f"; {number(one.moving)} % away from standstill)")
@@ -116,12 +116,12 @@ def joints_in_words(joints: Sequence[PoorJoint]) -> str:
 
 
 def listed(names: Sequence[str]) -> str:
-    """The first few names, shortened, and how many more there are."""
+    """Join the first few names, shortened, and say how many more there are."""
     shown = [shortened(name) for name in names[:NAMED]]
     more = len(names) - len(shown)
     return "; ".join(shown) + (f"; and {more} more" if more > 0 else "")
 
 
 def shortened(name: str) -> str:
-    """A name that fits into a sentence."""
+    """Return a name that fits into a sentence."""
     return name if len(name) <= _LONGEST else name[: _LONGEST - 3] + "..."

@@ -1,4 +1,4 @@
-"""What is left of the torque by frequency and by lag: whether it is noise, or something that the model lacks."""
+"""Draw the torque residual by frequency and by lag: whether it is noise, or something that the model lacks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _GOOD = (
 
 
 def residual_figures(evidence: Evidence) -> list[Figure]:
-    """One figure per joint: the first recording that was fitted to, and the first that was not; as far as they last."""
+    """Draw one figure per joint: the first recording that was fitted to, and the first that was not."""
     shown = []
     for role in ("identification", "validation"):
         shown += [one for one in evidence.recordings if one.role == role and one.spectra][:1]
@@ -69,7 +69,7 @@ def _strongest(spectrum: Spectrum) -> str:
 
 
 def _memory(spectrum: Spectrum) -> str:
-    """How long the residual resembles itself."""
+    """Describe the correlation time of the residual, where its autocorrelation falls below 1/e."""
     small = np.flatnonzero(np.abs(spectrum.correlation) < np.exp(-1.0))
     if not len(small):
         return f"and it resembles itself for more than {number(float(spectrum.lag[-1]))} s"

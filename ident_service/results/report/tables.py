@@ -1,4 +1,4 @@
-"""The tables of a report."""
+"""Build the tables of a report."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MARKS: dict[Verdict, str] = {"identified": "", "weak": "weak", "unidentified": 
 
 
 def parameter_table(evidence: Evidence, parameters: ParameterFile) -> str:
-    """Every base parameter: the chosen estimate as the parameter file has it, deviation, verdict, the other estimates.
+    """Return every base parameter as a table: the chosen estimate, deviation, verdict, the other estimates.
 
     The deviation is the unconstrained fit's, whose column therefore stands beside it where another one was chosen.
     """
@@ -56,7 +56,7 @@ def parameter_table(evidence: Evidence, parameters: ParameterFile) -> str:
 
 
 def _others(evidence: Evidence) -> list[tuple[str, Array | None]]:
-    """Name and values of the estimates to compare the chosen one with; CAD without values where there is none."""
+    """Return name and values of the estimates to compare the chosen one with; CAD without values where unknown."""
     first = evidence.estimates[0]
     found: list[tuple[str, Array | None]] = [(CAD, first.values if first.name == CAD else None)]
     places = sorted({evidence.unconstrained, evidence.constrained} - {evidence.chosen})
@@ -65,7 +65,7 @@ def _others(evidence: Evidence) -> list[tuple[str, Array | None]]:
 
 
 def verdict_rule() -> str:
-    """What the words of the verdict column stand for, and what the deviation beside them is of."""
+    """Return the meaning of the verdict column's words, and of the deviation beside them."""
     known, weak, share = 100 * IDENTIFIED_BELOW, 100 * WEAK_BELOW, NEGLIGIBLE_TORQUE
     return (
         f"Identified: \u03c3 is below {known:g} % of the parameter, or changes no joint's torque by more than "
@@ -77,7 +77,7 @@ def verdict_rule() -> str:
 
 
 def error_table(evidence: Evidence) -> str:
-    """Every estimate: feasible or not, and its torque error on every recording."""
+    """Return a table of all estimates: feasible or not, and torque error on every recording."""
     unseen = [one.name for one in evidence.recordings if one.role == "validation"]
     rows = []
     for place, one in enumerate(evidence.estimates):
@@ -99,7 +99,7 @@ def error_table(evidence: Evidence) -> str:
 
 
 def joint_table(evidence: Evidence, parameters: ParameterFile) -> str:
-    """Torque error per joint, of the chosen estimate, on every recording."""
+    """Return a table of the chosen estimate's torque error per joint, on every recording."""
     columns: list[tuple[str, list[Mapping[str, Any]]]] = []
     if "fit" in parameters.content:
         columns.append(("fitted", parameters.content["fit"]["per_joint"]))
@@ -117,7 +117,7 @@ def joint_table(evidence: Evidence, parameters: ParameterFile) -> str:
 
 
 def margin_table(evidence: Evidence) -> str:
-    """Per link the condition that leaves the least room, and the least of those that are about several links."""
+    """Return a table, per link, of the condition with the smallest margin, and of those on several links."""
     rows = []
     for link, name in enumerate(evidence.joints):
         own = [one for one in evidence.conditions if one.links == (link,)]
@@ -137,7 +137,7 @@ def _tightest(conditions: list[Condition]) -> list[Cell]:
 
 
 def friction_table(evidence: Evidence, parameters: ParameterFile) -> str:
-    """Per joint what shapes its friction curve beside the parameters; empty where nothing does."""
+    """Return a table, per joint, of the friction curve's shape parameters; empty where there are none."""
     found = parameters.content.get("friction", {})
     kinds = (("pre-sliding way", "presliding", "rad", "m"), ("Stribeck velocity", "stribeck_velocity", "rad/s", "m/s"))
     shown = [(*kind, found[kind[1]]) for kind in kinds if any(found.get(kind[1], []))]
@@ -154,7 +154,7 @@ def friction_table(evidence: Evidence, parameters: ParameterFile) -> str:
 
 
 def axis_table(evidence: Evidence) -> str:
-    """Per joint, how often it did not answer; empty where no recording knows."""
+    """Return a table, per joint, of how often it did not answer; empty where no recording knows."""
     known = [one for one in evidence.timing if one.invalid]
     if not known:
         return ""
@@ -169,7 +169,7 @@ def axis_table(evidence: Evidence) -> str:
 
 
 def file_table(evidence: Evidence, parameters: ParameterFile, sha256: Mapping[str, str]) -> str:
-    """What was used and made, with hashes."""
+    """Return a table of the files that were used and made, with hashes."""
     rows = [[Cell(f"{one.role} recording {one.name}"), Cell(one.sha256, kind="hash")] for one in evidence.recordings]
     used = {one.sha256 for one in evidence.recordings}
     if arm := parameters.content.get("arm"):

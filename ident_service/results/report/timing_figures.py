@@ -1,4 +1,4 @@
-"""How evenly a recording's samples were taken, as a histogram."""
+"""Draw how evenly a recording's samples were taken, as a histogram."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _TOP, _HEIGHT, _BOTTOM = 28.0, 150.0, 40.0
 
 
 def timing_figures(evidence: Evidence, parameters: ParameterFile) -> list[Figure]:
-    """One figure per recording; the parameter file may know the standard deviation of its steps."""
+    """Draw one figure per recording; the parameter file may know the standard deviation of its steps."""
     found = parameters.content.get("recording_quality", [])
     known = {one["recording"]: float(one["jitter_seconds"]["standard_deviation"]) for one in found}
     return [_figure(place, timing, known.get(timing.recording)) for place, timing in enumerate(evidence.timing, 1)]
@@ -52,7 +52,7 @@ def _figure(place: int, timing: Timing, deviation: float | None) -> Figure:
 
 
 def timing_words(timing: Timing, deviation: float | None = None) -> str:
-    """What a recording's timing comes down to.
+    """Summarise a recording's timing in words.
 
     Args:
         timing: of the recording.

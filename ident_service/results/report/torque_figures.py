@@ -1,4 +1,4 @@
-"""Measured against predicted torque, and what is left, joint by joint along a recording (figure 6 of the paper)."""
+"""Draw measured against predicted torque, and the residual, per joint along a recording (figure 6 of the paper)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _GOOD = (
 
 
 def torque_figures(evidence: Evidence, recording: int) -> list[Figure]:
-    """One figure per joint of a recording."""
+    """Draw one figure per joint of a recording."""
     return [_figure(evidence, recording, joint) for joint in range(len(evidence.joints))]
 
 
@@ -66,7 +66,7 @@ def _figure(evidence: Evidence, recording: int, joint: int) -> Figure:
 
 
 class _Columns:
-    """A trace as so many columns as can be seen, without a lost extreme."""
+    """Trace reduced to as many columns as can be seen, without a lost extreme."""
 
     def __init__(self, traced: Traced, trace: JointTrace) -> None:
         step = max(1, -(-len(traced.time) // _COLUMNS))
@@ -88,7 +88,7 @@ class _Columns:
 
 
 def _still(canvas: Canvas, axes: Axes, edges: tuple[Array, Array], standstill: Mask) -> None:
-    """Where rows were left out of the fit."""
+    """Draw where rows were left out of the fit."""
     turns = np.flatnonzero(np.diff(np.concatenate([[False], standstill, [False]]).astype(int)))
     canvas.clip(axes)
     for begin, end in zip(turns[::2], turns[1::2], strict=True):

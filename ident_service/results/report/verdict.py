@@ -1,4 +1,4 @@
-"""The verdict in one paragraph: every word of it follows from a number."""
+"""Write the verdict in one paragraph: every word of it follows from a number."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _CERTIFIED = "parameters.json has a certificate of that: `ident verify --arm` ch
 
 
 def verdict(evidence: Evidence, parameters: ParameterFile, *, simulated: bool = False) -> list[str]:
-    """Sentences: could a body have it, is that certified, how well it predicts, what is not known, what to do next.
+    """Return the verdict in sentences: feasibility, its certificate, prediction error, unknowns, next step.
 
     Args:
         evidence: what was gathered while the estimate was at hand.
@@ -95,7 +95,7 @@ def _prediction(evidence: Evidence) -> str:
 
 
 def _joints(evidence: Evidence, parameters: ParameterFile) -> list[str]:
-    """Which joints the error of the whole arm hides."""
+    """Return sentences on joints whose errors the error of the whole arm hides."""
     poor = poor_joints(evidence, parameters)
     unseen = bool(evidence.estimates[evidence.chosen].validation)
     where = "what it never saw" if unseen else "what it was fitted to"
@@ -120,7 +120,7 @@ def _error(whole: float, moving: float | None) -> str:
 
 
 def _worse(evidence: Evidence) -> bool:
-    """Whether it predicts unseen motions markedly worse than its own; judged where friction is known, if told."""
+    """Return whether unseen motions are predicted markedly worse than the fitted ones; without standstill, if known."""
     own = evidence.estimates[evidence.chosen]
     if own.moving is not None and own.moving_validation:
         return max(own.moving_validation) > _MUCH_WORSE * own.moving
@@ -146,7 +146,7 @@ def _knowledge(parameters: ParameterFile) -> str:
 
 
 def _next(evidence: Evidence, parameters: ParameterFile) -> str:
-    """What a person should do now, the most urgent thing first."""
+    """Return what a person should do now, the most urgent thing first."""
     if parameters.content.get("unusable"):
         return "Next: mend what forbids their use, and identify again."
     steps = []
