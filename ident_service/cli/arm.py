@@ -258,7 +258,7 @@ def _rehearse(arguments: argparse.Namespace) -> Answer:
 
 
 def _stop(arguments: argparse.Namespace) -> Answer:
-    """Stop an arm, or all; what is told and entered of it comes after."""
+    """Stop an arm, or all arms; print and note it in the audit trail only afterwards."""
     from ident_service.service.state_folder import shut_out
 
     os.umask(0o077)  # and no more: a stop is not refused for a folder that others can enter, or that is another's

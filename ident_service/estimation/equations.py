@@ -116,7 +116,7 @@ class Equations:
         return replace(self, blocks=blocks, near=near)
 
     def with_near(self, shares: Array) -> Equations:
-        """The same equations with the rows near standstill among the blocks, multiplied by `shares` per joint."""
+        """Return the equations with rows near standstill merged into the blocks, multiplied by `shares` per joint."""
         if not any(near.rows.any() for near in self.near):
             return self
         pairs = zip(self.blocks, self.near, strict=True)

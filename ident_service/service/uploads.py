@@ -252,7 +252,7 @@ class Piece:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Let the upload go."""
+        """Unlock the upload."""
         # The lock is of the open file, which a process that is being started has, too, until it runs its program.
         fcntl.flock(self._fd, fcntl.LOCK_UN)
         os.close(self._fd)

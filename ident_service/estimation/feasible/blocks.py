@@ -90,7 +90,7 @@ class Block:
         return float(np.linalg.eigvalsh(symmetric(entries, self.size) / np.outer(root, root))[0])
 
     def times(self, T: Array) -> Array:
-        """F T, shape (entries, columns of T), from the few parameters that the block is about."""
+        """Return F T, shape (entries, columns of T), from the nonzero columns of F."""
         return np.asarray(self.F[:, self.felt] @ T[self.felt])
 
     @cached_property

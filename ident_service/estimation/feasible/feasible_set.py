@@ -70,7 +70,7 @@ class FeasibleSet:
     equalities: tuple[Block, ...] = field(default=())
 
     def margin(self, delta: Array) -> tuple[float, str]:
-        """The smallest eigenvalue of all blocks and the block it belongs to; positive inside the set."""
+        """Return the smallest eigenvalue of all blocks and the block it belongs to; positive inside the set."""
         return min(
             (float(value), self.blocks[place].name)
             for group in self._by_size

@@ -124,7 +124,7 @@ def answer_mistakes(app: FastAPI) -> None:
 
 
 def _short_of(request: Request, error: Exception) -> tuple[int, str, str, dict[str, str]] | None:
-    """Tell what the machine, or the registry, is short of; None where an error says something else."""
+    """Return the answer for a lack of a resource (locked registry, full disk); None for any other error."""
     found = error
     if not isinstance(error, Unavailable):
         found = shortage(request.app.state.service.state / FILE, error) or error
