@@ -171,7 +171,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
     ):
         stoppable = StoppableArm(arm, until(lambda: controls.stop or stopping.requested(), lease))
         # The rate is measured with what a run gets of the kernel.
-        with nullcontext() if arm.clock.lock_step else asked():
+        with nullcontext() if arm.clock.lock_step else asked(settings=config.realtime):
             seconds = 0.0 if arguments.rate_seconds is None else arguments.rate_seconds
             ticket = preflight(stoppable, model, motion, confirm=confirm, rate_seconds=seconds)
     write_ticket(path, ticket)

@@ -16,7 +16,7 @@ from pydantic import (
     model_validator,
 )
 
-from ident_service.config.control import Control
+from ident_service.config.control import Control, Realtime
 from ident_service.config.design import Design
 from ident_service.config.drivers import Driver
 from ident_service.config.kinematics import Kinematics
@@ -331,7 +331,7 @@ _MOTION_DEPENDS_ON = (
 )
 
 
-class ArmConfig(Section):
+class ArmConfig(GrownSection):
     """A whole arm as its YAML file describes it; the first thing that passes every door.
 
     WARNING: with `unattended_motion: allowed` a scheduled re-identification, or one after maintenance, moves the arm
@@ -352,6 +352,7 @@ class ArmConfig(Section):
     prior: ParameterTable | None = None
     feasible_set: FeasibleSetName = "pseudo_inertia"
     control: Control = Control()
+    realtime: Realtime = Realtime()
     identification: Identification = Identification()
     recording: RecordingFormat = RecordingFormat()
     transmission: Transmission | None = None
@@ -362,6 +363,7 @@ class ArmConfig(Section):
     motions: Motions = Motions()
     driver: Driver | None = None
     unattended_motion: Literal["refused", "allowed"] = "refused"
+    later = frozenset({"realtime"})
 
     def has_brake(self, joint: str) -> bool:
         """Tell whether a joint is held where its drive has no power."""

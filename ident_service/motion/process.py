@@ -163,7 +163,8 @@ def _moved(request: dict[str, Any], controls: ControlFile, latch: Latch) -> dict
     sink = TimedSink(ring)
     lifeline = Lifeline(controls, sys.stdin.fileno(), lock_step=arm.clock.lock_step)
     # Last, so that everything it freezes and locks is loaded.
-    sentence = "virtual time" if arm.clock.lock_step else ask().sentence()
+    granted = None if arm.clock.lock_step else ask(settings=config.realtime)
+    sentence = "virtual time" if granted is None else granted.sentence()
     with arm:
         ticket = ticket_from_json(request["ticket"])
         ticket.require_valid_for(subject_of(model, motion, arm.describe()), datetime.now(UTC))
