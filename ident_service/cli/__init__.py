@@ -22,6 +22,7 @@ from ident_service.cli import (
     comparing,
     configs,
     daemon,
+    doctor,
     emulate,
     exports,
     keeping,
@@ -54,7 +55,7 @@ __all__ = ["DONE", "FAILED", "FAULTED", "PERSON_NEEDED", "USAGE", "VERDICT_NO", 
 
 GROUPS = (
     *(commission, motions, arm, recovery, parameters, results, comparing, exports, keeping),
-    *(configs, bus, emulate, schedule, reidentify, daemon, remote),
+    *(configs, bus, doctor, emulate, schedule, reidentify, daemon, remote),
 )
 _EXIT_CODES: tuple[tuple[type[IdentError], int], ...] = (
     (ConfigError, USAGE),

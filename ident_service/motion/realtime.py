@@ -136,7 +136,7 @@ def asked(core_from_last: int = 0, settings: Realtime | None = None) -> Iterator
 def capable(capability: int) -> bool:
     """Tell if this process has a capability, by its number in linux/capability.h."""
     with suppress(OSError, ValueError):
-        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
+        for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines():
             if line.startswith("CapEff:"):
                 return bool(int(line.split()[1], 16) >> capability & 1)
     return False
@@ -197,7 +197,7 @@ def _candidates(settings: Realtime, core_from_last: int) -> list[int]:
         return list(settings.cores)
     isolated: list[int] = []
     with suppress(OSError, ValueError):
-        isolated = core_numbers(ISOLATED.read_text(encoding="ascii"))
+        isolated = core_numbers(ISOLATED.read_text(encoding="utf-8"))
     # The last ones: interrupts and whoever started us prefer the first.
     others = sorted(os.sched_getaffinity(0) - set(isolated))
     cores = [*reversed(isolated), *reversed(others)]

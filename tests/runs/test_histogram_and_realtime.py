@@ -70,14 +70,15 @@ def another_loop(settings: str = "") -> Iterator[str]:
 
 @pytest.mark.skipif(len(CORES) < 2, reason="needs two cores")
 def test_two_loops_never_share_a_core_of_their_own() -> None:
-    one = f"cores=({CORES[-1]},)"
-    with another_loop(one) as first:
-        assert first == str(CORES[-1])
-        assert asking(f"cores=({CORES[-1]}, {CORES[0]})", "print(granted.core)") == f"{CORES[0]}\n"
-        alone = asking(one, "print(granted.core, sorted(os.sched_getaffinity(0)), granted.sentence())")
+    with another_loop(f"cores={tuple(CORES)}") as first:
+        if first == "None":
+            pytest.skip("loops outside of this test have every core")
+        both = f"cores=({first}, {next(core for core in CORES if core != int(first))})"
+        other = asking(both, "print(granted.core)").strip()  # or none, where a loop outside has that one
+        assert other != first
+        alone = asking(f"cores=({first},)", "print(granted.core, sorted(os.sched_getaffinity(0)), granted.sentence())")
     assert alone.startswith(f"None {CORES} ")  # left to the kernel, beside nobody
-    assert f"no core of its own: other loops have core {CORES[-1]}" in alone
-    assert asking(one, "print(granted.core, os.sched_getaffinity(0))") == f"{CORES[-1]} {{{CORES[-1]}}}\n"
+    assert f"no core of its own: other loops have core {first}" in alone
 
 
 def test_a_core_that_is_not_there_is_said() -> None:
@@ -120,8 +121,10 @@ def test_heap_and_stack_have_their_pages_before_the_loop_begins() -> None:
 def test_what_was_asked_for_a_while_is_given_back() -> None:
     before = os.sched_getscheduler(0), os.sched_getaffinity(0)
     for _ in range(2):  # its core is free again
-        with asked(settings=Realtime(cores=(CORES[-1],))) as granted:
-            assert granted.core == CORES[-1]
+        with asked(settings=Realtime(cores=tuple(CORES))) as granted:
+            if granted.core is None:
+                pytest.skip("loops outside of this test have every core")
+            assert os.sched_getaffinity(0) == {granted.core}
         assert (os.sched_getscheduler(0), os.sched_getaffinity(0)) == before
 
 

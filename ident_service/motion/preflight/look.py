@@ -27,8 +27,8 @@ VELOCITY_NOISE = 0.1  # of the velocity limit, peak: the guard stops at 1.2
 TORQUE_NOISE = 0.05  # of the torque limit, standard deviation, that the gains make of the noise
 LOST = 0.01  # of all answers
 RATE_REMEDY = (
-    "Give the process a core of its own and real-time priority (rtprio and memlock in limits.conf), stop other load, "
-    "or lower control.rate."
+    "Give the process a core of its own and real-time priority (`ident doctor ARM` says what is missing), stop "
+    "other load, or lower control.rate."
 )
 
 
