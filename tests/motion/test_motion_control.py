@@ -214,3 +214,18 @@ def test_stated_drive_inertia_is_in_the_computed_torque() -> None:
     np.testing.assert_allclose(more, (0.3 - np.array([0.02, 0.01])) * wanted, atol=1e-12)
     less = {name: joint.model_dump() | {"drive_inertia": 0.001} for name, joint in bench_config().joints.items()}
     np.testing.assert_array_equal(control_model(bench_model(joints=less)).prior, MODEL.prior)
+
+
+@pytest.mark.parametrize("lost", [1, 4, 9])
+def test_the_velocity_after_lost_positions_is_over_the_time_since_the_last_one(lost: int) -> None:
+    """A joint that gains speed unseen: no velocity that it never had is taken for its own."""
+    begin, speed, gains = np.zeros(2), np.array([0.5, -1.0]), np.array([40.0, -60.0])
+    control, time, fastest = controller(begin, cutoff=120.0), 0.0, np.zeros(2)
+    for cycle in range(1, 60):
+        time = cycle * PERIOD
+        since = max(0.0, time - 0.030)
+        valid = np.array([True, not 35 <= cycle < 35 + lost])
+        control.torque(speed * time + 0.5 * gains * since**2, valid, rest(begin))
+        fastest = np.maximum(fastest, np.abs(control.velocity))
+    np.testing.assert_array_less(fastest, np.abs(speed + gains * 0.030) * 1.01)
+    np.testing.assert_allclose(control.velocity, speed + gains * 0.0278, rtol=0.05)
