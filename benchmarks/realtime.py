@@ -51,6 +51,7 @@ def planar(folder: Path) -> Path:
         "drives": [drive | {"node": 1}, drive | {"node": 2}],
         "emulation": {"seed": 1, "truth": truth},
         **_PATIENCE,
+        "lost_cycles": 10,  # 10 ms, as at half of the rate
     }
     return _written(
         folder,
