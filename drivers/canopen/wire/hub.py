@@ -27,7 +27,7 @@ from drivers.canopen.wire.medium import Medium, Port, overflow
 from ident_service.errors import DriverError
 
 MOST_ENDS: Final = 32
-LATEST_NS: Final = 50_000_000  # that a wire makes up for when its host was late
+LATEST_NS: Final = 500_000_000  # that a wire makes up for when its host was late
 ERROR_BITS: Final = 20  # flag and delimiter of an error, and the interframe space; superposed flags make it up to 26
 BEFORE_FDF: Final = 15  # start, identifier, RRS, IDE, and the bit that a classic controller takes for an error
 _SELECT_LIMIT: Final = 1024  # descriptors that select, whose timeout alone is finer than milliseconds, can watch
