@@ -69,8 +69,8 @@ def test_a_hidden_delay_of_a_cycle_is_refused() -> None:
     assert "hidden delay from torque to position" in check.reason
 
 
-# Real torque over believed, by motor, with the CAD model of the links (`cad`) or what an identification knows, and what
-# preflight makes of it. Decision 0058 says why physics hide the rest: a joint answers as one with another inertia would.
+# Real torque over believed, by motor, with the CAD model of the links (`cad`) or what an identification knows,
+# and what preflight makes of it. Decision 0058 says why physics hide the rest.
 TORQUES: dict[tuple[str, int, float], str] = {
     ("cad", 1, 2.0): "j1: answer to torque",
     ("cad", 1, 3.0): "j1: answer to torque",
