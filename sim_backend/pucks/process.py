@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.canopen.profile import SYNC
 from drivers.clock import RealClock
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.schema import ArmConfig
@@ -30,8 +29,8 @@ from sim_backend.pucks.wires import INTERFACE as OUR_WIRE
 from sim_backend.pucks.wires import Wires
 
 _POLL_NS = 20_000_000  # commands, stop and states are looked at this often
-_LATE_NS = 500_000  # after which this process was kept from its drives
 _POSITIONS = range(0x181, 0x200)  # TPDO1
+_GIVEN_UP = 0.9  # of a period after SYNC, when a host hardly waits for positions any more
 _AT_ONCE = 256  # frames handled before time is looked at again
 # Speed below which an arm is said to rest when it has been so for a while, and above which to move [rad/s or m/s].
 _RESTS, _MOVES = 1e-2, 3e-2  # closed brakes creep by some 1e-3
@@ -113,6 +112,7 @@ class _Run:
     ) -> None:
         self._emulator, self._station = emulator, station
         self._stamps = isinstance(station, Wires)  # whether frames say when they were on the wire
+        self._given_up_ns = round(_GIVEN_UP * 1e9 * emulator.body.plant.period)
         self._tell, self._commands = tell, commands
         self._clock = RealClock()
         self._later: list[tuple[int, int, Sent]] = []
@@ -144,22 +144,13 @@ class _Run:
                         break
                 heard = self._station.receive(self._patience(now, looked))
                 at_once = 0
-                kept: list[Sent] = []
                 while heard is not None:
                     at_once += 1
                     bus, frame = heard
-                    now = clock.now_ns()
                     # Drives act when a frame is on the wire, not when this process comes to it.
-                    late = self._stamps and now - frame.stamp_ns > _LATE_NS
-                    if kept and frame.identifier == SYNC:
-                        # They would have been there in their own cycle; in this one they would be taken for its own.
-                        kept = [one for one in kept if one.bus != bus or one.frame.identifier not in _POSITIONS]
-                    kept += emulator.receive(bus, frame, frame.stamp_ns if self._stamps else now)
-                    if not late:
-                        self._pass_on(kept)
-                        kept = []
+                    at_ns = frame.stamp_ns if self._stamps else clock.now_ns()
+                    self._pass_on(emulator.receive(bus, frame, at_ns))
                     heard = self._station.receive(0.0) if at_once < _AT_ONCE else None
-                self._pass_on(kept)
                 if at_once:
                     self._heard += at_once
                     heard_ns = clock.now_ns()
@@ -191,6 +182,8 @@ class _Run:
         now = self._clock.now_ns()
         ready = []
         for item in sent:
+            if self._stamps and item.frame.identifier in _POSITIONS and now - item.ready_ns > self._given_up_ns:
+                continue  # a drive would have sent it in its own cycle; in this one it would be taken for its own
             if item.ready_ns <= now:
                 ready.append(item)
             else:
