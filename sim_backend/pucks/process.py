@@ -143,22 +143,25 @@ class _Run:
                     if stop_requested() or (end is not None and now >= end):
                         break
                 heard = self._station.receive(self._patience(now, looked))
-                at_once = 0
+                # Time goes on to when nothing waited any more, however late this process is.
+                now = clock.now_ns()
+                heard, at_once = heard or self._station.receive(0.0), 0
                 while heard is not None:
                     at_once += 1
                     bus, frame = heard
                     # Drives act when a frame is on the wire, not when this process comes to it.
                     at_ns = frame.stamp_ns if self._stamps else clock.now_ns()
-                    self._pass_on(emulator.receive(bus, frame, at_ns))
+                    self._pass_on(emulator.receive(bus, frame, at_ns), at_ns)
+                    now = clock.now_ns()
                     heard = self._station.receive(0.0) if at_once < _AT_ONCE else None
                 if at_once:
                     self._heard += at_once
                     heard_ns = clock.now_ns()
                 # What was due while frames waited comes after them: a drive's firmware would have had them in time.
-                self._pass_on(emulator.tick(clock.now_ns()))
-                self._streaming = clock.now_ns() - heard_ns < _POLL_NS
+                self._pass_on(emulator.tick(now))
+                self._streaming = now - heard_ns < _POLL_NS
                 if self._streaming:
-                    emulator.go_on(clock.now_ns())
+                    emulator.go_on(now)
         finally:
             gc.unfreeze()
             if collecting:
@@ -177,12 +180,13 @@ class _Run:
             due.append(overdue)
         return max(0, min(due) - now_ns) * 1e-9
 
-    def _pass_on(self, sent: Sequence[Sent]) -> None:
-        """Send what is ready, the lowest identifiers first, as a bus would."""
+    def _pass_on(self, sent: Sequence[Sent], asked_ns: int | None = None) -> None:
+        """Send what is ready, the lowest identifiers first, as a bus would, but no position too late."""
         now = self._clock.now_ns()
+        too_late = asked_ns is not None and now - asked_ns > self._given_up_ns
         ready = []
         for item in sent:
-            if self._stamps and item.frame.identifier in _POSITIONS and now - item.ready_ns > self._given_up_ns:
+            if too_late and item.frame.identifier in _POSITIONS:
                 continue  # a drive would have sent it in its own cycle; in this one it would be taken for its own
             if item.ready_ns <= now:
                 ready.append(item)

@@ -207,12 +207,13 @@ def test_drives_whose_process_stalls_answer_the_last_sync_alone(tmp_path: Path) 
         drives.join()
     syncs = [frame.stamp_ns for frame in heard if frame.identifier == SYNC]
     late = np.diff(syncs[:10]) * 1e-6
-    assert len(syncs) > 10
+    assert len(syncs) >= 10
     assert late.min() > 10.0  # of 20 ms: as they were sent, and not all at once
     answers = {node: [frame for frame in heard if frame.identifier == 0x180 + node] for node in (1, 2)}
     for node, frames in answers.items():
-        # Of some 15 SYNCs in the stall one has an answer, and those after it.
-        assert 1 <= len(frames) <= len(syncs) - 8, node
+        # Of those in the stall the last has an answer at most, and the five after it.
+        assert 1 <= len(frames) <= 7, node
+        assert len(syncs) - len(frames) >= 3, node
 
 
 def test_an_arm_may_be_without_positions_for_ten_milliseconds_and_no_longer(tmp_path: Path) -> None:
