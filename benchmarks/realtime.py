@@ -28,6 +28,7 @@ from ident_service.service.arm_state import fault_file
 TRIES = 10
 TARGET = "0.9"
 _PATIENCE = {"torque_deadline": 0.05, "lost_cycles": 5}
+_REALTIME = {"priority": 80}  # above whatever else of ours runs on this computer, such as tests
 
 
 def wam(folder: Path) -> Path:
@@ -35,7 +36,7 @@ def wam(folder: Path) -> Path:
     bus = {"interface": "ident_wire", "channel": f"wam{os.getpid()}"}
     driver = {"kind": "canopen", "buses": [bus], **_PATIENCE}
     tree = {"extends": "wam7_canopen_500hz", "name": "wam_here", "control": {"after_stop": "lower"}, "driver": driver}
-    return _written(folder, tree)
+    return _written(folder, tree | {"realtime": _REALTIME})
 
 
 def planar(folder: Path) -> Path:
@@ -51,12 +52,14 @@ def planar(folder: Path) -> Path:
         "drives": [drive | {"node": 1}, drive | {"node": 2}],
         "emulation": {"seed": 1, "truth": truth},
         **_PATIENCE,
+        "lost_cycles": 10,  # 10 ms, as at half of the rate
     }
     return _written(
         folder,
         {
             "extends": "planar2",
             "name": "planar_here",
+            "realtime": _REALTIME,
             "transmission": {"ratios": [20.0, 20.0]},
             "motions": {"identification": motion, "validation": motion},
             "driver": driver,

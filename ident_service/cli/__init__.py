@@ -21,6 +21,7 @@ from ident_service.cli import (
     comparing,
     configs,
     daemon,
+    doctor,
     emulate,
     exports,
     keeping,
@@ -63,7 +64,7 @@ __all__ = ["DONE", "FAILED", "FAULTED", "PERSON_NEEDED", "USAGE", "VERDICT_NO", 
 
 GROUPS = (
     *(commission, motions, arm, recovery, parameters, results, comparing, exports, keeping),
-    *(configs, bus, emulate, schedule, reidentify, daemon, remote),
+    *(configs, bus, doctor, emulate, schedule, reidentify, daemon, remote),
 )
 _EXIT_CODES: tuple[tuple[type[IdentError], int], ...] = (
     (ConfigError, USAGE),

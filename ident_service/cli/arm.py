@@ -136,12 +136,13 @@ def _check(arguments: argparse.Namespace) -> Answer:
     from ident_service.model.arm_model import arm_model
     from ident_service.motion.control_file import ControlFile
     from ident_service.motion.factory import make_arm
+    from ident_service.motion.last_position import PositionFile
     from ident_service.motion.preflight.check import Verdict
     from ident_service.motion.preflight.preflight import preflight
     from ident_service.motion.realtime import asked
     from ident_service.motion.stoppable import StoppableArm
     from ident_service.record.files import require_writable
-    from ident_service.service.arm_state import control_path, fault_file, ticket_path
+    from ident_service.service.arm_state import arm_folder, control_path, fault_file, ticket_path
     from ident_service.service.preflight import ticket_document, ticket_text, write_ticket
 
     config = load_arm(arguments.arm)
@@ -171,10 +172,13 @@ def _check(arguments: argparse.Namespace) -> Answer:
         ControlFile.take(control_path(state, config.name), None, asked_ns=arguments.asked_ns) as controls,
     ):
         stoppable = StoppableArm(arm, until(lambda: controls.stop or stopping.requested(), lease))
-        # The rate is measured with the real-time settings of a run.
-        with nullcontext() if arm.clock.lock_step else asked():
-            seconds = 0.0 if arguments.rate_seconds is None else arguments.rate_seconds
-            ticket = preflight(stoppable, model, motion, confirm=confirm, rate_seconds=seconds)
+        positions = PositionFile(arm_folder(state, config.name), config)
+        closed, seconds = positions.read(), 0.0 if arguments.rate_seconds is None else arguments.rate_seconds
+        # The rate is measured with what a run gets of the kernel.
+        with nullcontext() if arm.clock.lock_step else asked(settings=config.realtime):
+            ticket = preflight(stoppable, model, motion, confirm=confirm, rate_seconds=seconds, closed=closed)
+        if any(one.code == "at_rest" and one.verdict is Verdict.PASSED for one in ticket.checks):
+            positions.keep(arm)
     write_ticket(path, ticket)
     code = DONE if ticket.verdict is Verdict.PASSED else VERDICT_NO
     return code, ticket_text(ticket) + f"ticket: {path}\n", {"path": str(path), "ticket": ticket_document(ticket)}

@@ -39,6 +39,7 @@ def add(verbs: Verbs) -> None:
 
 
 def _emulate(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.control import Realtime
     from ident_service.config.load import load_arm, with_sheets
     from ident_service.motion.realtime import asked
     from sim_backend.pucks.process import emulate
@@ -47,7 +48,7 @@ def _emulate(arguments: argparse.Namespace) -> Answer:
     tell(arguments, f"{config.name}: emulated drives; Ctrl-C ends")
     stopping = StopOnSignal()
     # On another core than the motion process, if there is one.
-    with stopping, asked(core_from_last=1):
+    with stopping, asked(core_from_last=1, settings=Realtime(priority=config.realtime.priority)):
         done = emulate(
             config,
             faults=arguments.fault,

@@ -196,14 +196,14 @@ class CanopenDriver(GrownSection):
 
     `torque_frames` says whether up to four drives share a frame, by dummy mapping, or each has its own.
     `torque_deadline` [s] without torque frames makes a drive stop by itself (1400h:05). After `lost_cycles` in a row
-    without its position a joint counts as gone (FIELDBUS.md: 3 to 5). `bring_up` [s] is how long all
-    drives together may take for one step to `operation enabled`. `zero` says whether encoders know where they stand
-    (`absolute`), or count from where they were when power came; then a person leads the arm to the joints' `home` and
-    says so, `ident home ARM --zero`, after every loss of power. `measured_torque` says whether drives report the torque
-    that they measure (6077h): with their positions, in every cycle (`cyclic`), with their status (`status`), or not at
-    all; left out, with their status where the EDS has the object. `watchdog_reason` says why drives of an arm that can
-    fall may take longer than 0.1 s to notice that the host is gone. `profiles` are files of families of drives, which
-    count before the shipped ones.
+    without its position a joint counts as gone: 3 to 5 (FIELDBUS.md), or what takes 10 ms, as long as a stall may last.
+    `bring_up` [s] is how long all drives together may take for one step to `operation enabled`. `zero` says whether
+    encoders know where they stand (`absolute`), or count from where they were when power came; then a person leads
+    the arm to the joints' `home` and says so, `ident home ARM --zero`, after every loss of power. `measured_torque`
+    says whether drives report the torque that they measure (6077h): with their positions, in every cycle
+    (`cyclic`), with their status (`status`), or not at all; left out, with their status where the EDS has the
+    object. `watchdog_reason` says why drives of an arm that can fall may take longer than 0.1 s to notice that the
+    host is gone. `profiles` are files of families of drives, which count before the shipped ones.
     """
 
     kind: Literal["canopen"]
@@ -212,7 +212,7 @@ class CanopenDriver(GrownSection):
     drives: Annotated[tuple[CanopenDrive, ...], Field(min_length=1)]
     torque_frames: Literal["shared", "single"] = "shared"
     torque_deadline: Seconds = 0.01
-    lost_cycles: Annotated[int, Field(ge=3, le=5)] = 3
+    lost_cycles: Annotated[int, Field(ge=3, le=20)] = 3
     bring_up: Positive = 0.5
     zero: Literal["absolute", "at_home"] = "absolute"
     measured_torque: Literal["cyclic", "status", "none"] | None = None

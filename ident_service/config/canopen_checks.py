@@ -13,6 +13,8 @@ from ident_service.errors import DriverError
 _ASKED = 0.7  # of the guard time, after which a drive is asked again; all must be asked within it
 _WHOLE_TURNS = 0.999  # 6080h holds whole turns per minute
 _LEAST_DEADLINE = 2.0  # cycles: one frame may be late
+# Without positions, as long as a stall of this computer may last (decision 0069), or FIELDBUS.md's cycles.
+_LONGEST_LOSS, _MOST_LOST = 0.010, 5  # s; cycles
 
 
 def disagreements(
@@ -59,6 +61,12 @@ def disagreements(
             ("driver", "torque_deadline"),
             f"driver.torque_deadline: {driver.torque_deadline:g} s at {rate:g} Hz has no room for a late torque frame;"
             f" at least {_LEAST_DEADLINE:g} cycles are needed, {_LEAST_DEADLINE / rate:g} s",
+        )
+    if driver.lost_cycles > max(_MOST_LOST, _LONGEST_LOSS * rate):
+        yield (
+            ("driver", "lost_cycles"),
+            f"driver.lost_cycles: {driver.lost_cycles} at {rate:g} Hz is {1e3 * driver.lost_cycles / rate:g} ms without"
+            f" positions; at most {max(_MOST_LOST, int(_LONGEST_LOSS * rate))} cycles",
         )
     if transmission is None:
         yield ("driver",), "CANopen drives need the section transmission: gear ratios from joints to motors"

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from ident_service.config.quantities import GrownSection, Number, Positive
+from ident_service.config.quantities import GrownSection, Number, Positive, Section
 
 _FASTEST = 10_000.0  # Hz; no torque loop over a fieldbus is faster
 
@@ -37,6 +37,18 @@ class Control(GrownSection):
     friction_feedforward: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.8
     longest_stall: Annotated[float, Field(strict=True, gt=0, le=0.02)] | None = None
     later = frozenset({"after_stop", "floor", "friction_feedforward", "longest_stall"})
+
+
+class Realtime(Section):
+    """How this computer schedules the motion process, beside `control`, which says what it does.
+
+    `priority` is that of SCHED_FIFO, below the kernel's own threads at 99 and by default ros2_control's choice. `cores`
+    are the numbers of those that it may have, of which it takes the first that no other arm's loop has; left out,
+    isolated cores come first, then the last of the computer's.
+    """
+
+    priority: Annotated[int, Field(strict=True, ge=1, le=98)] = 50
+    cores: tuple[Annotated[int, Field(strict=True, ge=0, le=8191)], ...] = ()
 
 
 def disagreements(control: Control, joints: Sequence[str]) -> Iterator[tuple[tuple[str, ...], str]]:

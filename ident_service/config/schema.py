@@ -16,7 +16,7 @@ from pydantic import (
     model_validator,
 )
 
-from ident_service.config.control import Control
+from ident_service.config.control import Control, Realtime
 from ident_service.config.design import Design
 from ident_service.config.drivers import Driver
 from ident_service.config.kinematics import Kinematics
@@ -345,7 +345,7 @@ class ArmConfig(GrownSection):
     `payload` comes on top of them for as long as it is mounted.
     """
 
-    later = frozenset({"payload"})
+    later = frozenset({"payload", "realtime"})
 
     format: Literal["ident-arm"]
     version: Literal[1]
@@ -361,6 +361,7 @@ class ArmConfig(GrownSection):
     payload: Payload | None = None
     feasible_set: FeasibleSetName = "pseudo_inertia"
     control: Control = Control()
+    realtime: Realtime = Realtime()
     identification: Identification = Identification()
     recording: RecordingFormat = RecordingFormat()
     transmission: Transmission | None = None

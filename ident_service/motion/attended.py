@@ -17,6 +17,7 @@ from drivers.arm import Arm
 
 _SWITCH = 2e-4  # s after which the cycles get the interpreter from the other thread, instead of 5 ms
 _FIRST_COME = (os.SCHED_FIFO, os.SCHED_RR)  # threads of one priority let each other run only when they wait
+_FIRST = -20  # of the nice values
 
 
 @contextmanager
@@ -49,7 +50,7 @@ def attended(arm: Arm) -> Iterator[None]:
     sys.setswitchinterval(min(before, _SWITCH))
     try:
         thread.start()
-        with _behind():
+        with unhurried():
             yield
     finally:
         ended.set()
@@ -73,20 +74,26 @@ def _wait_for(over: threading.Event) -> None:
 
 
 @contextmanager
-def _behind() -> Iterator[None]:
-    """Run the block one priority below the threads started before, where real time was granted (`realtime.py`).
+def unhurried() -> Iterator[None]:
+    """Work at no real-time priority, but before all that has none, where real time was granted (`realtime.py`).
 
-    Those threads have this thread's priority and core, and would not run at all until this one waits.
+    Cycles in a thread that was started before go first. What works for seconds at a real-time priority starves all else
+    on its core, for which the kernel stops every real-time process there for up to 50 ms of a second
+    (sched_rt_runtime_us, or the fair server of Linux 6.12): in the middle of the motion that follows.
     """
     policy, granted = os.sched_getscheduler(0), os.sched_getparam(0)
-    lower = granted.sched_priority - 1
-    if policy not in _FIRST_COME or lower < os.sched_get_priority_min(policy):
+    if policy not in _FIRST_COME:
         yield
         return
+    thread = threading.get_native_id()
+    nice = os.getpriority(os.PRIO_PROCESS, thread)
     with suppress(OSError):
-        os.sched_setscheduler(0, policy, os.sched_param(lower))
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        os.setpriority(os.PRIO_PROCESS, thread, _FIRST)
     try:
         yield
     finally:
         with suppress(OSError):
             os.sched_setscheduler(0, policy, granted)
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, thread, nice)

@@ -64,6 +64,8 @@ class ComputedTorque:
         self.position = position.copy()
         self.velocity = np.zeros_like(position)
         self._none = np.zeros_like(position)
+        # While some are missing: what was measured last [rad or m], and how long ago [s], shape (joints,) each.
+        self._missing: tuple[Vector, Vector] | None = None
         self.correction = self.answer = self.feedforward = self._none
 
     def torque(self, position: Vector, valid: Flags, reference: Setpoint, elapsed: float | None = None) -> Vector:
@@ -120,15 +122,32 @@ class ComputedTorque:
     def _filtered(self, position: Vector, valid: Flags, elapsed: float | None) -> Vector:
         """Update the velocity filter and return the position, predicted where it was not measured."""
         seconds = self._period if elapsed is None else elapsed
+        if self._missing is not None or not valid.all():
+            return self._bridged(position, valid, seconds)
         gain = self._gain if seconds == self._period else _gain(self._cutoff, seconds)
-        if not valid.all():
-            position = np.where(valid, position, self.position + seconds * self.velocity)
         if seconds > 0.0:
             self.velocity = self.velocity + gain * ((position - self.position) / seconds - self.velocity)
         self.position = position
         return position
 
+    def _bridged(self, position: Vector, valid: Flags, seconds: float) -> Vector:
+        """Update where positions are missing, or were: a velocity is over the time since the last one measured.
 
-def _gain(cutoff: Vector, seconds: float) -> Vector:
+        Against a prediction over one period, what a joint had gained unseen in several would be a jump of its velocity.
+        """
+        measured, since = (self.position, np.zeros_like(position)) if self._missing is None else self._missing
+        since = since + seconds
+        seen = valid & (seconds > 0.0)
+        over = np.where(seen, since, self._period)
+        gain = _gain(self._cutoff, over)
+        self.velocity = np.where(
+            seen, self.velocity + gain * ((position - measured) / over - self.velocity), self.velocity
+        )
+        self.position = np.where(valid, position, self.position + seconds * self.velocity)
+        self._missing = None if valid.all() else (np.where(valid, position, measured), np.where(valid, 0.0, since))
+        return self.position
+
+
+def _gain(cutoff: Vector, seconds: Vector | float) -> Vector:
     """Return the gain of a first-order low-pass [Hz] over a time [s], whatever its length."""
     return np.asarray(1.0 - np.exp(-2.0 * np.pi * cutoff * seconds))

@@ -33,6 +33,7 @@ from ident_service.motion.factory import make_arm
 from ident_service.motion.fault_file import CONTROLS, FaultFile
 from ident_service.motion.faults import Severity
 from ident_service.motion.histogram import Histogram
+from ident_service.motion.last_position import PositionFile
 from ident_service.motion.latch import Latch
 from ident_service.motion.lifeline import Lifeline
 from ident_service.motion.loop import LOWERS, WAITS
@@ -166,15 +167,24 @@ def _moved(request: dict[str, Any], controls: ControlFile, latch: Latch) -> dict
     sink = TimedSink(ring)
     lifeline = Lifeline(controls, sys.stdin.fileno(), lock_step=arm.clock.lock_step)
     # Last, so that everything it freezes and locks is loaded.
-    sentence = "virtual time" if arm.clock.lock_step else ask().sentence()
-    with arm:
-        ticket = ticket_from_json(request["ticket"])
-        ticket.require_valid_for(subject_of(model, motion, arm.describe()), datetime.now(UTC))
-        if not sink.event(arm.clock.now_ns(), 20, sentence):
-            raise MotionRefused(f"nothing would be recorded: {sink.error or 'the recorder cannot keep up'}")
-        if lifeline.cut:
-            raise MotionRefused("whoever asked for the motion is gone")
-        report = follow(arm, model, plan, sink, lifeline, latch=latch)
+    granted = None if arm.clock.lock_step else ask(settings=config.realtime)
+    sentence = "virtual time" if granted is None else granted.sentence()
+    positions, moves = PositionFile(Path(request["arm_folder"]), config), False
+    try:
+        with arm:
+            ticket = ticket_from_json(request["ticket"])
+            ticket.require_valid_for(subject_of(model, motion, arm.describe()), datetime.now(UTC))
+            if not sink.event(arm.clock.now_ns(), 20, sentence):
+                raise MotionRefused(f"nothing would be recorded: {sink.error or 'the recorder cannot keep up'}")
+            if lifeline.cut:
+                raise MotionRefused("whoever asked for the motion is gone")
+            positions.require_not_turned(arm)
+            positions.forget()
+            moves = True
+            report = follow(arm, model, plan, sink, lifeline, latch=latch)
+    finally:
+        if moves:
+            positions.keep(arm)
     # A ring that is not closed is one whose writer died: its recording would be called incomplete.
     ring.close()
     return {

@@ -1,4 +1,4 @@
-"""Ask the kernel for real time, so that a loop wakes on time: priority, locked memory, a core, no garbage collection.
+"""What a process asks of the kernel so that a loop wakes in time: priority, memory, a core, awake cores, no collection.
 
 Each is asked for by itself and none is needed: without privileges the loop works, wakes late now and then, and says so.
 The answers go into the recording.
@@ -9,12 +9,25 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
+import resource
+import socket
+import struct
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
 
-_PRIORITY = 50  # of SCHED_FIFO, below the kernel's own threads; ros2_control's choice (FIELDBUS.md 5.1)
+from ident_service.config.control import Realtime
+
+LATENCY = Path("/dev/cpu_dma_latency")  # Documentation/power/pm_qos_interface.rst
+ISOLATED = Path("/sys/devices/system/cpu/isolated")
+CAP_IPC_LOCK, CAP_SYS_NICE = 14, 23  # linux/capability.h
 _MCL_CURRENT, _MCL_FUTURE = 1, 2  # sys/mman.h
+# malloc.h, and glibc's own values, which `asked` puts back.
+_M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
+_TRIM_THRESHOLD, _MMAP_MAX = 128 * 1024, 65536
+HEAP = 32 << 20  # bytes that the loop may take and give back without asking the kernel for a page
+STACK = 512 << 10  # bytes, likewise
 
 
 @dataclass(frozen=True)
@@ -27,6 +40,9 @@ class Granted:
         core: the core that is this process' own, or None.
         collector: frozen and switched off.
         refusals: one sentence each.
+        awake: whether cores stay out of deep sleep.
+        prefaulted: whether heap and stack have their pages, and keep them.
+        held: what ends with the kernel's promises when it is closed, or forgotten.
     """
 
     scheduling: bool
@@ -34,6 +50,9 @@ class Granted:
     core: int | None
     collector: bool
     refusals: tuple[str, ...]
+    awake: bool = False
+    prefaulted: bool = False
+    held: ExitStack = field(default_factory=ExitStack, repr=False, compare=False)
 
     def sentence(self) -> str:
         """Describe the grants and refusals in one sentence, for people and for the recording."""
@@ -42,7 +61,9 @@ class Granted:
             for name, one in (
                 ("SCHED_FIFO", self.scheduling),
                 ("locked memory", self.memory),
+                ("heap and stack in place", self.prefaulted),
                 (f"core {self.core}", self.core is not None),
+                ("cores kept awake", self.awake),
                 ("no garbage collection", self.collector),
             )
             if one
@@ -50,59 +71,180 @@ class Granted:
         return f"real time: got {', '.join(got) or 'nothing'}" + "".join(f"; {reason}" for reason in self.refusals)
 
 
-def ask(core_from_last: int = 0) -> Granted:
-    """Ask for all privileges; call it once, in the process of the loop, when all that it needs is loaded.
+def ask(core_from_last: int = 0, settings: Realtime | None = None) -> Granted:
+    """Ask for everything; call it once, in the process of the loop, when all that it needs is loaded.
 
     Args:
         core_from_last: which core, counted back from the last; for a second loop beside the first.
+        settings: of the arm's description, whose cores count before; defaults when None.
+
+    Returns:
+        What was got. It must be kept for as long as the loop runs: the core and the awake cores are lost with it.
     """
-    refusals = []
-    scheduling = memory = False
-    core: int | None = None
+    settings = Realtime() if settings is None else settings
+    refusals: list[str] = []
+    held = ExitStack()
+    scheduling = False
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(settings.priority))
         scheduling = True
     except OSError as error:
         refusals.append(f"SCHED_FIFO refused ({error.strerror})")
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) == 0:
-        memory = True
-    else:
-        refusals.append(f"locked memory refused ({os.strerror(ctypes.get_errno())})")
-    cores = sorted(os.sched_getaffinity(0))
-    if len(cores) > 1:
-        try:
-            # The last one: interrupts and the parent process prefer the first.
-            wanted = cores[-1 - core_from_last % len(cores)]
-            os.sched_setaffinity(0, {wanted})
-            core = wanted
-        except OSError as error:
-            refusals.append(f"a core of its own refused ({error.strerror})")
-    else:
-        refusals.append("one core only")
+    # Memory that is taken before it is locked is locked with the rest.
+    prefaulted = _prefault(refusals)
+    memory = _lock_memory(refusals)
+    core = _own_core(_candidates(settings, core_from_last), bool(settings.cores), held, refusals)
+    awake = _keep_awake(held, refusals)
     gc.collect()
     gc.freeze()
     gc.disable()
-    return Granted(scheduling, memory, core, True, tuple(refusals))
+    return Granted(scheduling, memory, core, True, tuple(refusals), awake, prefaulted, held)
 
 
 @contextmanager
-def asked(core_from_last: int = 0) -> Iterator[Granted]:
-    """Ask for all privileges for the duration of a block, in a process that does other things afterwards.
+def asked(core_from_last: int = 0, settings: Realtime | None = None) -> Iterator[Granted]:
+    """The same for a while, for a loop in a process that does other things afterwards.
 
     Args:
         core_from_last: as for `ask`.
+        settings: as for `ask`.
     """
     policy, cores, collecting = os.sched_getscheduler(0), os.sched_getaffinity(0), gc.isenabled()
     parameter = os.sched_getparam(0)
+    granted: Granted | None = None
     try:
-        yield ask(core_from_last)
+        granted = ask(core_from_last, settings)
+        yield granted
     finally:
+        if granted is not None:
+            granted.held.close()
         with suppress(OSError):
             os.sched_setscheduler(0, policy, parameter)
         with suppress(OSError):
             os.sched_setaffinity(0, cores)
-        ctypes.CDLL(None).munlockall()
+        libc = ctypes.CDLL(None)
+        libc.munlockall()
+        if hasattr(libc, "mallopt"):
+            libc.mallopt(_M_TRIM_THRESHOLD, _TRIM_THRESHOLD)
+            libc.mallopt(_M_MMAP_MAX, _MMAP_MAX)
+            libc.malloc_trim(0)
         gc.unfreeze()
         if collecting:
             gc.enable()
+
+
+def capable(capability: int) -> bool:
+    """Tell if this process has a capability, by its number in linux/capability.h."""
+    with suppress(OSError, ValueError):
+        for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines():
+            if line.startswith("CapEff:"):
+                return bool(int(line.split()[1], 16) >> capability & 1)
+    return False
+
+
+def core_numbers(text: str) -> list[int]:
+    """Return the numbers in the kernel's list of cores, as in "1,4-6"."""
+    found: list[int] = []
+    for part in text.strip().split(","):
+        if part:
+            first, _, last = part.partition("-")
+            found += range(int(first), int(last or first) + 1)
+    return found
+
+
+def _prefault(refusals: list[str]) -> bool:
+    """Have heap and stack touched once, and what is freed kept: a page that the kernel must find makes a cycle late."""
+    libc = ctypes.CDLL(None)
+    if not hasattr(libc, "mallopt"):
+        refusals.append("this C library does not keep freed memory")
+        return False
+    # No trimming, and large blocks from the heap as well, whose pages stay; mmap's would go with each block.
+    kept = libc.mallopt(_M_TRIM_THRESHOLD, -1) == 1 and libc.mallopt(_M_MMAP_MAX, 0) == 1
+    libc.malloc.restype, libc.malloc.argtypes, libc.free.argtypes = (
+        ctypes.c_void_p,
+        [ctypes.c_size_t],
+        [ctypes.c_void_p],
+    )
+    block = libc.malloc(HEAP)
+    if not kept or not block:
+        refusals.append(f"no {HEAP >> 20} MiB of heap in advance")
+        return False
+    ctypes.memset(block, 1, HEAP)
+    libc.free(block)
+    # An argument by value is copied onto the stack; a function that takes none leaves it alone.
+    depth = type("_Depth", (ctypes.Structure,), {"_fields_": [("bytes", ctypes.c_char * STACK)]})
+    touch = ctypes.CDLL(None).getppid
+    touch.argtypes = [depth]
+    touch(depth())
+    return True
+
+
+def _lock_memory(refusals: list[str]) -> bool:
+    libc = ctypes.CDLL(None, use_errno=True)
+    unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY or capable(CAP_IPC_LOCK)
+    # Under a limit, what a loop asks for later would be refused instead of being slow.
+    if libc.mlockall(_MCL_CURRENT | (_MCL_FUTURE if unlimited else 0)) != 0:
+        refusals.append(f"locked memory refused ({os.strerror(ctypes.get_errno())})")
+        return False
+    if not unlimited:
+        refusals.append("memory that is taken later is not locked (memlock is limited)")
+    return True
+
+
+def _candidates(settings: Realtime, core_from_last: int) -> list[int]:
+    """Cores in the order in which they are wanted."""
+    if settings.cores:
+        return list(settings.cores)
+    isolated: list[int] = []
+    with suppress(OSError, ValueError):
+        isolated = core_numbers(ISOLATED.read_text(encoding="utf-8"))
+    # The last ones: interrupts and whoever started us prefer the first.
+    others = sorted(os.sched_getaffinity(0) - set(isolated))
+    cores = [*reversed(isolated), *reversed(others)]
+    first = core_from_last % len(cores)
+    return cores[first:] + cores[:first] if len(cores) > 1 else []
+
+
+def _own_core(cores: list[int], described: bool, held: ExitStack, refusals: list[str]) -> int | None:
+    """Take the first core that no other loop has, named by an abstract address as buses are (decision 0048)."""
+    taken: list[int] = []
+    for core in cores:
+        lock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            lock.bind(f"\0ident-core-{core}".encode())
+        except OSError:
+            lock.close()
+            taken.append(core)
+            continue
+        try:
+            os.sched_setaffinity(0, {core})
+        except OSError as error:
+            lock.close()
+            if described or core == cores[-1]:
+                refusals.append(f"core {core} refused ({error.strerror})")
+            continue
+        held.callback(lock.close)
+        return core
+    if taken:
+        # Two loops on one core would wait for each other; the kernel finds each a place.
+        which = ", ".join(map(str, taken))
+        refusals.append(f"no core of its own: other loops have {'core' if len(taken) == 1 else 'cores'} {which}")
+    elif not cores:
+        refusals.append("one core only")
+    return None
+
+
+def _keep_awake(held: ExitStack, refusals: list[str]) -> bool:
+    """Ask for a wake-up latency of 0 us, which holds while the file is open."""
+    try:
+        file = os.open(LATENCY, os.O_WRONLY | os.O_CLOEXEC)
+    except OSError as error:
+        refusals.append(f"{LATENCY} refused ({error.strerror})")
+        return False
+    held.callback(os.close, file)
+    try:
+        os.write(file, struct.pack("=i", 0))
+    except OSError as error:
+        refusals.append(f"{LATENCY} refused ({error.strerror})")
+        return False
+    return True

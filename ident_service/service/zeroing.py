@@ -19,6 +19,7 @@ from ident_service.model.arm_model import arm_model
 from ident_service.motion.control_file import ControlFile
 from ident_service.motion.factory import make_arm
 from ident_service.motion.fault_file import Remembered
+from ident_service.motion.last_position import PositionFile
 from ident_service.record.files import require_writable
 from ident_service.service.arm_state import control_path, fault_file, ticket_path
 
@@ -101,5 +102,6 @@ def take_home(config: ArmConfig, state: Path, confirm: Callable[[str], str], arm
         # Removed before zeroing: a ticket that outlived it would be for another zero.
         existed = ticket.exists()
         ticket.unlink(missing_ok=True)
+        PositionFile(ticket.parent, config).forget()  # what drives tell is about another zero from now on
         drives = (make_arm(config) if arm is None else arm).zero()
     return Zeroed(config.name, posture, drives, fault_file(state, config.name).remembered(), existed)

@@ -27,9 +27,11 @@ from sim_backend.pucks.station import Station
 from sim_backend.pucks.wires import INTERFACE as OUR_WIRE
 from sim_backend.pucks.wires import Wires
 
-_POLL_NS = 20_000_000  # commands, stop and states are polled this often
-_AT_ONCE = 256  # frames handled before the clock is read again
-# Speed below which, for a while, an arm is reported to rest, and above which to move [rad/s or m/s].
+_POLL_NS = 20_000_000  # commands, stop and states are looked at this often
+_POSITIONS = range(0x181, 0x200)  # TPDO1
+_GIVEN_UP = 0.9  # of a period after SYNC, when a host hardly waits for positions any more
+_AT_ONCE = 256  # frames handled before time is looked at again
+# Speed below which an arm is said to rest when it has been so for a while, and above which to move [rad/s or m/s].
 _RESTS, _MOVES = 1e-2, 3e-2  # closed brakes creep by some 1e-3
 _RESTING_NS = 500_000_000
 
@@ -108,6 +110,8 @@ class _Run:
         commands: Callable[[], str | None],
     ) -> None:
         self._emulator, self._station = emulator, station
+        self._stamps = isinstance(station, Wires)  # whether frames say when they were on the wire
+        self._given_up_ns = round(_GIVEN_UP * 1e9 * emulator.body.plant.period)
         self._tell, self._commands = tell, commands
         self._clock = RealClock()
         self._later: list[tuple[int, int, Sent]] = []
@@ -138,19 +142,25 @@ class _Run:
                     if stop_requested() or (end is not None and now >= end):
                         break
                 heard = self._station.receive(self._patience(now, looked))
-                at_once = 0
+                # Time goes on to when nothing waited any more, however late this process is.
+                now = clock.now_ns()
+                heard, at_once = heard or self._station.receive(0.0), 0
                 while heard is not None:
                     at_once += 1
-                    self._pass_on(emulator.receive(*heard, clock.now_ns()))
+                    bus, frame = heard
+                    # Drives act when a frame is on the wire, not when this process comes to it.
+                    at_ns = frame.stamp_ns if self._stamps else clock.now_ns()
+                    self._pass_on(emulator.receive(bus, frame, at_ns), at_ns)
+                    now = clock.now_ns()
                     heard = self._station.receive(0.0) if at_once < _AT_ONCE else None
                 if at_once:
                     self._heard += at_once
                     heard_ns = clock.now_ns()
                 # What was due while frames waited comes after them: a drive's firmware would have had them in time.
-                self._pass_on(emulator.tick(clock.now_ns()))
-                self._streaming = clock.now_ns() - heard_ns < _POLL_NS
+                self._pass_on(emulator.tick(now))
+                self._streaming = now - heard_ns < _POLL_NS
                 if self._streaming:
-                    emulator.go_on(clock.now_ns())
+                    emulator.go_on(now)
         finally:
             gc.unfreeze()
             if collecting:
@@ -169,11 +179,14 @@ class _Run:
             due.append(overdue)
         return max(0, min(due) - now_ns) * 1e-9
 
-    def _pass_on(self, sent: Sequence[Sent]) -> None:
-        """Send the frames that are ready, the lowest identifiers first, as a bus would."""
+    def _pass_on(self, sent: Sequence[Sent], asked_ns: int | None = None) -> None:
+        """Send what is ready, the lowest identifiers first, as a bus would, but no position too late."""
         now = self._clock.now_ns()
+        too_late = asked_ns is not None and now - asked_ns > self._given_up_ns
         ready = []
         for item in sent:
+            if too_late and item.frame.identifier in _POSITIONS:
+                continue  # a drive would have sent it in its own cycle; in this one it would be taken for its own
             if item.ready_ns <= now:
                 ready.append(item)
             else:

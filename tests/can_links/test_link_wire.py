@@ -350,3 +350,29 @@ def test_a_connection_is_of_one_user_only(name: str) -> None:
         connection = Connection(name, Hello("me"))
         assert connection.welcome.answer == packets.ACCEPTED
         connection.close()
+
+
+def test_a_frame_comes_when_it_was_sent_however_late_the_wires_host_is() -> None:
+    with Wire(f"late-{os.getpid()}") as wire, ThreadPoolExecutor(1) as others:
+        port = LocalPort(wire, "drives")
+        greeting = others.submit(end_of, wire.name)
+        while not greeting.done():
+            wire.poll(time.monotonic_ns() + 1_000_000)
+        sender, sent = greeting.result(), list[tuple[int, int]]()
+        for number in range(3):
+            before = time.monotonic_ns()
+            sender.send(Frame(0x080 + number))
+            sent.append((before, time.monotonic_ns()))
+            time.sleep(0.005)
+        heard = [frame for _ in sent if (frame := port.receive(soon())) is not None]
+        assert [frame.identifier for frame in heard] == [0x080, 0x081, 0x082]
+        for frame, (before, after) in zip(heard, sent, strict=True):
+            assert before <= frame.stamp_ns <= after
+        # No end may say that it sent something long ago, or will.
+        raw = sender._connection._socket
+        for lie in (time.monotonic_ns() + 10**12, 1):
+            raw.send(packets.pack_frames([(Frame(0x083, stamp_ns=lie), False)]))
+            last = port.receive(soon())
+            assert last is not None
+            assert heard[-1].stamp_ns <= last.stamp_ns <= time.monotonic_ns()
+        sender.close()

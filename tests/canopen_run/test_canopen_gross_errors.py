@@ -44,9 +44,10 @@ def test_a_sound_wam_passes_with_every_watchdog_proven_twice() -> None:
     assert "j2 and j3: drive 3" in [one.joint for one in watchdogs]
 
 
-def test_counts_of_joint_7_times_two_are_a_scale_and_no_sign() -> None:
-    reason = checked(wam(m7={"counts": 8192}), wam())["identities"].reason
-    assert "node 7: a motor turn has 4096 counts" in reason
+@pytest.mark.parametrize("motor", [1, 2, 4, 5, 7])
+def test_counts_of_a_motor_times_two_are_a_scale_and_no_sign(motor: int) -> None:
+    reason = checked(wam(**{f"m{motor}": {"counts": 8192}}), wam())["identities"].reason
+    assert f"node {motor}: a motor turn has 4096 counts" in reason
     assert "the scale of its positions is wrong by 2" in reason
 
 
@@ -66,3 +67,37 @@ def test_a_hidden_delay_of_a_cycle_is_refused() -> None:
     check = checked(wam(), wam(), "hidden_delay size=0.002")["direction"]
     assert check.verdict is Verdict.FAILED
     assert "hidden delay from torque to position" in check.reason
+
+
+# Real torque over believed, by motor, with the CAD model of the links (`cad`) or what an identification knows,
+# and what preflight makes of it. Decision 0058 says why physics hide the rest.
+TORQUES: dict[tuple[str, int, float], str] = {
+    ("cad", 1, 2.0): "j1: answer to torque",
+    ("cad", 1, 3.0): "j1: answer to torque",
+    ("cad", 4, 3.0): "j4: answer to torque",
+    ("identified", 4, 2.0): "j4: answer to torque",
+    ("identified", 5, 3.0): "j6 went astray",
+    ("cad", 2, 2.0): "",
+    ("cad", 2, 3.0): "",
+    ("cad", 4, 2.0): "",
+    ("cad", 5, 3.0): "",
+    ("cad", 7, 3.0): "",
+    ("identified", 2, 2.0): "",
+    ("identified", 7, 3.0): "",
+}
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize(("known", "motor", "factor"), TORQUES)
+def test_what_preflight_makes_of_a_torque_constant(known: str, motor: int, factor: float) -> None:
+    told = wam()
+    if known == "identified":
+        tree = told.model_dump(mode="json", by_alias=True)
+        told = ArmConfig.model_validate(tree | {"prior": tree["driver"]["emulation"]["truth"]})
+    checks = checked(told, wam(**{f"m{motor}": {"torque_scale": factor}}))
+    refused = [check.reason for check in checks.values() if check.verdict is Verdict.FAILED]
+    if not (seen := TORQUES[known, motor, factor]):
+        assert refused == []  # where this fails, preflight sees more than decision 0058 says
+        return
+    assert len(refused) == 1
+    assert refused[0].startswith(seen)

@@ -38,8 +38,9 @@ from ident_service.model.arm_model import arm_model
 from ident_service.model.base import base_parameters
 from ident_service.motion.attended import attended
 from ident_service.motion.factory import make_arm
+from ident_service.motion.last_position import FILE, PositionFile
 from ident_service.record.open import open_recording
-from ident_service.service.arm_state import fault_file
+from ident_service.service.arm_state import arm_folder, fault_file
 
 NAME, RATE, KP, KD = "far", 50.0, 100.0, 16.0
 DEADLINE, BRAKING = 0.2, [4.0, 2.0]
@@ -127,6 +128,7 @@ def test_a_run_against_drives_in_another_process_finds_the_arms_parameters(bench
     ended = json.loads((folder / "ended.json").read_text())
     assert ended["state"] == "done"
     assert ended["lateness"]["count"] > 9.0 * RATE  # the motion lasts 10 s
+    stood_where_it_ended(bench, folder)
     out = tmp_path / "out"
     assert main(["identify", str(folder / "run.mcap"), "--arm", str(bench.arm), "--out", str(out)]) == 0
     document = json.loads((out / "parameters.json").read_text())["base_parameters"]
@@ -136,6 +138,30 @@ def test_a_run_against_drives_in_another_process_finds_the_arms_parameters(bench
     z = (np.array(document["values"]) - true) / np.array(document["standard_deviations"])
     # Coulomb and viscous friction of the shoulder explain each other; each alone is up to 5.4 deviations off.
     assert np.abs(z).max() < 7.0, z
+
+
+def stood_where_it_ended(bench: Bench, folder: Path) -> None:
+    """The position that the motion process kept when it had closed the arm is the last one of its recording."""
+    kept = np.array(json.loads((arm_folder(bench.state, NAME) / FILE).read_text())["position"])
+    last = list(open_recording(folder / "run.mcap", NAMES).blocks())[-1].position[-1]
+    assert np.abs(kept - last).max() < 0.05
+
+
+def test_a_run_is_refused_on_an_arm_whose_motor_stands_a_whole_turn_elsewhere(bench: Bench) -> None:
+    config = load_arm(bench.arm)
+    assert config.transmission is not None
+    coupling, place = np.array(config.transmission.coupling), arm_folder(bench.state, NAME) / FILE
+    turn = np.linalg.solve(np.diag(config.transmission.ratios) @ coupling, [2.0 * np.pi, 0.0])
+    with emulated(bench.arm):
+        PositionFile(place.parent, config).keep(make_arm(config))
+        document = json.loads(place.read_text())
+        place.write_text(json.dumps(document | {"position": (np.array(document["position"]) + turn).tolist()}))
+        run, _ = bench.started()
+        with run:
+            assert run.code() == 3, run.text
+    assert "motor 1 stands 1 whole turn from where it stood" in run.text
+    assert place.exists()  # what was refused has not moved
+    place.unlink()
 
 
 def test_drives_stop_by_themselves_when_the_motion_process_is_killed(bench: Bench) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,20 +12,23 @@ from typing import Any
 
 import numpy as np
 import pytest
-from canopen_run_bench import canopen, described, write
+from canopen_run_bench import canopen, channel, described, write
 from motion.motion_bench import Story
 
 from drivers.canopen.arm import CanopenArm
 from drivers.canopen.frame import Frame
 from drivers.canopen.profile import SYNC
+from drivers.canopen.wire.link import Connection
+from drivers.canopen.wire.packets import Hello
 from ident_service.config.load import load_arm
-from ident_service.errors import ArmFault
+from ident_service.errors import ArmFault, ConfigError, DriverError
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.controls import StopWhen
 from ident_service.motion.run import RunReport, run
 from sim_backend.pucks.faults import parse_fault
 from sim_backend.pucks.lock_step import LockStepArm, LockStepLink
+from sim_backend.pucks.process import emulate
 
 RATE = 500.0
 MS = 1_000_000
@@ -157,3 +162,67 @@ def test_a_runaway_that_begins_in_a_stall_is_seen_as_soon_as_without_one(tmp_pat
     assert stalled.fault.code != "late_cycles"
     # Of these cycles, four fell into the stall itself.
     assert len(stalled.link.syncs) <= len(calm.link.syncs) + 2
+
+
+@pytest.mark.slow
+def test_drives_whose_process_stalls_answer_the_last_sync_alone(tmp_path: Path) -> None:
+    """A real drive answers each in its cycle; answers to several at once would all be taken for the last one's."""
+    bus = {"interface": "ident_wire", "channel": channel()}
+    tree = canopen(described("late_drives", 50.0, 100.0, 16.0), bus, 1, torque_deadline=0.2)
+    config = load_arm(write(tmp_path, tree))
+    stall, stalled, ended = threading.Event(), threading.Event(), threading.Event()
+
+    def stalling() -> None:
+        if stall.is_set():
+            stalled.set()
+            time.sleep(0.3)
+            stall.clear()
+
+    drives = threading.Thread(
+        target=emulate, args=(config,), kwargs={"stop_requested": ended.is_set, "commands": stalling}
+    )
+    drives.start()
+    try:
+        for _ in range(500):
+            try:
+                ear = Connection(bus["channel"], Hello("ear"))
+                break
+            except DriverError:
+                time.sleep(0.02)
+        with CanopenArm(config) as arm:
+            stall.set()
+            assert stalled.wait(10.0)
+            while ear.take():  # what bringing the drives up took
+                pass
+            heard = list[Frame]()
+            while stall.is_set():
+                arm.exchange(None)
+            for _ in range(5):
+                arm.exchange(None)
+            while taken := ear.take():
+                heard += [frame for frame, _ in taken]
+            ear.close()
+    finally:
+        ended.set()
+        drives.join()
+    syncs = [frame.stamp_ns for frame in heard if frame.identifier == SYNC]
+    late = np.diff(syncs[:10]) * 1e-6
+    assert len(syncs) >= 10
+    assert late.min() > 10.0  # of 20 ms: as they were sent, and not all at once
+    answers = {node: [frame for frame in heard if frame.identifier == 0x180 + node] for node in (1, 2)}
+    for node, frames in answers.items():
+        # Of those in the stall the last has an answer at most, and the five after it.
+        assert 1 <= len(frames) <= 7, node
+        assert len(syncs) - len(frames) >= 3, node
+
+
+def test_an_arm_may_be_without_positions_for_ten_milliseconds_and_no_longer(tmp_path: Path) -> None:
+    for rate, most in ((1000.0, 10), (500.0, 5), (250.0, 5)):
+        tree = canopen(described("blind", rate, 100.0, 16.0), {"interface": "lock_step"}, 1, torque_deadline=0.05)
+        tree["driver"]["lost_cycles"] = most
+        load_arm(write(tmp_path, tree))
+        tree["driver"]["lost_cycles"] = most + 1
+        with pytest.raises(
+            ConfigError, match=f"driver.lost_cycles: {most + 1} at {rate:g} Hz .* at most {most} cycles"
+        ):
+            load_arm(write(tmp_path, tree))

@@ -134,6 +134,17 @@ def test_the_hash_changes_with_any_content(tmp_path: Path, old: str, new: str) -
     assert written(tmp_path, BASE).sha256 != written(tmp_path, BASE.replace(old, new)).sha256
 
 
+def test_real_time_is_no_part_of_a_motion_and_leaves_the_hash_of_who_does_not_describe_it(tmp_path: Path) -> None:
+    plain, described = written(tmp_path, BASE), written(tmp_path, BASE + "realtime: {priority: 60, cores: [3]}\n")
+    assert "realtime" not in plain.model_dump(mode="json")
+    assert written(tmp_path, BASE + "realtime: {priority: 50}\n").sha256 == plain.sha256
+    assert described.sha256 != plain.sha256
+    assert described.motion_sha256 == plain.motion_sha256
+    assert ArmConfig.model_validate(described.model_dump(mode="json", by_alias=True)) == described
+    with pytest.raises(ConfigError, match="less than or equal to 98"):
+        written(tmp_path, BASE + "realtime: {priority: 99}\n")  # that of the kernel's own threads
+
+
 def test_the_hash_changes_with_the_content_of_named_files(tmp_path: Path) -> None:
     text = BASE.replace("kinematics: {dh: {", "kinematics: {urdf: arm.urdf}\nprior: prior.json\n#")
     text = text.replace(

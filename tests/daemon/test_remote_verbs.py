@@ -54,7 +54,7 @@ def test_every_verb_is_done_by_a_daemon_or_says_why_not() -> None:
     assert len(verbs()) > 45
     assert set(done) | set(LOCAL_ONLY) == set(verbs())
     assert not set(done) & set(LOCAL_ONLY)
-    assert set(LOCAL_ONLY) == {"serve", "backup", "emulate", "import", "new", "restore", "token add"}
+    assert set(LOCAL_ONLY) == {"serve", "backup", "doctor", "emulate", "import", "new", "restore", "token add"}
     assert all(len(why) > 10 for why in LOCAL_ONLY.values())
     assert set(carried) == set(done)
     for word, told in carried.items():
@@ -66,7 +66,13 @@ def test_every_verb_is_done_by_a_daemon_or_says_why_not() -> None:
 
 def test_verbs_of_this_machine_say_why(state: Path, capsys: pytest.CaptureFixture[str]) -> None:
     server = ["--server", "http://127.0.0.1:1", "--state", str(state)]
-    for words in (["serve"], ["import", "x"], ["token", "add", "ann", "--role", "viewer"], ["emulate", "x"]):
+    for words in (
+        ["serve"],
+        ["import", "x"],
+        ["token", "add", "ann", "--role", "viewer"],
+        ["emulate", "x"],
+        ["doctor"],
+    ):
         assert main([*words, *server]) == 2
         said = capsys.readouterr().err
         assert next(why for word, why in LOCAL_ONLY.items() if " ".join(words).startswith(word)) in said

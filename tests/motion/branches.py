@@ -163,6 +163,8 @@ def outcomes(
     faults: Sequence[Fault | Strike],
     check: Callable[[int, Outcome], None],
     speed: float = 1.0,
+    *,
+    finish: bool = False,
 ) -> None:
     """Play a script once, with a branch for every fault, and check there what came of it.
 
@@ -172,6 +174,7 @@ def outcomes(
         faults: those of the branches.
         check: told the fault's number and the outcome; what it raises fails all.
         speed: of the run.
+        finish: whether the run is finished early.
     """
     truth: list[Truth] = []
     arm, story, latch = built(which, (), truth.append), Story(), Latch()
@@ -179,7 +182,7 @@ def outcomes(
     branches.faults.extend(faults)
 
     def body() -> None:
-        fault, script = None, Script(arm, which, state, speed)
+        fault, script = None, Script(arm, which, state, speed, finish=finish)
         moments: list[Truth] = []
         try:
             with arm:

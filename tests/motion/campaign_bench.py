@@ -92,6 +92,11 @@ PROMISES: dict[FaultKind, Promise] = {
     FaultKind.LATE_CYCLE: Promise({"late_cycles"}, size=12e-3, duration=1, within=1),  # 10 ms are survived
     FaultKind.CLOCK_JUMP: Promise({"clock_jump"}, size=-0.05, within=1),
 }
+# Late cycles again, as decision 0069 tells them apart: what a motion survives, and what comes too often.
+STALLS: dict[str, Promise] = {
+    "short_stall": Promise(set(), size=9e-3, duration=1, warns="late_cycle", words=("a cycle came 9 ms late",)),
+    "stalls": Promise({"late_cycles"}, size=9e-3, duration=50, within=8, words=("of the 1000 cycles of a second",)),
+}
 
 
 @dataclass(frozen=True)
@@ -136,9 +141,9 @@ class Subject:
     stop: int
     build: Callable[[Strike | None, Callable[[Truth], None]], WatchedArm] | None = None
     promises: Mapping[str, Promise] = field(
-        default_factory=lambda: {kind.value: promise for kind, promise in PROMISES.items()}
+        default_factory=lambda: {kind.value: promise for kind, promise in PROMISES.items()} | STALLS
     )
-    of_joint: Callable[[str], bool] = lambda kind: FAULT_RULES[FaultKind(kind)].of_joint
+    of_joint: Callable[[str], bool] = lambda kind: kind not in STALLS and FAULT_RULES[FaultKind(kind)].of_joint
     torque_step: Array | float = 0.0
 
 
@@ -174,26 +179,31 @@ class Case:
     share: float  # of the state's time at which it strikes
     joint: int | None
     speed: float = 1.0  # of the run
+    finish: bool = False  # whether the run is finished early, which leads through other states
 
     def __str__(self) -> str:
         slow = "" if self.speed == 1.0 else f"-at {self.speed:g}"
-        return f"{self.arm}-{self.kind}-{self.state.value}-{self.share:.2f}-{self.joint}{slow}"
+        early = "-finished" if self.finish else ""
+        return f"{self.arm}-{self.kind}-{self.state.value}-{self.share:.2f}-{self.joint}{slow}{early}"
 
 
 class Script(Switches):
-    """Somebody who pauses and goes on, or stops, at given cycles of the loop."""
+    """Somebody who pauses and goes on, stops, or finishes the run, at given cycles of the loop."""
 
-    def __init__(self, arm: WatchedArm, which: Subject, state: State, speed: float = 1.0) -> None:
+    def __init__(
+        self, arm: WatchedArm, which: Subject, state: State, speed: float = 1.0, *, finish: bool = False
+    ) -> None:
         super().__init__()
         self._arm = arm
-        self._pause = round(which.pause / speed) if state in PAUSED else 10**9
+        self._finish = round(which.pause / speed) if finish else 10**9
+        self._pause = round(which.pause / speed) if state in PAUSED and not finish else 10**9
         self._stop = round(which.stop / speed) if state in STOPPED else 10**9
         self._held_since = 10**9
 
     def lease_ok(self, now_ns: int) -> bool:
         cycle = self._arm.cycle - 1
         self.pause = self._pause <= cycle < self._pause + PAUSED_FOR + 200
-        self.stop = cycle >= self._stop
+        self.stop, self.finish = cycle >= self._stop, cycle >= self._finish
         self.supported = cycle >= self._held_since + HOLD / PERIOD  # counts where the arm waits for it
         return True
 
@@ -240,14 +250,20 @@ def built(which: Subject, faults: tuple[Fault | Strike, ...], observer: Callable
 
 
 def play(
-    which: Subject, state: State, faults: tuple[Fault | Strike, ...], path: Path | None, speed: float = 1.0
+    which: Subject,
+    state: State,
+    faults: tuple[Fault | Strike, ...],
+    path: Path | None,
+    speed: float = 1.0,
+    *,
+    finish: bool = False,
 ) -> Outcome:
     """One run on a new arm, with what the script of a state does, recorded if a path is given."""
     truth: list[Truth] = []
     arm = built(which, faults, truth.append)
     story, latch, fault = Story(), Latch(), None
     options: dict[str, Any] = {"latch": latch, "hold_seconds": HOLD, "speed": speed}
-    script = Script(arm, which, state, speed)
+    script = Script(arm, which, state, speed, finish=finish)
     try:
         with arm, ExitStack() as stack:
             sink: Sink = story
@@ -265,9 +281,9 @@ def play(
     return Outcome(story, arm, moments, latch, fault)
 
 
-def windows(name: str, state: State, speed: float = 1.0) -> dict[str, tuple[int, int]]:
+def windows(name: str, state: State, speed: float = 1.0, *, finish: bool = False) -> dict[str, tuple[int, int]]:
     """First and last cycle of every state of a healthy run of a script."""
-    return _windows(name, script_of(state), speed)
+    return _windows(name, State.EXCITING if finish else script_of(state), speed, finish)
 
 
 def script_of(state: State) -> State:
@@ -276,8 +292,8 @@ def script_of(state: State) -> State:
 
 
 @cache
-def _windows(name: str, state: State, speed: float) -> dict[str, tuple[int, int]]:
-    healthy = play(subject(name), state, (), None, speed)
+def _windows(name: str, state: State, speed: float, finish: bool) -> dict[str, tuple[int, int]]:
+    healthy = play(subject(name), state, (), None, speed, finish=finish)
     assert healthy.fault is None
     first, told = healthy.story.samples[0], [event for event in healthy.story.events if event[1] == 20]
     # Enabling may take time that has no cycles.
@@ -290,9 +306,10 @@ def _windows(name: str, state: State, speed: float) -> dict[str, tuple[int, int]
 def injected(case: Case) -> Fault | Strike:
     """The fault of a case, at its time."""
     which = subject(case.arm)
-    first, last = windows(case.arm, case.state, case.speed)[case.state.value]
+    first, last = windows(case.arm, case.state, case.speed, finish=case.finish)[case.state.value]
     promise = which.promises[case.kind]
     cycle = first + round(case.share * (last - 1 - first))
     if which.build is None:
-        return Fault(cycle, FaultKind(case.kind), case.joint, promise.duration, promise.size)
+        kind = FaultKind.LATE_CYCLE if case.kind in STALLS else FaultKind(case.kind)
+        return Fault(cycle, kind, case.joint, promise.duration, promise.size)
     return Strike(cycle, case.kind, case.joint, promise.duration, promise.size, case.share)

@@ -46,7 +46,7 @@ from sim_backend.faults import Fault
 
 def keeps_its_promise(case: Case, folder: Path) -> Outcome:
     which, fault, path = subject(case.arm), injected(case), folder / "run.mcap"
-    outcome = play(which, case.state, (fault,), path, case.speed)
+    outcome = play(which, case.state, (fault,), path, case.speed, finish=case.finish)
     is_kept(case, fault, outcome, path)
     return outcome
 
@@ -69,14 +69,15 @@ def keep_their_promises(
         is_kept(case, faults[number], outcome, path)
         also(case, outcome)
 
-    outcomes(subject(one.arm), one.state, faults, check, one.speed)
+    outcomes(subject(one.arm), one.state, faults, check, one.speed, finish=one.finish)
 
 
 def together(cases: Sequence[Case]) -> list[Any]:
     """The cases that one run can have in branches, for each such run."""
     groups: dict[str, list[Case]] = {}
     for case in cases:
-        groups.setdefault(f"{case.arm}-{script_of(case.state).value}-{case.speed:g}", []).append(case)
+        script = "finished" if case.finish else script_of(case.state).value
+        groups.setdefault(f"{case.arm}-{script}-{case.speed:g}", []).append(case)
     return [pytest.param(group, id=name) for name, group in groups.items()]
 
 
@@ -104,7 +105,9 @@ def went_on(case: Case, promise: Promise, at_cycle: int, outcome: Outcome) -> No
     if promise.within is not None:
         assert outcome.arm.cycle <= at_cycle + promise.within, "not found"
     assert outcome.latch.faults == ()
-    assert list(dict.fromkeys(outcome.story.states)) == list(windows(case.arm, case.state, case.speed))
+    assert list(dict.fromkeys(outcome.story.states)) == list(
+        windows(case.arm, case.state, case.speed, finish=case.finish)
+    )
     if promise.warns is not None:
         (told,) = [message for _, _, message in outcome.story.events if message.startswith(f"{promise.warns}: ")]
         assert any(words in told for words in promise.words), told

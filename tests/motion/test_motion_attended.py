@@ -8,12 +8,18 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
 from drivers.clock import Clock, RealClock, VirtualClock
+from ident_service.config.limits import motion_limits
+from ident_service.config.load import load_arm
 from ident_service.errors import DriverError
+from ident_service.excitation.plan import excitation
+from ident_service.model.arm_model import arm_model
 from ident_service.motion.attended import attended
+from ident_service.motion.preflight import plan
 from ident_service.motion.realtime import asked
 
 
@@ -72,20 +78,40 @@ def test_what_a_driver_should_not_raise_is_told_too() -> None:
 
 @pytest.mark.slow
 def test_cycles_go_on_beside_work_that_has_real_time() -> None:
-    """Work and cycles share a core and a priority there, and the work never waits."""
+    """Work and cycles share a core there; work at a real-time priority would have the kernel stop both."""
     with asked() as granted:
         if not granted.scheduling:
             pytest.skip("this machine grants no real time")
-        arm, before = Looked(RealClock()), os.sched_getparam(0)
+        arm, before = Looked(RealClock()), (os.sched_getscheduler(0), os.sched_getparam(0), os.nice(0))
 
         def work() -> None:
+            assert os.sched_getscheduler(0) == os.SCHED_OTHER
+            assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == -20
             end = time.thread_time() + 1.0
             while not arm.enough.is_set() and time.thread_time() < end:
                 pass
 
         during(arm, work)
         assert arm.enough.is_set()
-        assert os.sched_getparam(0) == before
+        assert (os.sched_getscheduler(0), os.sched_getparam(0), os.nice(0)) == before
+
+
+@pytest.mark.slow
+def test_preflight_computes_without_a_real_time_priority(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen, proof_of = list[int](), plan.proof_of
+
+    def watched(*args: Any) -> Any:
+        seen.append(os.sched_getscheduler(0))
+        return proof_of(*args)
+
+    monkeypatch.setattr(plan, "proof_of", watched)
+    model = arm_model(load_arm("planar2"))
+    with asked() as granted:
+        if not granted.scheduling:
+            pytest.skip("this machine grants no real time")
+        plan.motion_proven_check(model, motion_limits(model.config), excitation(model, "identification"))
+        assert os.sched_getscheduler(0) == os.SCHED_FIFO
+    assert seen == [os.SCHED_OTHER]
 
 
 def test_work_that_fails_ends_the_cycles_and_is_told_first() -> None:

@@ -270,3 +270,18 @@ def test_friction_is_guessed_of_a_drive_by_the_torque_that_joints_ask_of_it() ->
     np.testing.assert_allclose(guessed.coulomb, [0.02 * 20.0, 0.02 * 20.0])
     # At their limits both joints turn a drive by 2 + 3/2 rad/s.
     np.testing.assert_allclose(guessed.viscous, [0.05 * 20.0 / 3.5] * 2)
+
+
+@pytest.mark.parametrize("lost", [1, 4, 9])
+def test_the_velocity_after_lost_positions_is_over_the_time_since_the_last_one(lost: int) -> None:
+    """A joint that gains speed unseen: no velocity that it never had is taken for its own."""
+    begin, speed, gains = np.zeros(2), np.array([0.5, -1.0]), np.array([40.0, -60.0])
+    control, time, fastest = controller(begin, cutoff=120.0), 0.0, np.zeros(2)
+    for cycle in range(1, 60):
+        time = cycle * PERIOD
+        since = max(0.0, time - 0.030)
+        valid = np.array([True, not 35 <= cycle < 35 + lost])
+        control.torque(speed * time + 0.5 * gains * since**2, valid, rest(begin))
+        fastest = np.maximum(fastest, np.abs(control.velocity))
+    np.testing.assert_array_less(fastest, np.abs(speed + gains * 0.030) * 1.01)
+    np.testing.assert_allclose(control.velocity, speed + gains * 0.0278, rtol=0.05)

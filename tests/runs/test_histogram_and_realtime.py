@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ident_service.config.control import Realtime
 from ident_service.motion.histogram import Histogram
+from ident_service.motion.realtime import LATENCY, STACK, asked, core_numbers
+
+CORES = sorted(os.sched_getaffinity(0))
+ASK = "from ident_service.motion.realtime import *; granted = ask(settings=Realtime({}))"
 
 
 @given(times=st.lists(st.integers(0, 10**9), min_size=1, max_size=200), share=st.sampled_from([0.5, 0.99, 0.999]))
@@ -34,3 +44,90 @@ def test_what_is_asked_of_the_kernel_is_answered_in_words_and_nothing_fails() ->
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.startswith("real time: got ")
+
+
+def asking(settings: str, rest: str = "") -> str:
+    """Ask in a process of its own, as the motion process does, and print what `rest` makes of it."""
+    code = (
+        f"from ident_service.motion.realtime import *; granted = ask(settings=Realtime({settings})); {rest or 'pass'}"
+    )
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+
+
+@contextmanager
+def another_loop(settings: str = "") -> Iterator[str]:
+    """Keep another process that has asked; yields what it got."""
+    code = f"{ASK.format(settings)}; print(granted.core, flush=True); input()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None
+        try:
+            yield other.stdout.readline().strip()
+        finally:
+            other.communicate("\n")
+
+
+@pytest.mark.skipif(len(CORES) < 2, reason="needs two cores")
+def test_two_loops_never_share_a_core_of_their_own() -> None:
+    with another_loop(f"cores={tuple(CORES)}") as first:
+        if first == "None":
+            pytest.skip("loops outside of this test have every core")
+        both = f"cores=({first}, {next(core for core in CORES if core != int(first))})"
+        other = asking(both, "print(granted.core)").strip()  # or none, where a loop outside has that one
+        assert other != first
+        alone = asking(f"cores=({first},)", "print(granted.core, sorted(os.sched_getaffinity(0)), granted.sentence())")
+    assert alone.startswith(f"None {CORES} ")  # left to the kernel, beside nobody
+    assert f"no core of its own: other loops have core {first}" in alone
+
+
+def test_a_core_that_is_not_there_is_said() -> None:
+    assert "core 8191 refused" in asking("cores=(8191,)", "print(granted.core, granted.sentence())")
+
+
+def test_the_priority_is_the_described_one() -> None:
+    said = asking("priority=7", "print(granted.scheduling, os.sched_getparam(0).sched_priority)").split()
+    assert said in (["True", "7"], ["False", "0"])
+
+
+def test_cores_are_kept_awake_for_as_long_as_the_loop_runs() -> None:
+    if not os.access(LATENCY, os.W_OK):
+        assert f"{LATENCY} refused" in asking("", "print(granted.sentence())")
+        return
+    here = Path(f"/proc/{os.getpid()}/fd")
+
+    def held() -> bool:
+        return LATENCY in [file.readlink() for file in here.iterdir() if file.is_symlink()]
+
+    with asked() as granted:
+        assert granted.awake
+        assert held()
+    assert not held()
+
+
+def test_heap_and_stack_have_their_pages_before_the_loop_begins() -> None:
+    code = (
+        "import re, resource, numpy; stack = re.search('VmStk:[ ]*(.*) kB', open('/proc/self/status').read()"
+        ".replace(chr(9), ' ')); before = resource.getrusage(0).ru_minflt; "
+        "[numpy.ones(1 << 18).sum() for _ in range(50)]; "
+        "print(granted.prefaulted, stack.group(1), resource.getrusage(0).ru_minflt - before)"
+    )
+    done, stack, faults = asking("", code).split()
+    assert done == "True"
+    assert 1024 * int(stack) >= STACK
+    assert int(faults) < 100  # 50 blocks of 2 MiB have 25,600 pages
+
+
+def test_what_was_asked_for_a_while_is_given_back() -> None:
+    before = os.sched_getscheduler(0), os.sched_getaffinity(0)
+    for _ in range(2):  # its core is free again
+        with asked(settings=Realtime(cores=tuple(CORES))) as granted:
+            if granted.core is None:
+                pytest.skip("loops outside of this test have every core")
+            assert os.sched_getaffinity(0) == {granted.core}
+        assert (os.sched_getscheduler(0), os.sched_getaffinity(0)) == before
+
+
+def test_lists_of_cores_are_read_as_the_kernel_writes_them() -> None:
+    assert core_numbers("\n") == []
+    assert core_numbers("1,4-6,9\n") == [1, 4, 5, 6, 9]

@@ -27,6 +27,7 @@ from drivers.canopen.wire.medium import Medium, Port, overflow
 from ident_service.errors import DriverError
 
 MOST_ENDS: Final = 32
+LATEST_NS: Final = 500_000_000  # that a wire makes up for when its host was late
 ERROR_BITS: Final = 20  # flag and delimiter of an error, and the interframe space; superposed flags make it up to 26
 BEFORE_FDF: Final = 15  # start, identifier, RRS, IDE, and the bit that a classic controller takes for an error
 _SELECT_LIMIT: Final = 1024  # descriptors that select, whose timeout alone is finer than milliseconds, can watch
@@ -38,6 +39,7 @@ class _End:
     def __init__(self, sock: socket.socket) -> None:
         self.socket, self.dropped = sock, False
         self.port: Port | None = None
+        self.heard_ns = 0  # when its last frame came
 
 
 class Wire:
@@ -196,8 +198,9 @@ class Wire:
             for frame, _ in unpack_frames(data):
                 if frame.error:
                     raise DriverError("a frame that no controller sends")
-                # The queue had room for a whole packet.
-                self.medium.offer(end.port, frame, now)
+                # The queue had room for a whole packet. A frame came when it was sent, however late this process is.
+                end.heard_ns = max(end.heard_ns, min(now, max(frame.stamp_ns, now - LATEST_NS)))
+                self.medium.offer(end.port, frame, end.heard_ns)
         except DriverError:
             if end.port is None and data.startswith(packets.MAGIC):
                 self._answer(end, packets.OTHER_VERSION)

@@ -190,10 +190,11 @@ class Medium:
             if begin > now_ns:
                 return False
             heads = [head for head in heads if head[1] <= begin]
-        port, _, frame = min(heads, key=lambda head: priority(head[2])) if len(heads) > 1 else heads[0]
+        port, arrival, frame = min(heads, key=lambda head: priority(head[2])) if len(heads) > 1 else heads[0]
         self.collisions += sum(priority(other[2]) == priority(frame) for other in heads) - 1 if len(heads) > 1 else 0
         port.pending.popleft()
-        self._current = (port, frame, begin + (self._duration_ns(frame) if self._duration_ns else 0))
+        end = begin + self._duration_ns(frame) if self._duration_ns else max(self._free_ns, arrival)
+        self._current = (port, frame, end)
         return True
 
     def _finish(self, sender: Port, frame: Frame, end: int) -> None:

@@ -15,6 +15,7 @@ from drivers.status import AxisStatus
 from ident_service.config.limits import MotionLimits
 from ident_service.errors import AnotherDrive, ArmError, PositionUnknown
 from ident_service.model.arm_model import ArmModel
+from ident_service.motion.last_position import LOOK_AT_IT, LastPosition, turned
 from ident_service.motion.preflight.check import Check, Verdict, failed, joint_units, judged, measure, measures, skipped
 
 DRIFT = 0.05  # of the velocity limit, as at the beginning of a run
@@ -27,8 +28,8 @@ VELOCITY_NOISE = 0.1  # of the velocity limit, peak: the guard stops at 1.2
 TORQUE_NOISE = 0.05  # of the torque limit, standard deviation, that the gains make of the noise
 LOST = 0.01  # of all answers
 RATE_REMEDY = (
-    "Give the process a core of its own and real-time priority (rtprio and memlock in limits.conf), stop other load, "
-    "or lower control.rate."
+    "Give the process a core of its own and real-time priority (`ident doctor ARM` says what is missing), stop "
+    "other load, or lower control.rate."
 )
 
 
@@ -156,8 +157,15 @@ def identities_check(
     )
 
 
-def at_rest_check(looked: Looked, model: ArmModel, limits: MotionLimits) -> Check:
-    """Check that the arm stands still without torque, inside its position limits."""
+def at_rest_check(looked: Looked, model: ArmModel, limits: MotionLimits, closed: LastPosition | None = None) -> Check:
+    """Whether the arm stands still without torque, inside its position limits, and no motor whole turns elsewhere.
+
+    Args:
+        looked: at the arm.
+        model: of the arm.
+        limits: of the arm.
+        closed: where it stood when it was closed last, where that is known.
+    """
     code, names = "at_rest", model.chain.names
     if not looked.usable:
         return failed(code, "not every axis answers as it should", "Check bus and encoders of the axes named above.")
@@ -169,6 +177,10 @@ def at_rest_check(looked: Looked, model: ArmModel, limits: MotionLimits) -> Chec
         *measures("drift", drift, speed, names, most=DRIFT * limits.velocity),
         *measures("position", position[-1], angle, names, least=limits.lower, most=limits.upper),
     ]
+    if closed is not None:
+        found += measures("moved since it was closed last", position[-1] - closed.position, angle, names)
+        if words := turned(closed, position[-1], model.config):
+            return failed(code, words, LOOK_AT_IT, found)
     return judged(
         code, found, "Let the arm come to rest on its support, inside its position limits, and keep hands off."
     )

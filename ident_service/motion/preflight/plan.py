@@ -14,6 +14,7 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
 from ident_service.model.rigid_body import InverseDynamics
 from ident_service.motion.after_stop import after_stop, falling_joints
+from ident_service.motion.attended import unhurried
 from ident_service.motion.plans import Destination, GoTo
 from ident_service.motion.preflight.check import Check, Measure, Verdict, failed, joint_units, judged, measure, measures
 from ident_service.motion.preflight.stability import INERTIA, LEAST_GAIN_MARGIN, delay_of, stability
@@ -30,6 +31,7 @@ HOLDABLE = 0.8  # of a torque limit: what holding may take, so that something is
 _POSTURES = 8  # of the motion, at which the coupled loop is judged
 
 
+@unhurried()
 def configuration_check(model: ArmModel) -> Check:
     """Check that the description has all that motion needs: limits, gains, a prior of a real body, room on the bus."""
     code, remedy = "configuration", "Complete the arm's description; `ident config check` names every place."
@@ -76,6 +78,7 @@ def motion_fits_check(model: ArmModel, excitation: Excitation) -> Check:
     return Check(code, Verdict.PASSED)
 
 
+@unhurried()
 def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excitation) -> Check:
     """Check that the motion, the way to it from home, and every stop out of it are proven to keep all limits."""
     code, remedy = "motion_proven", "Design the motion again, with larger margins or a smaller share of the limits."
@@ -106,6 +109,7 @@ def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excit
     return failed(code, "; ".join(found), remedy, taken) if found else judged(code, taken, remedy)
 
 
+@unhurried()
 def stability_check(model: ArmModel, limits: MotionLimits, excitation: Excitation | None) -> Check:
     """Check that the gains are stable at this rate and delay, at home, in the middle and along the motion."""
     path = None if excitation is None or excitation.path.joints != model.chain.joints else excitation.path

@@ -25,6 +25,7 @@ from ident_service.model.rigid_body import InverseDynamics
 from ident_service.model.threads import one_blas_thread
 from ident_service.motion.attended import attended
 from ident_service.motion.control import ComputedTorque
+from ident_service.motion.last_position import LastPosition
 from ident_service.motion.outside import admitting, reachable
 from ident_service.motion.preflight import gravity as weight
 from ident_service.motion.preflight.check import ABOUT_THE_MOTION, CODES, Check, Verdict, failed, skipped
@@ -87,6 +88,7 @@ def preflight(
     valid: timedelta = VALID,
     look_seconds: float = LOOK,
     rate_seconds: float = 0.0,
+    closed: LastPosition | None = None,
 ) -> Ticket:
     """Check an arm and a motion.
 
@@ -102,12 +104,13 @@ def preflight(
         valid: how long the ticket counts.
         look_seconds: how long rate and noise are measured.
         rate_seconds: how long the rate is measured with the torque that holds the arm, at least for `HOLD`.
+        closed: where the arm stood when it was closed last, where that is known.
 
     Returns:
         The ticket, whatever its verdict; what fails is in its checks, and nothing the arm does is raised.
     """
     clock = RealClock() if clock is None else clock
-    flight = _Preflight(arm, model, excitation, confirm, identities, tell, look_seconds, rate_seconds)
+    flight = _Preflight(arm, model, excitation, confirm, identities, tell, look_seconds, rate_seconds, closed)
     flight.run()
     subject = subject_of(model, excitation, flight.described)
     return new_ticket(subject, flight.all_checks(), clock.now_ns() + clock.utc_offset_ns, valid)
@@ -145,10 +148,11 @@ class _Preflight:
         tell: Tell,
         look_seconds: float,
         rate_seconds: float,
+        closed: LastPosition | None,
     ) -> None:
         self.arm, self.model, self.excitation = arm, model, excitation
         self.confirm, self.identities, self.tell = confirm, identities, tell
-        self.look_seconds, self.rate_seconds = look_seconds, rate_seconds
+        self.look_seconds, self.rate_seconds, self.closed = look_seconds, rate_seconds, closed
         self.described: ArmDescription | None = None
         self.away = ""  # from home, in words
         self.checks: dict[str, Check] = {}
@@ -224,7 +228,7 @@ class _Preflight:
             identities_check(self.described, self.model, limits, self.identities, looked)
         ):
             return None
-        if not self._passed(at_rest_check(looked, self.model, self._bounds(limits))):
+        if not self._passed(at_rest_check(looked, self.model, self._bounds(limits), self.closed)):
             return None
         home = looked.samples[-1].position.copy()
         if self.excitation is not None:

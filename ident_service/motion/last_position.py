@@ -1,0 +1,151 @@
+"""Keep where an arm stood when it was closed, for an encoder that is a whole turn off when its power comes back.
+
+An absolute encoder on the motor's side knows its angle within a turn. How many turns there were it counts, or keeps
+with a battery. Where that fails, every joint limit and every gravity torque is off by as much, and nothing that moves a
+little shows it: loops close, directions are right. So what the drives tell when the arm is opened is compared with what
+they told last (`turned`). Positions are looked at without a command and after the arm has been closed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from drivers.arm import Arm, Vector
+from ident_service.config.schema import ArmConfig
+from ident_service.errors import IdentError, MotionRefused, UsageError
+from ident_service.motion.watch import watch
+from ident_service.record.files import write_atomically
+
+FILE: Final = "position.json"  # in the arm's folder
+TURN: Final = 0.03  # of a motor turn by which one that is lost may differ from a whole number
+STILL: Final = 0.01  # rad/s or m/s, at most, where a position is worth keeping
+LOOK_AT_IT: Final = (
+    "Look at the arm: if it does not stand as `ident watch` says, an encoder has lost turns, which the maker's tool or "
+    "`ident home --zero` sets; if it does, move that joint a little by hand, and check again."
+)
+_LOOK = 0.5  # s
+
+
+@dataclass(frozen=True)
+class LastPosition:
+    """Where an arm stood, with nobody moving it any more.
+
+    Attributes:
+        position: [rad or m], shape (joints,).
+        when: UTC.
+    """
+
+    position: Vector
+    when: datetime
+
+
+class PositionFile:
+    """The last position of one arm, as its description was then."""
+
+    def __init__(self, folder: Path, config: ArmConfig) -> None:
+        """`folder` of the arm, below the state folder."""
+        self._path, self._config = folder / FILE, config
+
+    def forget(self) -> None:
+        """Forget it: the arm is about to move, and where it will stand nobody knows."""
+        self._path.unlink(missing_ok=True)
+
+    def keep(self, arm: Arm) -> None:
+        """Keep where a closed arm stands, or forget what was kept where it moves, or does not tell.
+
+        Arms that are new whenever they are opened, simulated ones, have no such position.
+        """
+        with suppress(IdentError, OSError):  # what ended the motion, or was found of the arm, counts more
+            self.forget()
+            if is_new_every_time(arm, self._config):
+                return
+            seen = watch(arm, _LOOK)
+            still = np.isfinite(seen.position).all() and (np.abs(seen.velocity) <= STILL).all()
+            if still and not seen.missing.any():
+                document = {
+                    "scale_sha256": _scale(self._config),
+                    "when": datetime.now(UTC).isoformat(timespec="seconds"),
+                    "position": seen.position.tolist(),
+                }
+                write_atomically(self._path, json.dumps(document, indent=1) + "\n")
+
+    def require_not_turned(self, arm: Arm) -> None:
+        """Look at an open arm once, and refuse to move one whose motors seem to have turned by whole turns.
+
+        Raises:
+            MotionRefused: they do.
+            UsageError: as `read`.
+            DriverError: the arm does not answer.
+        """
+        last = self.read()
+        if last is not None and (words := turned(last, arm.exchange(None).position, self._config)):
+            raise MotionRefused(f"{words}; {LOOK_AT_IT}")
+
+    def read(self) -> LastPosition | None:
+        """Return what was kept; None where nothing is, or of a description with other joints, gears or counts.
+
+        Raises:
+            UsageError: the file was damaged by somebody.
+        """
+        try:
+            document = json.loads(self._path.read_text(encoding="utf-8"))
+            if document["scale_sha256"] != _scale(self._config):
+                return None
+            position = np.array(document["position"], dtype=float)
+            if position.shape != (len(self._config.joints),) or not np.isfinite(position).all():
+                raise ValueError("not a number for each joint")
+            return LastPosition(position, datetime.fromisoformat(document["when"]))
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise UsageError(f"{self._path}: cannot be read ({error}); look at the arm, then remove the file") from None
+
+
+def is_new_every_time(arm: Arm, config: ArmConfig) -> bool:
+    """Tell if an arm begins anew whenever it is opened, as simulated ones do."""
+    return arm.clock.lock_step or config.driver is None or config.driver.kind == "simulated"
+
+
+def turned(last: LastPosition, position: Vector, config: ArmConfig) -> str:
+    """Say which motors seem to have turned by whole turns since an arm was closed; empty where none has.
+
+    Somebody may have moved the arm by hand. That all motors have turned by whole turns, and one by more than none, is
+    what lost turns look like, and hardly what a hand does.
+
+    Args:
+        last: where it stood.
+        position: where it stands, as its drives say [rad or m], shape (joints,).
+        config: of the arm.
+    """
+    gears = config.transmission
+    if gears is None:
+        return ""
+    names = tuple(config.joints)
+    coupling = np.eye(len(names)) if gears.coupling is None else np.array(gears.coupling)
+    turns = np.array(gears.ratios) * (coupling @ (position - last.position)) / (2.0 * np.pi)
+    whole = np.rint(turns)
+    if not whole.any() or (np.abs(turns - whole) > TURN).any():
+        return ""
+    motors = [
+        f"motor {number + 1} stands {abs(count):.0f} whole turn{'s' if abs(count) > 1 else ''} from where it stood"
+        for number, count in enumerate(whole)
+        if count
+    ]
+    moved = zip(names, position - last.position, strict=True)
+    joints = ", ".join(f"{name} {away:+.4g}" for name, away in moved if abs(away) > 1e-3)
+    return f"{', '.join(motors)} when the arm was closed at {last.when:%Y-%m-%d %H:%M} UTC ({joints} rad or m)"
+
+
+def _scale(config: ArmConfig) -> str:
+    """Return a hash of what a position in the file depends on: joints, gears, and counts of the drives."""
+    gears = None if config.transmission is None else config.transmission.model_dump(mode="json")
+    drives = [getattr(drive, "counts", None) for drive in getattr(config.driver, "drives", ())]
+    return hashlib.sha256(json.dumps([list(config.joints), gears, drives]).encode()).hexdigest()
