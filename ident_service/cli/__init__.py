@@ -124,7 +124,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _asked(verb: Callable[[argparse.Namespace], Answer], arguments: argparse.Namespace) -> Answer:
-    """What a verb answers; what the machine refuses is no defect of ours, wherever it is noticed."""
+    """Return a verb's answer; turn refusals of the operating system into errors that say so."""
     try:
         return verb(arguments)
     except IdentError as error:  # some of which are errors of the system, too

@@ -366,7 +366,7 @@ def _control(arguments: argparse.Namespace) -> tuple[str, Path]:
 
 
 def _name(arguments: argparse.Namespace) -> str:
-    """Of an arm: the word itself where the state folder remembers such an arm, whose description may be a daemon's.
+    """Return an arm's name: the word itself where the state folder remembers such an arm, which may be a daemon's.
 
     Raises:
         UsageError: there is none, among those of the state folder or elsewhere; both are listed.

@@ -1,4 +1,4 @@
-"""What a daemon tells of: a job, a moment of a run, an event."""
+"""Represent what a daemon reports: a job, a moment of a run, an event."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a motion needs to know of an arm, as arrays: limits, gains, home; refused where the description is silent.
+"""Hold what a motion needs of an arm as arrays: limits, gains, home; refuse a description that lacks them.
 
 Motors that share joints are limited by themselves: with `J = diag(r) C` (`config/recording.py`), `tau = J^T tau_motor`,
 so that what two joints may have each by itself may be more than a motor gives when both want it at once.

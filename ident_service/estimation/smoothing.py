@@ -272,7 +272,7 @@ class _Smoother:
 
 
 class _Way:
-    """Which way friction acts; its windows must come in order, because friction remembers the way it came."""
+    """Direction of friction; its windows must come in order, because friction has a memory."""
 
     def __init__(self, joints: int, options: Identification, period: float, coupling: Array | None) -> None:
         self._reversal, self._period = options.reversal, period

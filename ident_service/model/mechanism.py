@@ -129,7 +129,7 @@ def count_mechanism(file: TextFile, kind: Kind) -> None:
 
 @dataclass(frozen=True)
 class BadInertia:
-    """What a URDF says of a link's mass or inertia, and no link has.
+    """A mass or inertia in a URDF that no link can have.
 
     Attributes:
         line: where.

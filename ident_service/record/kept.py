@@ -15,7 +15,7 @@ MAX_BYTES: Final = 128 << 20  # a quarter of an hour of seven joints at 1 kHz
 
 
 class Memory:
-    """What was computed from samples that do not change, of each kind the last."""
+    """Memory of what was computed from unchanging samples, the last of each kind."""
 
     def __init__(self, max_bytes: int = MAX_BYTES) -> None:
         """Keep nothing that is larger than `max_bytes`."""

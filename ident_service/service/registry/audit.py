@@ -1,4 +1,4 @@
-"""Who did what, and when: rows that are added and never changed (a trigger of the database keeps that).
+"""Keep the audit log: who did what, and when; rows are added and never changed (a trigger of the database).
 
 What was done at a terminal while the registry was kept waits as a file below `STATE/audit.waiting`. The daemon enters
 it, or the next act at a terminal, with the time of the act.
