@@ -103,7 +103,7 @@ class Plant:
 
     @property
     def drive_velocity(self) -> Array:
-        """Return the drives' velocities `C dq` [rad/s or m/s], shape (joints,), read-only; exactly 0 where one sticks."""
+        """Return the drives' velocities `C dq` [rad/s or m/s], shape (joints,), read-only; 0 where one sticks."""
         return self._rate
 
     @property

@@ -40,7 +40,7 @@ class Control(GrownSection):
 
 
 class Realtime(Section):
-    """How this computer schedules the motion process, beside `control`, which says what it does.
+    """Scheduling of the motion process on this computer, beside `control`, which says what it does.
 
     `priority` is that of SCHED_FIFO, below the kernel's own threads at 99 and by default ros2_control's choice. `cores`
     are the numbers of those that it may have, of which it takes the first that no other arm's loop has; left out,

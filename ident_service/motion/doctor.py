@@ -37,7 +37,7 @@ _LIMITS = "/etc/security/limits.d/ident.conf"
 
 
 class State(Enum):
-    """How something of this computer is."""
+    """State of one property of this computer."""
 
     GOOD = "good"
     POOR = "poor"
@@ -63,7 +63,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Woken:
-    """How late a loop that only sleeps was woken.
+    """Lateness of a loop that only sleeps.
 
     Attributes:
         period: of its slots [s].
@@ -84,7 +84,7 @@ class Woken:
 
     @property
     def seconds(self) -> float:
-        """How long was measured [s]."""
+        """Return the measured time [s]."""
         return len(self.late) * self.period
 
     def share(self, share: float) -> float:

@@ -36,7 +36,7 @@ _LOOK = 0.5  # s
 
 @dataclass(frozen=True)
 class LastPosition:
-    """Where an arm stood, with nobody moving it any more.
+    """Position in which an arm was closed, with nobody moving it any more.
 
     Attributes:
         position: [rad or m], shape (joints,).

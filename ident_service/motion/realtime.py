@@ -1,4 +1,4 @@
-"""What a process asks of the kernel so that a loop wakes in time: priority, memory, a core, awake cores, no collection.
+"""Ask the kernel for real time, so that a loop wakes in time: priority, memory, a core that stays awake.
 
 Each is asked for by itself and none is needed: without privileges the loop works, wakes late now and then, and says so.
 The answers go into the recording.

@@ -158,7 +158,7 @@ def identities_check(
 
 
 def at_rest_check(looked: Looked, model: ArmModel, limits: MotionLimits, closed: LastPosition | None = None) -> Check:
-    """Whether the arm stands still without torque, inside its position limits, and no motor whole turns elsewhere.
+    """Check that the arm stands still without torque, inside its limits, and no motor whole turns elsewhere.
 
     Args:
         looked: at the arm.
