@@ -23,7 +23,7 @@ from sim_backend.build import build_machine
 from sim_backend.door import checked_torque, description
 from sim_backend.faults import Fault
 from sim_backend.imperfections import Imperfections
-from sim_backend.machine import Machine
+from sim_backend.machine import Machine, Stand
 from sim_backend.machine import Truth as Truth
 from sim_backend.plant import Plant
 from sim_backend.remote_arm import RemoteArm
@@ -44,6 +44,7 @@ class SimulatedArm(Arm):
         watchdog: float = 0.01,
         braking: Vector | None = None,
         unpowered: Vector | None = None,
+        stand: Stand | None = None,
         faults: Sequence[Fault] = (),
         observer: Callable[[Truth], None] | None = None,
     ) -> None:
@@ -59,6 +60,7 @@ class SimulatedArm(Arm):
             watchdog: time without a torque after which enabled drives go idle [s].
             braking: damping of idle axes [N m s/rad or N s/m], shape (joints,); None for none.
             unpowered: damping of axes that are off, as `Machine` has it.
+            stand: likewise.
             faults: to inject, by cycle since `open`.
             observer: called with the truth of every cycle.
 
@@ -75,6 +77,7 @@ class SimulatedArm(Arm):
             watchdog=watchdog,
             braking=braking,
             unpowered=unpowered,
+            stand=stand,
             faults=faults,
         )
         self._schedule = Schedule(clock, round(plant.period * 1e9), skips=False)
@@ -200,6 +203,7 @@ def from_config(
         watchdog=driver.watchdog,
         braking=pieces.braking,
         unpowered=pieces.unpowered,
+        stand=pieces.stand,
         faults=pieces.faults,
         observer=observer,
     )

@@ -18,7 +18,7 @@ from ident_service.errors import DriverError
 from ident_service.model.arm_model import arm_model, with_payload
 from sim_backend.faults import Fault, configured_faults
 from sim_backend.imperfections import Imperfections
-from sim_backend.machine import Machine
+from sim_backend.machine import Machine, Stand
 from sim_backend.plant import Plant
 
 # Where limits do not state a drive's strength, its shorted windings stop the joint in about this time [s].
@@ -89,6 +89,7 @@ def build_machine(config: ArmConfig, faults: Sequence[Fault] = ()) -> Machine:
         delay_cycles=driver.delay_cycles,
         watchdog=driver.watchdog,
         braking=braking,
+        stand=None if driver.stand is None else Stand(driver.stand, _HOLDING * braking),
         unpowered=np.where(held, _HOLDING * braking, np.where(shorted, braking, 0.0)),
         faults=(*configured_faults(driver.faults, model.chain.names, plant.period), *faults),
     )

@@ -20,6 +20,8 @@ from sim_backend.faults import LONGEST_DELAY, Fault, FaultKind, Feedback, active
 from sim_backend.imperfections import Imperfections
 from sim_backend.plant import Plant
 
+# An arm that loses its power farther from its stand than this many times how far it sinks onto it falls beside it.
+_STAND_REACH = 6.0
 _DELAYS = (FaultKind.DELAYED_FEEDBACK, FaultKind.HIDDEN_DELAY)
 
 
@@ -55,6 +57,19 @@ class Reading:
     status_age: int
 
 
+@dataclass(frozen=True)
+class Stand:
+    """Support under the posture in which an arm is found, as a person puts it there before anything is energised.
+
+    Attributes:
+        sinking: of the joint that sinks farthest until the arm rests on it [rad or m].
+        damping: with which it holds [N m s/rad or N s/m], shape (joints,).
+    """
+
+    sinking: float
+    damping: Vector
+
+
 class Machine:
     """Simulate a plant, its drives, encoders and faults; the same seed gives the same readings bit for bit."""
 
@@ -68,6 +83,7 @@ class Machine:
         watchdog: float = 0.01,
         braking: Vector | None = None,
         unpowered: Vector | None = None,
+        stand: Stand | None = None,
         faults: Sequence[Fault] = (),
     ) -> None:
         """Assemble the machine; one cycle is one period of the plant.
@@ -81,6 +97,7 @@ class Machine:
             braking: damping of idle axes [N m s/rad or N s/m], shape (joints,); None for no braking.
             unpowered: damping of axes that are off, and of idle ones after a quick stop's ramp [N m s/rad or N s/m],
                 shape (joints,); None for axes that coast when off and are braked while idle.
+            stand: what an arm rests on that nothing holds; None for nothing.
             faults: to inject, by period since `restart`.
 
         Raises:
@@ -118,6 +135,8 @@ class Machine:
             unpowered,
             max(1, round(RAMP / plant.period)),
         )
+        self.stand = stand
+        self._found, self._near = plant.position.copy(), True
         self.supported = True
         self.restart()
 
@@ -206,8 +225,16 @@ class Machine:
             DriverError: the plant ran away; it stays where it was.
         """
         if not self.supported:
-            self.plant.brake(self._drives.damping)
+            self.plant.brake(self.stand.damping if self.stand and self._on_stand(self.stand) else self._drives.damping)
             self.plant.step(self._drives.output())
+
+    def _on_stand(self, stand: Stand) -> bool:
+        """Return whether an arm that lost its power near its stand has sunk onto it."""
+        sunk = float(np.abs(self.plant.position - self._found).max())
+        if self.enabled and not self.gave_up:
+            self._near = sunk < _STAND_REACH * stand.sinking
+            return False
+        return self._near and sunk > stand.sinking
 
     def truth(self, stamp_ns: int) -> Truth:
         """Return the truth at the beginning of the present period, which is at `stamp_ns`."""

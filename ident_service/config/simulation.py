@@ -149,7 +149,9 @@ class SimulatedDriver(GrownSection):
     `process` says where its plant lives; `bus` names a separate one that other processes may ask for, `status` the file
     it reports to, `deadline` [s] how long an answer of it may take. `watchdog` [s] without a torque frame makes
     the drives idle; idle drives brake with `braking` [N m s/rad], for 0.1 s or, where `windings_off` is `shorted`, for
-    as long as they are off. `watchdog_reason` says why drives of an arm that can fall may go on for longer than 0.1 s.
+    as long as they are off. `stand` [rad or m] is how far an arm that nothing holds sinks from where it was found until
+    it rests on the support that a person has put under it; left out, nothing catches it. `watchdog_reason` says why
+    drives of an arm that can fall may go on for longer than 0.1 s.
     """
 
     kind: Literal["simulated"]
@@ -168,7 +170,8 @@ class SimulatedDriver(GrownSection):
     watchdog_reason: Annotated[str, Field(max_length=200)] = ""
     braking: PerJoint | None = None
     windings_off: WindingsOff = "open"
-    later = frozenset({"windings_off", "watchdog_reason"})
+    stand: Positive | None = None
+    later = frozenset({"windings_off", "watchdog_reason", "stand"})
     faults: tuple[SimulatedFault, ...] = ()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from flight_bench import LIMIT, PRIOR, TRUTH, Flight, Flown, check_of, verdicts
 from helpers.forks import fork_plants
 
 from drivers.arm import Sample
+from ident_service.cli import main
 from ident_service.config.load import load_arm
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import arm_model
@@ -150,3 +152,10 @@ def test_a_period_without_a_cycle_is_filled_in_and_the_torque_before_it_acted_on
         np.testing.assert_allclose(getattr(gaps, name), getattr(whole, name), atol=1e-12)
     assert gaps.torque[:, 1].tolist() == [-0.0, -10.0, -10.0, -10.0, -40.0, -50.0, -50.0, -70.0]
     np.testing.assert_array_equal(whole.torque[:, 1], -10.0 * np.arange(8))
+
+
+@pytest.mark.slow
+def test_the_shipped_wam_may_move_after_the_check_of_the_readme(tmp_path: Path) -> None:
+    """Its drives have no brakes: without torque it sinks onto what a person has put under it."""
+    words = ["check", "wam7_sim", "--confirm", "wam7_sim", "--state", str(tmp_path)]
+    assert main(words) == 0

@@ -222,3 +222,23 @@ def test_real_time_runs_on_the_machines_clock():
         assert arm.clock.now_ns() >= stamps[-1]
     np.testing.assert_array_equal(np.diff(stamps), MS)
     assert arm.plant.velocity[0] == pytest.approx(4e-3)
+
+
+@pytest.mark.parametrize(("push", "rests"), [(0.0, True), (6.0, False)])
+def test_an_arm_without_power_sinks_onto_its_stand_unless_it_has_moved_away(push, rests):
+    config = slider(1.0)
+    driver = config.driver.model_copy(update={"stand": 0.02, "windings_off": "shorted", "braking": 20.0})
+    arm = running(config.model_copy(update={"driver": driver, "joints": {"s1": Joint(brake=False)}}))
+    begun = arm.plant.position[0]
+    for _ in range(200):
+        arm.exchange(np.array([9.81 + push]))
+    for _ in range(200):
+        arm.exchange(np.array([9.81 - push]))
+    away = abs(arm.plant.position[0] - begun)
+    assert (away < 0.02) == rests
+    arm.stop(StopKind.TORQUE_OFF)
+    for _ in range(3000):
+        arm.exchange(None)
+    assert (abs(arm.plant.velocity[0]) < 2e-3) == rests
+    if rests:
+        assert 0.02 <= abs(arm.plant.position[0] - begun) < 0.03
