@@ -1,10 +1,10 @@
 """A search written in an afternoon: random Fourier motions scaled into the limits, the best of each hundred improved.
 
-Torques are pinocchio's, the optimiser is scipy's: SLSQP with numerical derivatives, begun anew from another hundred when it
-ends, which finds more in the same time than Powell's method, L-BFGS, or random motions alone (decision 0071). The
-regressor is the traced one of this package, which is many times as fast as pinocchio's from Python. It keeps position,
-velocity, acceleration and torque at its samples, and knows neither jerk, clearance nor supply, nor whether the arm can
-follow. All of that is in its favour.
+Torques are pinocchio's, the optimiser is scipy's: SLSQP with numerical derivatives, begun anew from another hundred
+when it ends, which finds more in the same time than Powell's method, L-BFGS, or random motions alone (decision 0071).
+The regressor is the traced one of this package, which is many times as fast as pinocchio's from Python. It keeps
+position, velocity, acceleration and torque at its samples, and knows neither jerk, clearance nor supply, nor whether
+the arm can follow. All of that is in its favour.
 """
 
 from __future__ import annotations

@@ -6,17 +6,23 @@ with `lambda >= 0` (Karush-Kuhn-Tucker). A limit L whose share is `c = |s| / L -
 the limit is r times as wide.
 That is the slope at this motion, which far away from it is no more than a guess.
 
+The forecast following error is inversely proportional to the joint's position gain, so that a stiffer one pays like a
+wider limit. It also takes part of the velocity limit, in which the arm catches up; stiffer gains leave less of that.
+Gains are proposed where they would pay, velocity gains with them so that the damping stays, and only as stiff as
+somebody judges to be stable.
+
 Boundary: looks at a motion that has been found; nothing is searched.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import nnls
 
+from ident_service.config.design import Criterion
 from ident_service.config.limits import MotionLimits
 from ident_service.excitation.problem import Multipliers, Problem
 from ident_service.excitation.task import Task
@@ -26,11 +32,8 @@ _REACHED = 0.05  # share of a limit that may be left where it still counts as re
 _NO_FORCE = -1e6  # a multiplier at which a limit does not press, however far it is exceeded
 _WORTH_TELLING = 0.03  # of lambda; below, twice the limit gives two hundredths more
 _MOST_TOLD = 6
-_GAINS = {
-    "d_optimal": "{:.2g} times the information per parameter",
-    "a_optimal": "variances {:.2g} times smaller",
-    "condition_number": "a condition number {:.2g} times smaller",
-}
+_MUCH = 1.5  # times: from here on a factor says more than a percentage
+_STIFFER = (2.0, 1.5, 1.25)  # times the position gain: what is proposed, the stiffest first
 
 
 @dataclass(frozen=True)
@@ -41,11 +44,13 @@ class Binding:
         limit: its name among those of `Problem`.
         joint: its place, None for what is no joint's.
         exponent: lambda; the motion gains by the factor `r^lambda` where the limit is r times as wide.
+        by_gain: likewise where the joint's position gain is r times as stiff.
     """
 
     limit: str
     joint: int | None
     exponent: float
+    by_gain: float = 0.0
 
 
 def binding(task: Task, coefficients: Array, per_period: int) -> tuple[Binding, ...]:
@@ -62,29 +67,42 @@ def binding(task: Task, coefficients: Array, per_period: int) -> tuple[Binding, 
     none = problem.no_multipliers(1.0)
     silent = {name: np.full_like(values, _NO_FORCE) for name, values in none.values.items()}
     alone = problem.value_and_gradient(x, sharpness, Multipliers(silent, 1.0))[1]
-    slopes, owners = [], []
+    slopes, owners, by_gain = [], [], []
+    catching_up = problem.speed_from_error(x)
     for name, found in state.limits.items():
         peaks = (found >= np.roll(found, 1, axis=0)) & (found >= np.roll(found, -1, axis=0)) & (found > -_REACHED)
         for sample, column in np.argwhere(peaks):
             values = {key: one if key != name else one.copy() for key, one in silent.items()}
             values[name][sample, column] = 1.0 - float(found[sample, column])  # with weight 1: a force of one
             slopes.append(problem.value_and_gradient(x, sharpness, Multipliers(values, 1.0))[1] - alone)
-            owners.append((name, None if name in ("power", "clearance") else int(column)))
+            # The forecast speed has to stay below a multiple of the velocity limit, which is what anybody can change.
+            limit = "velocity" if name == "forecast speed" else name
+            owners.append((limit, None if name in ("power", "clearance") else int(column)))
+            speed = float(catching_up[sample, column]) if name == "forecast speed" else 0.0
+            by_gain.append(1.0 if name == "following error" else speed)
     if not slopes:
         return ()
     forces, _ = nnls(np.array(slopes).T, -alone)
-    total: dict[tuple[str, int | None], float] = {}
-    for owner, force in zip(owners, forces.tolist(), strict=True):
-        total[owner] = total.get(owner, 0.0) + force
+    total: dict[tuple[str, int | None], tuple[float, float]] = {}
+    for owner, force, part in zip(owners, forces.tolist(), by_gain, strict=True):
+        cost, stiffer = total.get(owner, (0.0, 0.0))
+        total[owner] = cost + force, stiffer + force * part
     return tuple(
-        Binding(*owner, cost) for owner, cost in sorted(total.items(), key=lambda item: -item[1]) if cost > 0.0
+        Binding(*owner, *costs)
+        for owner, costs in sorted(total.items(), key=lambda item: -item[1][0])
+        if costs[0] > 0.0
     )
 
 
 def binding_words(
-    found: Sequence[Binding], task: Task, limits: MotionLimits, velocity: Array, lengths: Sequence[str]
+    found: Sequence[Binding],
+    task: Task,
+    limits: MotionLimits,
+    velocity: Array,
+    lengths: Sequence[str],
+    stable: Callable[[Array, Array], bool] = lambda kp, kd: True,
 ) -> list[str]:
-    """Say what holds a motion back and what it costs.
+    """Say what holds a motion back, what it costs, and which gains would lift it.
 
     Args:
         found: the limits.
@@ -92,27 +110,53 @@ def binding_words(
         limits: of the arm, margins included.
         velocity: largest velocity of the motion [rad/s or m/s], shape (joints,).
         lengths: unit of each joint's position.
+        stable: judges gains kp and kd, each of shape (joints,).
     """
     names, lines = task.model.chain.names, []
+    kp, kd = limits.kp, limits.kd
     for one in found[:_MOST_TOLD]:
         if one.exponent < _WORTH_TELLING:
             break
-        gain = "would give about " + _GAINS[task.criterion].format(2.0**one.exponent)
+        gain = f"would give about {gain_words(task.criterion, 2.0**one.exponent)}"
         if one.joint is None:
             what = "the supply's power" if one.limit == "power" else "clearance"
             # A clearance is measured in its own depth, of which twice means nothing.
             lines.append(f"{what} holds it back" + (f"; twice as much {gain}" if one.limit == "power" else ""))
             continue
         name, k = names[one.joint], one.joint
-        if one.limit in ("following error", "forecast speed"):
-            share, allowed = velocity[k] / limits.velocity[k], limits.following_error[k]
-            lines.append(
-                f"{name} is held to {share:.0%} of its velocity by following_error; kp {2.0 * limits.kp[k]:g} or "
-                f"{2.0 * allowed:g} {lengths[k]} {gain}"
-            )
-            continue
-        if one.limit == "position":
-            lines.append(f"{name} is held by its position range; twice the range {gain}")
-            continue
-        lines.append(f"{name} is held by its {one.limit}; {2.0 * getattr(limits, one.limit)[k]:g} {gain}")
+        stiffer = ""
+        if one.by_gain >= _WORTH_TELLING:
+            # Each proposal stands on those before, so that all of them together are stable.
+            times, kp, kd = _stiffened(kp, kd, k, stable)
+            if times > 1.0:
+                pays = gain_words(task.criterion, times**one.by_gain)
+                stiffer = f"; kp {kp[k]:.4g} with kd {kd[k]:.4g} would give about {pays}"
+            else:
+                stiffer = "; stiffer gains would not be stable"
+        if one.limit == "following error":
+            share, allowed = velocity[k] / limits.velocity[k], 2.0 * limits.following_error[k]
+            line = f"{name} is held to {share:.0%} of its velocity by following_error; {allowed:g} {lengths[k]} {gain}"
+        elif one.limit == "position":
+            line = f"{name} is held by its position range; twice the range {gain}"
+        else:
+            line = f"{name} is held by its {one.limit}; {2.0 * getattr(limits, one.limit)[k]:g} {gain}"
+        lines.append(line + stiffer)
     return lines
+
+
+def gain_words(criterion: Criterion, factor: float) -> str:
+    """Say what a factor of a criterion's gain means for the estimate."""
+    if criterion == "d_optimal":
+        more = f"{factor:.2g} times the" if factor >= _MUCH else f"{factor - 1.0:.0%} more"
+        return f"{more} information per parameter"
+    what = "variances" if criterion == "a_optimal" else "a condition number"
+    return f"{what} {1.0 - 1.0 / factor:.0%} smaller"
+
+
+def _stiffened(kp: Array, kd: Array, joint: int, stable: Callable[[Array, Array], bool]) -> tuple[float, Array, Array]:
+    """Return how much stiffer a joint's gains can be, damping unchanged, and the gains; 1.0 where they cannot."""
+    for times in _STIFFER:
+        factor = np.where(np.arange(len(kp)) == joint, times, 1.0)
+        if stable(kp * factor, kd * np.sqrt(factor)):
+            return times, kp * factor, kd * np.sqrt(factor)
+    return 1.0, kp, kd

@@ -15,7 +15,7 @@ from ident_service.config.design import Criterion, Design
 from ident_service.config.limits import MotionLimits, motion_limits
 from ident_service.errors import MotionRefused, UsageError
 from ident_service.excitation.basis import Basis, FourierBasis, PostureBasis
-from ident_service.excitation.binding import binding, binding_words
+from ident_service.excitation.binding import binding, binding_words, gain_words
 from ident_service.excitation.criteria import condition_number, criterion
 from ident_service.excitation.demands import demands
 from ident_service.excitation.excitation import LONGEST, Excitation
@@ -156,6 +156,7 @@ def design_motion(
     added: Array | None = None,
     earlier: Found | None = None,
     veto: Callable[[FourierPath | PosturePath], str | None] = lambda _: None,
+    stable: Callable[[Array, Array], bool] = lambda kp, kd: True,
     tell: Callable[[Progress], None] = lambda _: None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> Designed:
@@ -172,6 +173,7 @@ def design_motion(
         added: information from earlier recordings (`settled`).
         earlier: of a search for the same task, to go on from.
         veto: what else speaks against a motion of which everything is proven, in words; such a motion is made smaller.
+        stable: judges gains kp and kd, each of shape (joints,), before they are proposed.
         tell: called from time to time.
         cancelled: asked from time to time; True ends the search with what it has.
 
@@ -190,23 +192,28 @@ def design_motion(
     found = search(task, safe, seed, budget or Budget(), per_period(basis), tell, cancelled, earlier)
 
     why: list[str] = []
+    first: list[list[str]] = []  # what was objected to at full size
 
     def proven(coefficients: Array) -> Proof | None:
         proof = proof_of(basis.path(coefficients), model, task.limits, collision, design.torque_margin)
         why[:] = objections(proof, model, task.limits)
         if not why and (vetoed := veto(basis.path(coefficients))) is not None:
             why[:] = [vetoed]
+        first.append(list(why))
         return None if why else proof
 
     best: tuple[float, Array, Proof] | None = None
+    shrunk: tuple[str, ...] = ()
     for candidate in found.candidates:
         if best is not None and candidate.value >= best[0]:
             break  # even without the loss that a proof may cost it is no better
+        first.clear()
         result = largest_proven(basis, candidate.coefficients, basis.standing(safe), proven)
         if result is not None:
             value = criterion_of(task, basis.path(result[0]), base)
             if best is None or value < best[0]:
                 best = (value, *result)
+                shrunk = _shrunk_words(task, base, candidate.coefficients, result[0], value, first[0])
     if best is None and any(candidate.start >= 0 for candidate in found.candidates):
         raise MotionRefused(
             f"{model.config.name}: of {found.finished} motions found none is one that the arm can follow for certain, "
@@ -229,16 +236,29 @@ def design_motion(
         ()
         if value >= criterion_of(task, basis.path(basis.still(coefficients)), base)
         else (
+            *shrunk,
             *binding_words(
                 binding(task, coefficients, per_period(basis)),
                 task,
                 motion_limits(model.config),
                 proof.demands.velocity,
                 ["rad" if turns else "m" for turns in model.chain.revolute],
+                stable,
             ),
         )
     )
     return Designed(excitation, proof, kappa, found, held)
+
+
+def _shrunk_words(
+    task: Task, base: BaseParameters, whole: Array, smaller: Array, value: float, why: list[str]
+) -> tuple[str, ...]:
+    """Say what it costs that a motion was made smaller until it could be proven; nothing where it was not."""
+    if smaller is whole:
+        return ()
+    lost = value - criterion_of(task, task.basis.path(whole), base)
+    gain = gain_words(task.criterion, float(np.exp(max(lost, 0.0))))
+    return (f"made smaller until everything could be proven; whole, it would give about {gain}: {'; '.join(why)}",)
 
 
 def require_bearable(basis: Basis) -> None:

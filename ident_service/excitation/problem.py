@@ -196,6 +196,17 @@ class Problem:
         sizes = (self._half, limits.velocity, limits.acceleration, limits.jerk)
         return tuple(zip(self._maps, middles, sizes, strict=True))
 
+    def speed_from_error(self, x: Array) -> Array:
+        """Return which share of its allowed speed the arm needs to fall behind and catch up, shape (samples, joints).
+
+        It is positive where that comes on top of the reference's speed, negative where it takes some off.
+        """
+        q, dq = (values @ self.coefficients(x).T for values in self._maps[:2])
+        if self._following is None:
+            return np.zeros_like(q)
+        catching_up = -(self._rate_of @ self._following.run(q, dq))
+        return np.asarray(catching_up * np.sign(dq + catching_up) / (TOLERATED * self.task.limits.velocity))
+
     def state(self, x: Array, sharpness: float) -> State:
         """Criterion and limits at x."""
         return self._evaluate(x, sharpness, None)[0]
