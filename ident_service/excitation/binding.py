@@ -113,35 +113,57 @@ def binding_words(
         stable: judges gains kp and kd, each of shape (joints,).
     """
     names, lines = task.model.chain.names, []
-    kp, kd = limits.kp, limits.kd
+    proposals = _stiffer_gains(found, task.criterion, limits, stable)
     for one in found[:_MOST_TOLD]:
         if one.exponent < _WORTH_TELLING:
             break
-        gain = f"would give about {gain_words(task.criterion, 2.0**one.exponent)}"
+        gain = gain_words(task.criterion, 2.0**one.exponent)
         if one.joint is None:
             what = "the supply's power" if one.limit == "power" else "clearance"
             # A clearance is measured in its own depth, of which twice means nothing.
-            lines.append(f"{what} holds it back" + (f"; twice as much {gain}" if one.limit == "power" else ""))
+            twice = f"; twice as much would give about {gain}" if one.limit == "power" else ""
+            lines.append(f"{what} holds it back{twice}")
             continue
-        name, k = names[one.joint], one.joint
-        stiffer = ""
-        if one.by_gain >= _WORTH_TELLING:
-            # Each proposal stands on those before, so that all of them together are stable.
-            times, kp, kd = _stiffened(kp, kd, k, stable)
-            if times > 1.0:
-                pays = gain_words(task.criterion, times**one.by_gain)
-                stiffer = f"; kp {kp[k]:.4g} with kd {kd[k]:.4g} would give about {pays}"
-            else:
-                stiffer = "; stiffer gains would not be stable"
+        name, k, why = names[one.joint], one.joint, f"held by its {one.limit}"
         if one.limit == "following error":
-            share, allowed = velocity[k] / limits.velocity[k], 2.0 * limits.following_error[k]
-            line = f"{name} is held to {share:.0%} of its velocity by following_error; {allowed:g} {lengths[k]} {gain}"
+            why = f"held to {velocity[k] / limits.velocity[k]:.0%} of its velocity by following_error"
+            wider = f"{2.0 * limits.following_error[k]:g} {lengths[k]}"
         elif one.limit == "position":
-            line = f"{name} is held by its position range; twice the range {gain}"
+            why, wider = "held by its position range", "twice the range"
         else:
-            line = f"{name} is held by its {one.limit}; {2.0 * getattr(limits, one.limit)[k]:g} {gain}"
-        lines.append(line + stiffer)
+            wider = f"{2.0 * getattr(limits, one.limit)[k]:g}"
+        stiffer, pays = proposals.pop(k, ("", "")) if one.by_gain > 0.0 else ("", "")
+        if stiffer and pays == gain:
+            lines.append(f"{name} is {why}; {stiffer}, or {wider}, would give about {gain}")
+            continue
+        more = f"; {stiffer} would give about {pays}" if pays else f"; {stiffer}" if stiffer else ""
+        lines.append(f"{name} is {why}; {wider} would give about {gain}{more}")
     return lines
+
+
+def _stiffer_gains(
+    found: Sequence[Binding], criterion: Criterion, limits: MotionLimits, stable: Callable[[Array, Array], bool]
+) -> dict[int, tuple[str, str]]:
+    """Return gains by joint where stiffer ones would pay, and what they would give, in words; all together are stable.
+
+    Where no stiffer gains are stable, that is said, and nothing is given.
+    """
+    pays: dict[int, float] = {}
+    for one in found:
+        if one.joint is not None:
+            pays[one.joint] = pays.get(one.joint, 0.0) + one.by_gain
+    kp, kd, words = limits.kp, limits.kd, {}
+    for k, exponent in sorted(pays.items(), key=lambda item: -item[1]):
+        if exponent < _WORTH_TELLING:
+            break
+        words[k] = ("stiffer gains would not be stable", "")
+        for times in _STIFFER:
+            factor = np.where(np.arange(len(kp)) == k, times, 1.0)
+            if stable(kp * factor, kd * np.sqrt(factor)):  # damping stays
+                kp, kd = kp * factor, kd * np.sqrt(factor)
+                words[k] = (f"kp {kp[k]:.4g} with kd {kd[k]:.4g}", gain_words(criterion, times**exponent))
+                break
+    return words
 
 
 def gain_words(criterion: Criterion, factor: float) -> str:
@@ -151,12 +173,3 @@ def gain_words(criterion: Criterion, factor: float) -> str:
         return f"{more} information per parameter"
     what = "variances" if criterion == "a_optimal" else "a condition number"
     return f"{what} {1.0 - 1.0 / factor:.0%} smaller"
-
-
-def _stiffened(kp: Array, kd: Array, joint: int, stable: Callable[[Array, Array], bool]) -> tuple[float, Array, Array]:
-    """Return how much stiffer a joint's gains can be, damping unchanged, and the gains; 1.0 where they cannot."""
-    for times in _STIFFER:
-        factor = np.where(np.arange(len(kp)) == joint, times, 1.0)
-        if stable(kp * factor, kd * np.sqrt(factor)):
-            return times, kp * factor, kd * np.sqrt(factor)
-    return 1.0, kp, kd
