@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -9,11 +10,12 @@ import numpy as np
 import pytest
 from design_bench import ONE_START, quick, small
 
+from ident_service.config.design import Design
 from ident_service.config.limits import motion_limits
 from ident_service.errors import MotionRefused
 from ident_service.excitation.binding import binding, binding_words
 from ident_service.excitation.clearance import certified_clearance
-from ident_service.excitation.climb import climbed, random_variables
+from ident_service.excitation.climb import Candidate, climbed, random_variables
 from ident_service.excitation.design import design_motion, family, per_period, settled
 from ident_service.excitation.excitation import Excitation
 from ident_service.excitation.path import FourierPath, PosturePath
@@ -21,6 +23,7 @@ from ident_service.excitation.plan import excitation
 from ident_service.excitation.postures import safe_posture
 from ident_service.excitation.problem import Problem
 from ident_service.excitation.proof import objections, proof_of
+from ident_service.excitation.task import Task
 from ident_service.excitation.tracking import cases, track, way_width
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
@@ -112,26 +115,72 @@ def test_the_last_ramp_of_a_motion_of_many_periods_has_the_tube_of_the_simulated
         np.testing.assert_allclose(short.width(times, half), long.width(later, half))
 
 
-@pytest.mark.slow
-def test_the_limit_that_is_widened_by_its_own_word_pays_as_foretold() -> None:
-    """A slower joint is held by its velocity; a design with a little more of it gains what the multiplier says."""
-    model = small(joints={"elbow": {"velocity": 0.6}}, **SLOW)
-    design = quick()
+def polished(model: ArmModel, design: Design) -> tuple[Task, Candidate, Callable[[Task], Candidate]]:
+    """A task, the best motion of one start, and what a polish from there finds for another task."""
     task = settled(model, design, *family(design, model))
     safe = task.basis.standing(safe_posture(model, task.limits))
     problem = Problem(task, per_period(task.basis))
     x = random_variables(problem, np.random.default_rng(1), safe)
     start = climbed(problem, x, safe, 0, lambda: None).coefficients
     best = climbed(problem, problem.variables(start), safe, 0, lambda: None, polish=True)
+
+    def from_there(other: Task) -> Candidate:
+        problem = Problem(other, per_period(other.basis))
+        return climbed(problem, problem.variables(best.coefficients), safe, 0, lambda: None, polish=True)
+
+    return task, best, from_there
+
+
+@pytest.mark.slow
+def test_the_limit_that_is_widened_by_its_own_word_pays_as_foretold() -> None:
+    """A slower joint is held by its velocity; a design with a little more of it gains what the multiplier says."""
+    model = small(joints={"elbow": {"velocity": 0.6}}, **SLOW)
+    task, best, from_there = polished(model, quick())
     found = binding(task, best.coefficients, per_period(task.basis))
     expected = {(one.limit, one.joint): one.exponent for one in found}["velocity", 1]
     assert expected > 0.05
     velocity = task.limits.velocity * np.array([1.0, 1.1])
-    wider = Problem(replace(task, limits=replace(task.limits, velocity=velocity)), per_period(task.basis))
-    more = climbed(wider, wider.variables(best.coefficients), safe, 0, lambda: None, polish=True)
+    more = from_there(replace(task, limits=replace(task.limits, velocity=velocity)))
     assert best.value - more.value == pytest.approx(expected * np.log(1.1), rel=0.3)
     words = binding_words(found, task, motion_limits(model.config), task.limits.velocity, ("rad", "rad"))
     assert any("elbow is held by its velocity; 1.2 would give about" in line for line in words)
+
+
+@pytest.fixture(scope="module")
+def soft() -> tuple[Task, Candidate, Callable[[Task], Candidate]]:
+    """An elbow so soft that the friction which nobody knows of would push it far off its reference."""
+    model = small(joints={"elbow": {"kp": 40.0, "kd": 12.0, "following_error": 0.05}}, **SLOW)
+    return polished(model, quick())
+
+
+@pytest.mark.slow
+def test_stiffer_gains_pay_as_foretold(soft: tuple[Task, Candidate, Callable[[Task], Candidate]]) -> None:
+    task, best, from_there = soft
+    found = binding(task, best.coefficients, per_period(task.basis))
+    expected = sum(one.by_gain for one in found if one.joint == 1)
+    assert expected > 0.05
+    stiffer = from_there(replace(task, limits=replace(task.limits, kp=task.limits.kp * np.array([1.0, 1.1]))))
+    assert best.value - stiffer.value == pytest.approx(expected * np.log(1.1), rel=0.3)
+
+
+@pytest.mark.slow
+def test_gains_are_proposed_only_as_stiff_as_is_stable(
+    soft: tuple[Task, Candidate, Callable[[Task], Candidate]],
+) -> None:
+    task, best, _ = soft
+    found = binding(task, best.coefficients, per_period(task.basis))
+
+    def words(most: float) -> str:
+        velocity = 0.3 * task.limits.velocity
+        stable = lambda kp, kd: bool(kp[1] <= most)  # noqa: E731
+        lines = binding_words(found, task, motion_limits(task.model.config), velocity, ("rad", "rad"), stable)
+        (about,) = [line for line in lines if "elbow is held to" in line]
+        return about
+
+    assert words(1000.0).startswith("elbow is held to 30% of its velocity by following_error; kp 80 with kd 16.97")
+    assert "0.1 rad" in words(1000.0)
+    assert "kp 60 with kd 14.7 would give about" in words(70.0)
+    assert words(45.0).endswith("; stiffer gains would not be stable")
 
 
 def test_the_parts_of_a_long_way_show_the_error_of_the_whole() -> None:
