@@ -8,22 +8,24 @@ That is the slope at this motion, which far away from it is no more than a guess
 
 The forecast following error is inversely proportional to the joint's position gain, so that a stiffer one pays like a
 wider limit. It also takes part of the velocity limit, in which the arm catches up; stiffer gains leave less of that.
-Gains are proposed where they would pay, velocity gains with them so that the damping stays, and only as stiff as
-somebody judges to be stable.
+Where following holds a joint back, gains are proposed with which it would follow at its velocity limit, the damping
+unchanged, and only as stiff as somebody judges to be stable.
 
 Boundary: looks at a motion that has been found; nothing is searched.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from ident_service.config.design import Criterion
 from ident_service.config.limits import MotionLimits
+from ident_service.excitation.following import USABLE
 from ident_service.excitation.problem import Multipliers, Problem
 from ident_service.excitation.task import Task
 from ident_service.model.chain import Array
@@ -33,7 +35,8 @@ _NO_FORCE = -1e6  # a multiplier at which a limit does not press, however far it
 _WORTH_TELLING = 0.03  # of lambda; below, twice the limit gives two hundredths more
 _MOST_TOLD = 6
 _MUCH = 1.5  # times: from here on a factor says more than a percentage
-_STIFFER = (2.0, 1.5, 1.25)  # times the position gain: what is proposed, the stiffest first
+_HALVINGS = 5  # of the way to gains that would do, where those are not stable
+_NOT_WORTH_IT = 1.05  # times the gain: what is below is not proposed
 
 
 @dataclass(frozen=True)
@@ -94,13 +97,25 @@ def binding(task: Task, coefficients: Array, per_period: int) -> tuple[Binding, 
     )
 
 
+def needed_stiffness(task: Task, coefficients: Array, per_period: int) -> Array:
+    """Return how many times as stiff each joint has to be to follow at its velocity limit, shape (joints,).
+
+    Args:
+        task: what was searched.
+        coefficients: of a motion, through whose postures the arm has to go, shape (joints, size).
+        per_period: samples per period.
+    """
+    problem = Problem(task, per_period)
+    return problem.error_at_velocity_limit(problem.variables(coefficients)) / (USABLE * task.limits.following_error)
+
+
 def binding_words(
     found: Sequence[Binding],
     task: Task,
     limits: MotionLimits,
     velocity: Array,
     lengths: Sequence[str],
-    stable: Callable[[Array, Array], bool] = lambda kp, kd: True,
+    gains: Mapping[int, str] | None = None,
 ) -> list[str]:
     """Say what holds a motion back, what it costs, and which gains would lift it.
 
@@ -110,59 +125,73 @@ def binding_words(
         limits: of the arm, margins included.
         velocity: largest velocity of the motion [rad/s or m/s], shape (joints,).
         lengths: unit of each joint's position.
-        stable: judges gains kp and kd, each of shape (joints,).
+        gains: by joint, what `stiffer_gains` proposes.
     """
     names, lines = task.model.chain.names, []
-    proposals = _stiffer_gains(found, task.criterion, limits, stable)
+    left = dict(gains or {})
     for one in found[:_MOST_TOLD]:
         if one.exponent < _WORTH_TELLING:
             break
-        gain = gain_words(task.criterion, 2.0**one.exponent)
+        gain = f"would give about {gain_words(task.criterion, 2.0**one.exponent)}"
         if one.joint is None:
             what = "the supply's power" if one.limit == "power" else "clearance"
             # A clearance is measured in its own depth, of which twice means nothing.
-            twice = f"; twice as much would give about {gain}" if one.limit == "power" else ""
-            lines.append(f"{what} holds it back{twice}")
+            lines.append(f"{what} holds it back" + (f"; twice as much {gain}" if one.limit == "power" else ""))
             continue
-        name, k, why = names[one.joint], one.joint, f"held by its {one.limit}"
+        name, k = names[one.joint], one.joint
         if one.limit == "following error":
-            why = f"held to {velocity[k] / limits.velocity[k]:.0%} of its velocity by following_error"
-            wider = f"{2.0 * limits.following_error[k]:g} {lengths[k]}"
+            share, allowed = velocity[k] / limits.velocity[k], 2.0 * limits.following_error[k]
+            line = f"{name} is held to {share:.0%} of its velocity by following_error; {allowed:g} {lengths[k]} {gain}"
         elif one.limit == "position":
-            why, wider = "held by its position range", "twice the range"
+            line = f"{name} is held by its position range; twice the range {gain}"
         else:
-            wider = f"{2.0 * getattr(limits, one.limit)[k]:g}"
-        stiffer, pays = proposals.pop(k, ("", "")) if one.by_gain > 0.0 else ("", "")
-        if stiffer and pays == gain:
-            lines.append(f"{name} is {why}; {stiffer}, or {wider}, would give about {gain}")
-            continue
-        more = f"; {stiffer} would give about {pays}" if pays else f"; {stiffer}" if stiffer else ""
-        lines.append(f"{name} is {why}; {wider} would give about {gain}{more}")
-    return lines
+            line = f"{name} is held by its {one.limit}; {2.0 * getattr(limits, one.limit)[k]:g} {gain}"
+        stiffer = left.pop(k, "") if one.by_gain > 0.0 else ""
+        lines.append(line + (f"; {stiffer}" if stiffer else ""))
+    return [*lines, *(f"{names[k]} falls behind; {stiffer}" for k, stiffer in left.items())]
 
 
-def _stiffer_gains(
-    found: Sequence[Binding], criterion: Criterion, limits: MotionLimits, stable: Callable[[Array, Array], bool]
-) -> dict[int, tuple[str, str]]:
-    """Return gains by joint where stiffer ones would pay, and what they would give, in words; all together are stable.
+def stiffer_gains(
+    found: Sequence[Binding],
+    late: NDArray[np.bool_],
+    needed: Array,
+    limits: MotionLimits,
+    stable: Callable[[Array, Array], bool],
+) -> dict[int, str]:
+    """Propose gains for the joints that following holds back, in words by joint; all of them together are stable.
 
-    Where no stiffer gains are stable, that is said, and nothing is given.
+    Args:
+        found: the limits.
+        late: joints that a simulated arm moves too far off their references, shape (joints,).
+        needed: times the stiffness, `needed_stiffness`.
+        limits: for the gains that there are.
+        stable: judges gains kp and kd, each of shape (joints,).
     """
-    pays: dict[int, float] = {}
+    pays = 1.0 * late
     for one in found:
         if one.joint is not None:
-            pays[one.joint] = pays.get(one.joint, 0.0) + one.by_gain
+            pays[one.joint] += one.by_gain
     kp, kd, words = limits.kp, limits.kd, {}
-    for k, exponent in sorted(pays.items(), key=lambda item: -item[1]):
-        if exponent < _WORTH_TELLING:
-            break
-        words[k] = ("stiffer gains would not be stable", "")
-        for times in _STIFFER:
+    for k in np.argsort(-pays, kind="stable").tolist():
+        if pays[k] < _WORTH_TELLING or needed[k] <= _NOT_WORTH_IT:
+            continue
+        wanted, low, high = float(needed[k]), 1.0, float(needed[k])
+        for halving in range(_HALVINGS + 1):
+            times = wanted if halving == 0 else float(np.sqrt(low * high))
             factor = np.where(np.arange(len(kp)) == k, times, 1.0)
-            if stable(kp * factor, kd * np.sqrt(factor)):  # damping stays
-                kp, kd = kp * factor, kd * np.sqrt(factor)
-                words[k] = (f"kp {kp[k]:.4g} with kd {kd[k]:.4g}", gain_words(criterion, times**exponent))
+            low, high = (times, high) if stable(kp * factor, kd * np.sqrt(factor)) else (low, times)
+            if low == wanted:
                 break
+        if low <= _NOT_WORTH_IT:
+            words[k] = "stiffer gains would not be stable"
+            continue
+        factor = np.where(np.arange(len(kp)) == k, low, 1.0)
+        kp, kd = kp * factor, kd * np.sqrt(factor)
+        both = f"kp {float(f'{kp[k]:.3g}'):g} and kd {float(f'{kd[k]:.3g}'):g}"
+        if low == wanted:
+            words[k] = f"with {both} it would follow at its velocity limit"
+        else:
+            words[k] = f"{both} are the stiffest that are stable, {low / wanted:.0%} of what its velocity limit needs"
     return words
 
 

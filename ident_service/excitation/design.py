@@ -6,7 +6,7 @@ then proven for all time, made smaller where the proof needs it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,12 +15,19 @@ from ident_service.config.design import Criterion, Design
 from ident_service.config.limits import MotionLimits, motion_limits
 from ident_service.errors import MotionRefused, UsageError
 from ident_service.excitation.basis import Basis, FourierBasis, PostureBasis
-from ident_service.excitation.binding import binding, binding_words, gain_words
+from ident_service.excitation.binding import (
+    Binding,
+    binding,
+    binding_words,
+    gain_words,
+    needed_stiffness,
+    stiffer_gains,
+)
 from ident_service.excitation.criteria import condition_number, criterion
 from ident_service.excitation.demands import demands
 from ident_service.excitation.excitation import LONGEST, Excitation
 from ident_service.excitation.expectation import described_noise, information, seconds_of_information
-from ident_service.excitation.following import dry_friction
+from ident_service.excitation.following import USABLE, dry_friction
 from ident_service.excitation.path import FourierPath, PosturePath
 from ident_service.excitation.postures import safe_posture
 from ident_service.excitation.proof import Proof, largest_proven, objections, proof_of
@@ -192,33 +199,38 @@ def design_motion(
     found = search(task, safe, seed, budget or Budget(), per_period(basis), tell, cancelled, earlier)
 
     why: list[str] = []
-    first: list[list[str]] = []  # what was objected to at full size
+    tried: list[tuple[Proof, str]] = []  # of one motion, at full size first
 
     def proven(coefficients: Array) -> Proof | None:
         proof = proof_of(basis.path(coefficients), model, task.limits, collision, design.torque_margin)
         why[:] = objections(proof, model, task.limits)
         if not why and (vetoed := veto(basis.path(coefficients))) is not None:
             why[:] = [vetoed]
-        first.append(list(why))
+        tried.append((proof, "; ".join(why)))
         return None if why else proof
 
     best: tuple[float, Array, Proof] | None = None
-    shrunk: tuple[str, ...] = ()
+    whole: tuple[Array, Proof, str] | None = None  # what the best was made of, or the first that came to nothing
     for candidate in found.candidates:
         if best is not None and candidate.value >= best[0]:
             break  # even without the loss that a proof may cost it is no better
-        first.clear()
+        tried.clear()
         result = largest_proven(basis, candidate.coefficients, basis.standing(safe), proven)
         if result is not None:
             value = criterion_of(task, basis.path(result[0]), base)
             if best is None or value < best[0]:
                 best = (value, *result)
-                shrunk = _shrunk_words(task, base, candidate.coefficients, result[0], value, first[0])
-    if best is None and any(candidate.start >= 0 for candidate in found.candidates):
+                whole = (candidate.coefficients, *tried[0])
+        elif best is None and whole is None:
+            whole = (candidate.coefficients, *tried[0])
+    full = motion_limits(model.config)
+    if best is None and whole is not None and any(candidate.start >= 0 for candidate in found.candidates):
+        gains = _gains(task, (), *whole[:2], full, stable)
+        proposed = "".join(f"{model.chain.names[k]}: {words}. " for k, words in gains.items())
         raise MotionRefused(
             f"{model.config.name}: of {found.finished} motions found none is one that the arm can follow for certain, "
-            f"however small: {'; '.join(why)}. Stiffer gains, a wider following_error, or friction and drive_inertia "
-            "as they are would help"
+            f"however small: {'; '.join(why)}. {proposed}Stiffer gains, a wider following_error, or friction and "
+            "drive_inertia as they are would help"
         )
     if best is None:
         still = basis.standing(safe)
@@ -232,33 +244,40 @@ def design_motion(
     excitation = Excitation(
         "designed", path, model.config.motion_sha256, _made(model, design, seed, found, kappa, value, proof)
     )
-    held = (
-        ()
-        if value >= criterion_of(task, basis.path(basis.still(coefficients)), base)
-        else (
-            *shrunk,
-            *binding_words(
-                binding(task, coefficients, per_period(basis)),
-                task,
-                motion_limits(model.config),
-                proof.demands.velocity,
-                ["rad" if turns else "m" for turns in model.chain.revolute],
-                stable,
-            ),
+    held: tuple[str, ...] = ()
+    if whole is not None and value < criterion_of(task, basis.path(basis.still(coefficients)), base):
+        bound = binding(task, whole[0], per_period(basis))
+        lengths = ["rad" if turns else "m" for turns in model.chain.revolute]
+        gains = _gains(task, bound, *whole[:2], full, stable)
+        held = (
+            *(() if coefficients is whole[0] else (_shrunk_words(task, base, value, whole[0], whole[2]),)),
+            *binding_words(bound, task, full, proof.demands.velocity, lengths, gains),
         )
-    )
     return Designed(excitation, proof, kappa, found, held)
 
 
-def _shrunk_words(
-    task: Task, base: BaseParameters, whole: Array, smaller: Array, value: float, why: list[str]
-) -> tuple[str, ...]:
-    """Say what it costs that a motion was made smaller until it could be proven; nothing where it was not."""
-    if smaller is whole:
-        return ()
+def _gains(
+    task: Task,
+    bound: Sequence[Binding],
+    whole: Array,
+    proof: Proof,
+    limits: MotionLimits,
+    stable: Callable[[Array, Array], bool],
+) -> dict[int, str]:
+    """Propose gains by joint, for a motion as it was found and what its proof came to."""
+    late = np.zeros(len(limits.kp), dtype=bool)
+    needed = needed_stiffness(task, whole, per_period(task.basis))
+    if proof.tracking is not None:
+        late = proof.tracking.late(limits)
+        needed = np.maximum(needed, np.where(late, proof.tracking.error / (USABLE * limits.following_error), 0.0))
+    return stiffer_gains(bound, late, needed, limits, stable)
+
+
+def _shrunk_words(task: Task, base: BaseParameters, value: float, whole: Array, why: str) -> str:
+    """Say what it costs that a motion was made smaller until it could be proven."""
     lost = value - criterion_of(task, task.basis.path(whole), base)
     gain = gain_words(task.criterion, float(np.exp(max(lost, 0.0))))
-    return (f"made smaller until everything could be proven; whole, it would give about {gain}: {'; '.join(why)}",)
+    return f"made smaller until everything could be proven; whole, it would give about {gain}: {why}"
 
 
 def require_bearable(basis: Basis) -> None:

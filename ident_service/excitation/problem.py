@@ -207,6 +207,14 @@ class Problem:
         catching_up = -(self._rate_of @ self._following.run(q, dq))
         return np.asarray(catching_up * np.sign(dq + catching_up) / (TOLERATED * self.task.limits.velocity))
 
+    def error_at_velocity_limit(self, x: Array) -> Array:
+        """Return the largest forecast error in the motion's postures at the velocity limits [rad or m], (joints,)."""
+        q, dq = (values @ self.coefficients(x).T for values in self._maps[:2])
+        if self._following is None:
+            return np.zeros(self._n)
+        fastest = np.where(dq < 0.0, -1.0, 1.0) * self.task.limits.velocity
+        return np.asarray(np.abs(self._following.run(q, fastest)).max(axis=0))
+
     def state(self, x: Array, sharpness: float) -> State:
         """Criterion and limits at x."""
         return self._evaluate(x, sharpness, None)[0]

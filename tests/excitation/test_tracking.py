@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -13,7 +14,7 @@ from design_bench import ONE_START, quick, small
 from ident_service.config.design import Design
 from ident_service.config.limits import motion_limits
 from ident_service.errors import MotionRefused
-from ident_service.excitation.binding import binding, binding_words
+from ident_service.excitation.binding import binding, binding_words, needed_stiffness, stiffer_gains
 from ident_service.excitation.clearance import certified_clearance
 from ident_service.excitation.climb import Candidate, climbed, random_variables
 from ident_service.excitation.design import design_motion, family, per_period, settled
@@ -168,19 +169,44 @@ def test_gains_are_proposed_only_as_stiff_as_is_stable(
     soft: tuple[Task, Candidate, Callable[[Task], Candidate]],
 ) -> None:
     task, best, _ = soft
-    found = binding(task, best.coefficients, per_period(task.basis))
+    found, limits = binding(task, best.coefficients, per_period(task.basis)), motion_limits(task.model.config)
+    needed = needed_stiffness(task, best.coefficients, per_period(task.basis))
+    most = 40.0 * needed[1]  # times the kp that there is
 
-    def words(most: float) -> str:
-        velocity = 0.3 * task.limits.velocity
-        stable = lambda kp, kd: bool(kp[1] <= most)  # noqa: E731
-        lines = binding_words(found, task, motion_limits(task.model.config), velocity, ("rad", "rad"), stable)
+    def words(allowed: float) -> str:
+        def stable(kp: np.ndarray, kd: np.ndarray) -> bool:
+            assert kd[1] ** 2 / kp[1] == pytest.approx(12.0**2 / 40.0)  # the damping stays
+            return bool(kp[1] <= allowed)
+
+        gains = stiffer_gains(found, np.zeros(2, dtype=bool), needed, limits, stable)
+        lines = binding_words(found, task, limits, 0.3 * limits.velocity, ("rad", "rad"), gains)
         (about,) = [line for line in lines if "elbow is held to" in line]
         return about
 
-    assert words(1000.0).startswith("elbow is held to 30% of its velocity by following_error; kp 80 with kd 16.97")
-    assert "0.1 rad" in words(1000.0)
-    assert "kp 60 with kd 14.7 would give about" in words(70.0)
-    assert words(45.0).endswith("; stiffer gains would not be stable")
+    assert words(1.01 * most).startswith("elbow is held to 30% of its velocity by following_error; 0.1 rad would give")
+    assert words(1.01 * most).endswith(
+        f"; with kp {most:.0f} and kd {12.0 * np.sqrt(most / 40.0):.3g} it would follow at its velocity limit"
+    )
+    assert "are the stiffest that are stable" in words(0.8 * most)
+    assert words(40.0).endswith("; stiffer gains would not be stable")
+
+
+@pytest.mark.slow
+def test_with_the_gains_that_are_proposed_the_joint_uses_its_velocity() -> None:
+    """A wrist behind which nearly nothing stands: as it is, no motion of it passes; with the gains, it moves freely."""
+    weak = {"elbow": {"kp": 40.0, "kd": 12.0, "following_error": 0.02}}
+    soft, design = small(joints=weak, **SLOW), quick()
+    try:
+        before = design_motion(soft, design, budget=ONE_START)
+        said = "; ".join(before.binding)
+        slow = before.proof.demands.velocity[1]
+    except MotionRefused as refusal:
+        said, slow = str(refusal), 0.0
+    proposed = re.search(r"with kp ([0-9.]+) and kd ([0-9.]+) it would follow at its velocity limit", said)
+    assert proposed is not None, said
+    weak["elbow"] |= {"kp": float(proposed[1]), "kd": float(proposed[2])}
+    after = design_motion(small(joints=weak, **SLOW), design, budget=ONE_START)
+    assert after.proof.demands.velocity[1] > max(2.0 * slow, 0.3 * motion_limits(soft.config).velocity[1])
 
 
 def test_the_parts_of_a_long_way_show_the_error_of_the_whole() -> None:
