@@ -1,7 +1,7 @@
 """Excitation design: what a minute of search reaches, against the published motion, and what the result is worth.
 
 Ten seeds of a minute each and a few shorter searches; a plain search beside ours on five arms, three seeds of half a
-minute each; and what twice the time adds: about an hour and a half. `python -m benchmarks.design` for all of it, or the
+minute each; and what twice the time adds: about an hour. `python -m benchmarks.design` for all of it, or the
 names of some of its parts: `evaluation wam gain small plain time`.
 """
 
