@@ -3,8 +3,8 @@
 Torques are pinocchio's, the optimiser is scipy's: SLSQP with numerical derivatives, begun anew from another hundred
 when it ends, which finds more in the same time than Powell's method, L-BFGS, or random motions alone (decision 0071).
 The regressor is the traced one of this package, which is many times as fast as pinocchio's from Python. It keeps
-position, velocity, acceleration and torque at its samples, and knows neither jerk, clearance nor supply, nor whether
-the arm can follow. All of that is in its favour.
+position, velocity, acceleration, torque and, where the arm has bodies, the workspace's clearance at its samples, and
+knows neither jerk nor supply, nor whether the arm can follow. All of that is in its favour.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from ident_service.config.limits import MotionLimits
 from ident_service.excitation.fourier import FourierSeries
 from ident_service.excitation.path import FourierPath
 from ident_service.model.arm_model import ArmModel, control_model
+from ident_service.model.collision import CollisionModel
 from ident_service.model.regressor import joint_regressor
 from ident_service.model.rigid_body import pinocchio_model
 
@@ -27,6 +28,8 @@ _SAMPLES = 100
 _RANDOM = 100  # motions, of which the best is improved
 _STEP, _ITERATIONS = 1e-5, 200
 _HALVINGS = 10
+_SEEN = 4  # clearance is looked at in one sample of so many
+_NOTHING = 1e3  # the value of a motion that teaches nothing
 Array = np.ndarray
 
 
@@ -54,6 +57,7 @@ class PlainSearch:
         self._columns, self._noise = columns, noise
         self._pin = pinocchio_model(model.chain, model.layout, prior)
         self._data = self._pin.createData()
+        self._collision = CollisionModel(model)
         self._time = np.arange(_SAMPLES) / _SAMPLES / design.base_frequency
 
     def run(self, criterion: str, seed: int, seconds: float) -> FourierPath:
@@ -67,7 +71,7 @@ class PlainSearch:
             if time.monotonic() > end:
                 raise _OutOfTime
             path = self._scaled(x)
-            found = self._value(path, criterion)
+            found = min(self._value(path, criterion), _NOTHING)
             if found < best:
                 best, motion = found, path
             return found
@@ -111,7 +115,12 @@ class PlainSearch:
     def _holds(self, path: FourierPath) -> bool:
         q, dq, ddq, _ = FourierPath(path.series, 1, 0.0).at(self._time)
         torque = np.array([pin.rnea(self._pin, self._data, *row) for row in zip(q, dq, ddq, strict=True)])
-        return bool((np.abs(torque) <= 0.98 * self._limits.torque).all())
+        if not (np.abs(torque) <= 0.98 * self._limits.torque).all():
+            return False
+        if not self._collision.pairs:
+            return True
+        distances = self._collision.distances(q[::_SEEN])
+        return bool((distances >= self._model.config.workspace.clearance).all())
 
     def _value(self, path: FourierPath, criterion: str) -> float:
         rows = self._rows(path)

@@ -6,8 +6,9 @@ then proven for all time, made smaller where the proof needs it.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,9 +29,10 @@ from ident_service.excitation.demands import demands
 from ident_service.excitation.excitation import LONGEST, Excitation
 from ident_service.excitation.expectation import described_noise, information, seconds_of_information
 from ident_service.excitation.following import USABLE, dry_friction
+from ident_service.excitation.mending import Attempt, Prover
 from ident_service.excitation.path import FourierPath, PosturePath
 from ident_service.excitation.postures import safe_posture
-from ident_service.excitation.proof import Proof, largest_proven, objections, proof_of
+from ident_service.excitation.proof import Proof
 from ident_service.excitation.search import Budget, Found, Progress, search
 from ident_service.excitation.task import Task, usable_limits
 from ident_service.model.arm_model import ArmModel, control_model
@@ -42,6 +44,8 @@ from ident_service.model.expected_friction import expected_friction
 _PER_HARMONIC = 50  # samples of a search per period of its highest harmonic
 _PER_WAY = 24  # samples of a search per way between postures
 _MOST_SAMPLES = 2000
+_MENDING = 0.2  # of the time of a search, for what the proof of its result objects to
+_SHORTEST = 1.0  # s, below which it does not pay to begin another part of a search
 
 
 @dataclass(frozen=True)
@@ -196,88 +200,89 @@ def design_motion(
     _require_free_home(model, task.limits, collision)
     safe = safe_posture(model, task.limits, seed)
     _require_holdable_home(model, task.limits)
-    found = search(task, safe, seed, budget or Budget(), per_period(basis), tell, cancelled, earlier)
-
-    why: list[str] = []
-    tried: list[tuple[Proof, str]] = []  # of one motion, at full size first
-
-    def proven(coefficients: Array) -> Proof | None:
-        proof = proof_of(basis.path(coefficients), model, task.limits, collision, design.torque_margin)
-        why[:] = objections(proof, model, task.limits)
-        if not why and (vetoed := veto(basis.path(coefficients))) is not None:
-            why[:] = [vetoed]
-        tried.append((proof, "; ".join(why)))
-        return None if why else proof
-
-    best: tuple[float, Array, Proof] | None = None
-    whole: tuple[Array, Proof, str] | None = None  # what the best was made of, or the first that came to nothing
-    for candidate in found.candidates:
-        if best is not None and candidate.value >= best[0]:
-            break  # even without the loss that a proof may cost it is no better
-        tried.clear()
-        result = largest_proven(basis, candidate.coefficients, basis.standing(safe), proven)
-        if result is not None:
-            value = criterion_of(task, basis.path(result[0]), base)
-            if best is None or value < best[0]:
-                best = (value, *result)
-                whole = (candidate.coefficients, *tried[0])
-        elif best is None and whole is None:
-            whole = (candidate.coefficients, *tried[0])
-    full = motion_limits(model.config)
-    if best is None and whole is not None and any(candidate.start >= 0 for candidate in found.candidates):
-        gains = _gains(task, (), *whole[:2], full, stable)
+    prover = Prover(model, task, safe, design.torque_margin, lambda X: criterion_of(task, basis.path(X), base), veto)
+    found, best = _searched(task, prover, safe, seed, budget or Budget(), tell, cancelled, earlier)
+    limits = motion_limits(model.config)
+    if best.result is None and best.candidate.start >= 0:
+        gains = _gains(best, (), limits, stable)
         proposed = "".join(f"{model.chain.names[k]}: {words}. " for k, words in gains.items())
         raise MotionRefused(
             f"{model.config.name}: of {found.finished} motions found none is one that the arm can follow for certain, "
-            f"however small: {'; '.join(why)}. {proposed}Stiffer gains, a wider following_error, or friction and "
+            f"however small: {best.refused}. {proposed}Stiffer gains, a wider following_error, or friction and "
             "drive_inertia as they are would help"
         )
-    if best is None:
-        still = basis.standing(safe)
-        proof = proof_of(basis.path(still), model, task.limits, collision, design.torque_margin)
-        if wrong := objections(proof, model, task.limits):
-            raise MotionRefused(f"not even standing still keeps the limits: {'; '.join(wrong)}")
-        best = (criterion_of(task, basis.path(still), base), still, proof)
-    value, coefficients, proof = best
+    if best.result is None:
+        raise MotionRefused(f"not even standing still keeps the limits: {best.refused}")
+    coefficients, proof = best.result
     path = basis.path(coefficients)
     kappa = condition_number(information(path, model, base, np.ones(model.chain.joints)))
     excitation = Excitation(
-        "designed", path, model.config.motion_sha256, _made(model, design, seed, found, kappa, value, proof)
+        "designed", path, model.config.motion_sha256, _made(model, design, seed, found, kappa, best.value, proof)
     )
     held: tuple[str, ...] = ()
-    if whole is not None and value < criterion_of(task, basis.path(basis.still(coefficients)), base):
-        bound = binding(task, whole[0], per_period(basis))
+    if best.value < criterion_of(task, basis.path(basis.still(coefficients)), base):
+        whole = best.candidate.coefficients
+        bound = binding(best.task, whole, per_period(basis))
         lengths = ["rad" if turns else "m" for turns in model.chain.revolute]
-        gains = _gains(task, bound, *whole[:2], full, stable)
+        gains = _gains(best, bound, limits, stable)
         held = (
-            *(() if coefficients is whole[0] else (_shrunk_words(task, base, value, whole[0], whole[2]),)),
-            *binding_words(bound, task, full, proof.demands.velocity, lengths, gains),
+            *(() if coefficients is whole else (_shrunk_words(task, base, best),)),
+            *binding_words(bound, task, limits, proof.demands.velocity, lengths, gains),
         )
     return Designed(excitation, proof, kappa, found, held)
 
 
-def _gains(
+def _searched(
     task: Task,
+    prover: Prover,
+    safe: Array,
+    seed: int,
+    budget: Budget,
+    tell: Callable[[Progress], None],
+    cancelled: Callable[[], bool],
+    earlier: Found | None,
+) -> tuple[Found, Attempt]:
+    """Search, prove, and spend what time is left on what the proof objects to, or else on searching on."""
+    begun, per = time.monotonic(), per_period(task.basis)
+
+    def left() -> float:
+        return np.inf if budget.seconds is None else budget.seconds - (time.monotonic() - begun)
+
+    first = budget if budget.seconds is None else replace(budget, seconds=(1.0 - _MENDING) * budget.seconds)
+    found = search(task, safe, seed, first, per, tell, cancelled, earlier)
+    best = prover.best_of(found.candidates)
+    if best is None:
+        raise AssertionError("a search has at least one candidate")
+    if best.candidate.start < 0 or cancelled():
+        return found, best
+    mended = prover.mended(best, per, lambda: cancelled() or left() <= 0.0)
+    if mended is not best or budget.seconds is None or budget.starts is not None or left() < _SHORTEST:
+        return found, mended
+    found = search(task, safe, seed, replace(budget, seconds=left()), per, tell, cancelled, found)
+    return found, prover.best_of(found.candidates, best) or best
+
+
+def _gains(
+    attempt: Attempt,
     bound: Sequence[Binding],
-    whole: Array,
-    proof: Proof,
     limits: MotionLimits,
     stable: Callable[[Array, Array], bool],
 ) -> dict[int, str]:
     """Propose gains by joint, for a motion as it was found and what its proof came to."""
+    task, tracking = attempt.task, attempt.proof.tracking
     late = np.zeros(len(limits.kp), dtype=bool)
-    needed = needed_stiffness(task, whole, per_period(task.basis))
-    if proof.tracking is not None:
-        late = proof.tracking.late(limits)
-        needed = np.maximum(needed, np.where(late, proof.tracking.error / (USABLE * limits.following_error), 0.0))
+    needed = needed_stiffness(task, attempt.candidate.coefficients, per_period(task.basis))
+    if tracking is not None:
+        late = tracking.late(limits)
+        needed = np.maximum(needed, np.where(late, tracking.error / (USABLE * limits.following_error), 0.0))
     return stiffer_gains(bound, late, needed, limits, stable)
 
 
-def _shrunk_words(task: Task, base: BaseParameters, value: float, whole: Array, why: str) -> str:
+def _shrunk_words(task: Task, base: BaseParameters, attempt: Attempt) -> str:
     """Say what it costs that a motion was made smaller until it could be proven."""
-    lost = value - criterion_of(task, task.basis.path(whole), base)
+    lost = attempt.value - criterion_of(task, task.basis.path(attempt.candidate.coefficients), base)
     gain = gain_words(task.criterion, float(np.exp(max(lost, 0.0))))
-    return f"made smaller until everything could be proven; whole, it would give about {gain}: {why}"
+    return f"made smaller until everything could be proven; whole, it would give about {gain}: {attempt.why}"
 
 
 def require_bearable(basis: Basis) -> None:

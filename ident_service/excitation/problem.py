@@ -112,7 +112,8 @@ class Problem:
         step = float(np.median(np.diff(times)))
         # What a point a metre away from an axis may do between two samples, beyond the straight line between them.
         between = min(0.125 * float(limits.acceleration.max()) * step**2, _BETWEEN)
-        self._clearance = model.config.workspace.clearance + between
+        self._clearance = np.full(len(times) + _LINE, model.config.workspace.clearance + between)
+        self._clearance[: len(times)] += task.extra_clearance
         # The straight way from home to where the motion begins, for which only clearance matters.
         self._line = np.linspace(0.0, 1.0, _LINE)[:, None]
         self._begin = maps(task.basis, np.zeros(1))[0]
@@ -262,7 +263,9 @@ class Problem:
             way = limits.home + self._line * (self._begin @ X.T - limits.home)
             # The arm, which falls behind, and not its reference has to keep clear.
             where = q if self._following is None else q - behind
-            found["clearance"] = (self._clearance - self._capsules.distances(np.concatenate([where, way])).T) / _DEPTH
+            found["clearance"] = (
+                self._clearance[:, None] - self._capsules.distances(np.concatenate([where, way])).T
+            ) / _DEPTH
         state = State(X, value, found)
         if multipliers is None:
             return state, value.value, np.zeros(0)

@@ -76,7 +76,11 @@ class Tracking:
 
     def late(self, limits: MotionLimits) -> NDArray[np.bool_]:
         """Return which joints are too far from their references for the guard of an arm, shape (joints,)."""
-        return np.asarray(~(self.error <= _ERROR_USED * limits.following_error))
+        return np.asarray(~(self.used(limits)[0] <= 1.0))
+
+    def used(self, limits: MotionLimits) -> tuple[Array, Array]:
+        """Return the shares used of what a simulated arm may: of following errors and velocities, shape (joints,)."""
+        return self.error / (_ERROR_USED * limits.following_error), self.velocity / (_VELOCITY_USED * limits.velocity)
 
     def objections(self, names: Sequence[str], limits: MotionLimits) -> list[str]:
         """Return what the guard would stop, or might, in words; empty when the arm can follow.
