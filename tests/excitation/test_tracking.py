@@ -17,8 +17,9 @@ from ident_service.errors import MotionRefused
 from ident_service.excitation.binding import binding, binding_words, needed_stiffness, stiffer_gains
 from ident_service.excitation.clearance import certified_clearance
 from ident_service.excitation.climb import Candidate, climbed, random_variables
-from ident_service.excitation.design import design_motion, family, per_period, settled
+from ident_service.excitation.design import criterion_of, design_motion, family, per_period, settled
 from ident_service.excitation.excitation import Excitation
+from ident_service.excitation.mending import Prover
 from ident_service.excitation.path import FourierPath, PosturePath
 from ident_service.excitation.plan import excitation
 from ident_service.excitation.postures import safe_posture
@@ -207,6 +208,31 @@ def test_with_the_gains_that_are_proposed_the_joint_uses_its_velocity() -> None:
     weak["elbow"] |= {"kp": float(proposed[1]), "kd": float(proposed[2])}
     after = design_motion(small(joints=weak, **SLOW), design, budget=ONE_START)
     assert after.proof.demands.velocity[1] > max(2.0 * slow, 0.3 * motion_limits(soft.config).velocity[1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kp", "reason"), [(100.0, "falls behind"), (200.0, "comes within")])
+def test_what_a_proof_objects_to_is_searched_for_again_and_not_only_made_smaller(kp: float, reason: str) -> None:
+    """A soft arm above a floor: its heavier links, which no forecast knows, and the tube around its motion."""
+    gains = {"kp": kp, "kd": 2.0 * kp**0.5}
+    floor = {"clearance": 0.02, "obstacles": {"floor": {"half_space": {"normal": [0, 1, 0], "offset": -0.6}}}}
+    model = small(joints={"shoulder": gains, "elbow": gains}, workspace=floor, **SLOW)
+    design = quick()
+    task, best, _ = polished(model, design)
+    base, safe = family(design, model)[1], safe_posture(model, task.limits)
+
+    def value(coefficients: np.ndarray) -> float:
+        return criterion_of(task, task.basis.path(coefficients), base)
+
+    prover = Prover(model, task, safe, design.torque_margin, value, lambda path: None)
+    smaller = prover.best_of([best])
+    assert smaller is not None
+    assert reason in smaller.why
+    assert smaller.value > value(best.coefficients) + 0.01
+    mended = prover.mended(smaller, per_period(task.basis), lambda: False)
+    assert mended.value < smaller.value - 0.01
+    assert mended.result is not None
+    assert not objections(mended.result[1], model, task.limits)
 
 
 def test_the_parts_of_a_long_way_show_the_error_of_the_whole() -> None:
