@@ -44,6 +44,7 @@ from ident_service.model.expected_friction import expected_friction
 _PER_HARMONIC = 50  # samples of a search per period of its highest harmonic
 _PER_WAY = 24  # samples of a search per way between postures
 _MOST_SAMPLES = 2000
+_EXACT = 1e6  # exponent of power means that are as good as the extremes themselves
 _MENDING = 0.2  # of the time of a search, for what the proof of its result objects to
 _SHORTEST = 1.0  # s, below which it does not pay to begin another part of a search
 
@@ -310,7 +311,7 @@ def criterion_of(task: Task, path: FourierPath | PosturePath, base: BaseParamete
     G = information(path, task.model, base, task.noise) * seconds_of_information(path) * task.rate
     if task.added is not None:
         G = G + task.added
-    return criterion(task.criterion, G, 64.0, task.chosen, task.scale).value
+    return criterion(task.criterion, G, _EXACT, task.chosen, task.scale).value
 
 
 def _require_holdable_home(model: ArmModel, limits: MotionLimits) -> None:

@@ -82,11 +82,15 @@ class Prover:
         return proof, why or self._veto(path) or ""
 
     def best_of(self, candidates: Sequence[Candidate], best: Attempt | None = None) -> Attempt | None:
-        """Return the best of candidates, best first, and of an earlier attempt."""
-        for candidate in candidates:
-            if best is not None and candidate.value >= best.value:
+        """Return the best of candidates and of an earlier attempt.
+
+        The search's own values are smooth ones, by which another candidate may be the best.
+        """
+        ranked = sorted((self._value(one.coefficients), place) for place, one in enumerate(candidates))
+        for value, place in ranked:
+            if best is not None and value >= best.value:
                 break  # even without the loss that a proof may cost it is no better
-            one = self._attempt(self._task, candidate)
+            one = self._attempt(self._task, candidates[place])
             best = one if best is None or one.value < best.value else best
         return best
 
