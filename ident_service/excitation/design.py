@@ -45,7 +45,7 @@ _PER_HARMONIC = 50  # samples of a search per period of its highest harmonic
 _PER_WAY = 24  # samples of a search per way between postures
 _MOST_SAMPLES = 2000
 _EXACT = 1e6  # exponent of power means that are as good as the extremes themselves
-_MENDING = 0.2  # of the time of a search, for what the proof of its result objects to
+_MENDING = 0.25  # of the time of a search, for what the proof of its result objects to
 _SHORTEST = 1.0  # s, below which it does not pay to begin another part of a search
 
 
@@ -250,17 +250,19 @@ def _searched(
         return np.inf if budget.seconds is None else budget.seconds - (time.monotonic() - begun)
 
     first = budget if budget.seconds is None else replace(budget, seconds=(1.0 - _MENDING) * budget.seconds)
+
+    def over() -> bool:
+        return cancelled() or left() <= 0.0
+
     found = search(task, safe, seed, first, per, tell, cancelled, earlier)
-    best = prover.best_of(found.candidates)
+    best = prover.best_of(found.candidates, per, over)
     if best is None:
         raise AssertionError("a search has at least one candidate")
-    if best.candidate.start < 0 or cancelled():
-        return found, best
-    mended = prover.mended(best, per, lambda: cancelled() or left() <= 0.0)
-    if mended is not best or budget.seconds is None or budget.starts is not None or left() < _SHORTEST:
-        return found, mended
-    found = search(task, safe, seed, replace(budget, seconds=left()), per, tell, cancelled, found)
-    return found, prover.best_of(found.candidates, best) or best
+    goes_on = budget.seconds is not None and budget.starts is None and not cancelled() and left() > _SHORTEST
+    if goes_on and best.candidate.start >= 0:
+        found = search(task, safe, seed, replace(budget, seconds=left()), per, tell, cancelled, found)
+        best = prover.best_of(found.candidates, per, over, best) or best
+    return found, best
 
 
 def _gains(

@@ -7,7 +7,7 @@ the arm that does not follow, or comes too near, the search is told how much mor
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,7 +22,8 @@ from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel
 
 _ROUNDS = 2
-_WORTH_IT = 0.01  # of the criterion, lost by making a motion smaller
+_NEARLY = 0.99  # of its size: a motion of which so much can be proven is not worth searching on
+_ENOUGH = 0.05  # of the criterion, lost to a proof: below, what else was tried is not proven too
 
 
 @dataclass(frozen=True)
@@ -81,47 +82,69 @@ class Prover:
         why = "; ".join(objections(proof, self._model, limits))
         return proof, why or self._veto(path) or ""
 
-    def best_of(self, candidates: Sequence[Candidate], best: Attempt | None = None) -> Attempt | None:
-        """Return the best of candidates and of an earlier attempt.
+    def best_of(
+        self,
+        candidates: Sequence[Candidate],
+        per_period: int,
+        over: Callable[[], bool],
+        best: Attempt | None = None,
+    ) -> Attempt | None:
+        """Return the best motion that can be proven, of candidates and an earlier attempt.
 
-        The search's own values are smooth ones, by which another candidate may be the best.
+        Args:
+            candidates: of the search, whose own values are smooth ones, by which another candidate may be the best.
+            per_period: samples per period of the search, to go on with.
+            over: asked at every evaluation; True ends searching on.
+            best: an earlier attempt.
         """
         ranked = sorted((self._value(one.coefficients), place) for place, one in enumerate(candidates))
         for value, place in ranked:
             if best is not None and value >= best.value:
                 break  # even without the loss that a proof may cost it is no better
-            one = self._attempt(self._task, candidates[place])
-            best = one if best is None or one.value < best.value else best
+            for tried in reversed(self._searched_on(candidates[place], per_period, over)):
+                one = self._largest(tried)
+                best = one if best is None or one.value < best.value else best
+                if best.value - value < _ENOUGH:
+                    break
         return best
 
-    def mended(self, best: Attempt, per_period: int, over: Callable[[], bool]) -> Attempt:
-        """Search on where a motion had to be made smaller; the better of both.
+    def _searched_on(self, candidate: Candidate, per_period: int, over: Callable[[], bool]) -> list[Attempt]:
+        """Return a candidate and what was found from it, each the answer to the proof of the one before."""
+        tried = [self._at_full_size(self._task, candidate)]
+        while tried[-1].why and len(tried) <= _ROUNDS and not over():
+            latest = tried[-1]
+            task, whole = tightened(latest.task, latest.proof, self._limits), latest.candidate.coefficients
+            if task is None or not self.proof(self._scaled(whole, _NEARLY))[1]:
+                break  # there is nothing to search for, or hardly anything to gain by it
+            found = polished(task, whole, self._safe, candidate.start, per_period, over)
+            tried.append(self._at_full_size(task, found))
+        return tried
 
-        Args:
-            best: the attempt to mend.
-            per_period: samples per period of the search.
-            over: asked at every evaluation; True ends the search with what it has.
-        """
-        latest = best
-        for _ in range(_ROUNDS):
-            whole = latest.candidate.coefficients
-            if latest.value - self._value(whole) < _WORTH_IT or over():
-                break
-            task = tightened(latest.task, latest.proof, self._limits)
-            if task is None:
-                break
-            latest = self._attempt(task, polished(task, whole, self._safe, latest.candidate.start, per_period, over))
-            best = latest if latest.value < best.value else best
-        return best
+    def _at_full_size(self, task: Task, candidate: Candidate) -> Attempt:
+        whole = candidate.coefficients
+        proof, why = self.proof(whole)
+        if why:
+            return Attempt(task, candidate, proof, why, None, np.inf, why)
+        return Attempt(task, candidate, proof, why, (whole, proof), self._value(whole), "")
 
-    def _attempt(self, task: Task, candidate: Candidate) -> Attempt:
-        tried: list[tuple[Proof, str]] = []
+    def _largest(self, attempt: Attempt) -> Attempt:
+        """Return an attempt with the largest motion that can be proven."""
+        if not attempt.why:
+            return attempt
+        whole, basis = attempt.candidate.coefficients, self._task.basis
+        refused = attempt.why
 
         def proven(coefficients: Array) -> Proof | None:
-            tried.append(self.proof(coefficients))
-            return None if tried[-1][1] else tried[-1][0]
+            nonlocal refused
+            if coefficients is whole:
+                return None
+            proof, refused = self.proof(coefficients)
+            return None if refused else proof
 
-        basis = self._task.basis
-        result = largest_proven(basis, candidate.coefficients, basis.standing(self._safe), proven)
+        result = largest_proven(basis, whole, basis.standing(self._safe), proven)
         value = np.inf if result is None else self._value(result[0])
-        return Attempt(task, candidate, *tried[0], result, value, tried[-1][1])
+        return replace(attempt, result=result, value=value, refused=refused)
+
+    def _scaled(self, coefficients: Array, share: float) -> Array:
+        middle = self._task.basis.still(coefficients)
+        return middle + share * (coefficients - middle)

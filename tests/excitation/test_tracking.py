@@ -225,11 +225,11 @@ def test_what_a_proof_objects_to_is_searched_for_again_and_not_only_made_smaller
         return criterion_of(task, task.basis.path(coefficients), base)
 
     prover = Prover(model, task, safe, design.torque_margin, value, lambda path: None)
-    smaller = prover.best_of([best])
+    smaller, mended = (prover.best_of([best], per_period(task.basis), over) for over in (lambda: True, lambda: False))
     assert smaller is not None
     assert reason in smaller.why
     assert smaller.value > value(best.coefficients) + 0.01
-    mended = prover.mended(smaller, per_period(task.basis), lambda: False)
+    assert mended is not None
     assert mended.value < smaller.value - 0.01
     assert mended.result is not None
     assert not objections(mended.result[1], model, task.limits)
