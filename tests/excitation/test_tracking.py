@@ -211,7 +211,10 @@ def test_with_the_gains_that_are_proposed_the_joint_uses_its_velocity() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kp", "reason"), [(100.0, "falls behind"), (200.0, "comes within")])
+@pytest.mark.timeout(400)
+@pytest.mark.parametrize(
+    ("kp", "reason"), [pytest.param(100.0, "falls behind", marks=pytest.mark.campaign), (200.0, "comes within")]
+)
 def test_what_a_proof_objects_to_is_searched_for_again_and_not_only_made_smaller(kp: float, reason: str) -> None:
     """A soft arm above a floor: its heavier links, which no forecast knows, and the tube around its motion."""
     gains = {"kp": kp, "kd": 2.0 * kp**0.5}
