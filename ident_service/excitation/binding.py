@@ -201,4 +201,5 @@ def gain_words(criterion: Criterion, factor: float) -> str:
         more = f"{factor:.2g} times the" if factor >= _MUCH else f"{factor - 1.0:.0%} more"
         return f"{more} information per parameter"
     what = "variances" if criterion == "a_optimal" else "a condition number"
-    return f"{what} {1.0 - 1.0 / factor:.0%} smaller"
+    less = f"{factor:.3g} times" if factor >= _MUCH else f"{1.0 - 1.0 / factor:.0%}"
+    return f"{what} {less} smaller"

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from design_bench import ONE_START, quick, small
 
-from ident_service.config.design import Design
+from ident_service.config.design import Criterion, Design
 from ident_service.config.limits import motion_limits
 from ident_service.errors import MotionRefused
-from ident_service.excitation.binding import binding, binding_words, needed_stiffness, stiffer_gains
+from ident_service.excitation.binding import binding, binding_words, gain_words, needed_stiffness, stiffer_gains
 from ident_service.excitation.clearance import certified_clearance
 from ident_service.excitation.climb import Candidate, climbed, random_variables
 from ident_service.excitation.design import criterion_of, design_motion, family, per_period, settled
@@ -208,6 +208,20 @@ def test_with_the_gains_that_are_proposed_the_joint_uses_its_velocity() -> None:
     weak["elbow"] |= {"kp": float(proposed[1]), "kd": float(proposed[2])}
     after = design_motion(small(joints=weak, **SLOW), design, budget=ONE_START)
     assert after.proof.demands.velocity[1] > max(2.0 * slow, 0.3 * motion_limits(soft.config).velocity[1])
+
+
+@pytest.mark.parametrize(
+    ("criterion", "factor", "words"),
+    [
+        ("d_optimal", 1.04, "4% more information per parameter"),
+        ("d_optimal", 2.0, "2 times the information per parameter"),
+        ("condition_number", 1.25, "a condition number 20% smaller"),
+        ("condition_number", 640.0, "a condition number 640 times smaller"),
+        ("a_optimal", 1.1, "variances 9% smaller"),
+    ],
+)
+def test_a_gain_is_a_percentage_until_a_factor_says_more(criterion: Criterion, factor: float, words: str) -> None:
+    assert gain_words(criterion, factor) == words
 
 
 @pytest.mark.slow
