@@ -251,17 +251,16 @@ def _searched(
 
     first = budget if budget.seconds is None else replace(budget, seconds=(1.0 - _MENDING) * budget.seconds)
 
-    def over() -> bool:
-        return cancelled() or left() <= 0.0
-
     found = search(task, safe, seed, first, per, tell, cancelled, earlier)
-    best = prover.best_of(found.candidates, per, over)
+    kept_back = None if budget.seconds is None else _MENDING * budget.seconds
+    best = prover.best_of(found.candidates, per, kept_back, cancelled)
     if best is None:
         raise AssertionError("a search has at least one candidate")
-    goes_on = budget.seconds is not None and budget.starts is None and not cancelled() and left() > _SHORTEST
-    if goes_on and best.candidate.start >= 0:
+    # What the proof objected to has had its time.
+    at_once = best.task is task and not best.why and best.candidate.start >= 0
+    if at_once and budget.seconds is not None and budget.starts is None and not cancelled() and left() > _SHORTEST:
         found = search(task, safe, seed, replace(budget, seconds=left()), per, tell, cancelled, found)
-        best = prover.best_of(found.candidates, per, over, best) or best
+        best = prover.best_of(found.candidates, per, 0.0, cancelled, best) or best
     return found, best
 
 

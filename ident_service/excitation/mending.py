@@ -6,6 +6,7 @@ the arm that does not follow, or comes too near, the search is told how much mor
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -86,7 +87,8 @@ class Prover:
         self,
         candidates: Sequence[Candidate],
         per_period: int,
-        over: Callable[[], bool],
+        seconds: float | None,
+        cancelled: Callable[[], bool],
         best: Attempt | None = None,
     ) -> Attempt | None:
         """Return the best motion that can be proven, of candidates and an earlier attempt.
@@ -94,28 +96,39 @@ class Prover:
         Args:
             candidates: of the search, whose own values are smooth ones, by which another candidate may be the best.
             per_period: samples per period of the search, to go on with.
-            over: asked at every evaluation; True ends searching on.
+            seconds: for searching on, proofs not counted; no bound when None.
+            cancelled: asked at every evaluation; True ends searching on.
             best: an earlier attempt.
         """
         ranked = sorted((self._value(one.coefficients), place) for place, one in enumerate(candidates))
         for value, place in ranked:
             if best is not None and value >= best.value:
                 break  # even without the loss that a proof may cost it is no better
-            for tried in reversed(self._searched_on(candidates[place], per_period, over)):
+            each = None if seconds is None else seconds / _ROUNDS
+            tries = self._searched_on(candidates[place], per_period, each, cancelled)
+            seconds = 0.0  # for one candidate: the others are there to be made smaller
+            for tried in reversed(tries):
                 one = self._largest(tried)
                 best = one if best is None or one.value < best.value else best
                 if best.value - value < _ENOUGH:
                     break
         return best
 
-    def _searched_on(self, candidate: Candidate, per_period: int, over: Callable[[], bool]) -> list[Attempt]:
+    def _searched_on(
+        self, candidate: Candidate, per_period: int, seconds: float | None, cancelled: Callable[[], bool]
+    ) -> list[Attempt]:
         """Return a candidate and what was found from it, each the answer to the proof of the one before."""
         tried = [self._at_full_size(self._task, candidate)]
-        while tried[-1].why and len(tried) <= _ROUNDS and not over():
+        while tried[-1].why and len(tried) <= _ROUNDS and seconds != 0.0 and not cancelled():
             latest = tried[-1]
             task, whole = tightened(latest.task, latest.proof, self._limits), latest.candidate.coefficients
             if task is None or not self.proof(self._scaled(whole, _NEARLY))[1]:
                 break  # there is nothing to search for, or hardly anything to gain by it
+            until = None if seconds is None else time.monotonic() + seconds
+
+            def over(until: float | None = until) -> bool:
+                return cancelled() or (until is not None and time.monotonic() >= until)
+
             found = polished(task, whole, self._safe, candidate.start, per_period, over)
             tried.append(self._at_full_size(task, found))
         return tried

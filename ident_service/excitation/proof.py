@@ -18,6 +18,7 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel
 
+_LARGE = 0.4  # of a motion's size
 _FREER = 1.1  # times what was missing: a motion that is moved away becomes another one
 _FARTHEST = 0.2  # m, of clearance
 _CALM, _SHORTEST = 0.5, 0.5  # share of the limits on the ways to and from a motion; s
@@ -157,7 +158,10 @@ def largest_proven(
     """
     if (proof := proven(coefficients)) is not None:
         return coefficients, proof
+    best: tuple[float, tuple[Array, Proof]] | None = None
     for anchor in (basis.still(coefficients), safe):
+        if best is not None and best[0] >= _LARGE:
+            break  # where a motion's own middle is a bad place, little is left of it; the safe posture may leave more
         found: tuple[Array, Proof] | None = None
         too_large, small_enough = -1, len(_SHRINKS)
         step = 1
@@ -169,6 +173,6 @@ def largest_proven(
                 found, small_enough = (smaller, proof), size
             else:
                 too_large, step = size, 2 * step
-        if found is not None:
-            return found
-    return None
+        if found is not None and (best is None or _SHRINKS[small_enough] > best[0]):
+            best = _SHRINKS[small_enough], found
+    return None if best is None else best[1]
