@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from design_bench import ONE_START, quick, small
+from design_bench import FOURIER, ONE_START, quick, small
 
 from ident_service.config.design import Criterion, Design
 from ident_service.config.limits import motion_limits
@@ -24,7 +24,7 @@ from ident_service.excitation.path import FourierPath, PosturePath
 from ident_service.excitation.plan import excitation
 from ident_service.excitation.postures import safe_posture
 from ident_service.excitation.problem import Problem
-from ident_service.excitation.proof import objections, proof_of
+from ident_service.excitation.proof import largest_proven, objections, proof_of
 from ident_service.excitation.task import Task
 from ident_service.excitation.tracking import cases, track, way_width
 from ident_service.model.arm_model import ArmModel
@@ -193,6 +193,7 @@ def test_gains_are_proposed_only_as_stiff_as_is_stable(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(400)
 def test_with_the_gains_that_are_proposed_the_joint_uses_its_velocity() -> None:
     """A wrist behind which nearly nothing stands: as it is, no motion of it passes; with the gains, it moves freely."""
     weak = {"elbow": {"kp": 40.0, "kd": 12.0, "following_error": 0.02}}
@@ -208,6 +209,19 @@ def test_with_the_gains_that_are_proposed_the_joint_uses_its_velocity() -> None:
     weak["elbow"] |= {"kp": float(proposed[1]), "kd": float(proposed[2])}
     after = design_motion(small(joints=weak, **SLOW), design, budget=ONE_START)
     assert after.proof.demands.velocity[1] > max(2.0 * slow, 0.3 * motion_limits(soft.config).velocity[1])
+
+
+def test_where_a_motion_s_own_middle_is_a_bad_place_it_shrinks_towards_the_safe_posture() -> None:
+    motion, safe = FOURIER.standing(np.ones(1)), FOURIER.standing(np.zeros(1))
+    motion[0, 0] = 1.0
+
+    def proven(coefficients: np.ndarray) -> Any:
+        """Next to an obstacle at one hardly anything can be proven, farther away half of the motion."""
+        return coefficients if coefficients[0, 0] <= (0.05 if coefficients[0, -1] > 0.6 else 0.6) else None
+
+    found = largest_proven(FOURIER, motion, safe, proven)
+    assert found is not None
+    assert found[0][0, 0] > 0.5
 
 
 @pytest.mark.parametrize(
