@@ -24,6 +24,7 @@ from ident_service.excitation.binding import (
     needed_stiffness,
     stiffer_gains,
 )
+from ident_service.excitation.climb import Candidate
 from ident_service.excitation.criteria import condition_number, criterion
 from ident_service.excitation.demands import demands
 from ident_service.excitation.excitation import LONGEST, Excitation
@@ -45,7 +46,8 @@ _PER_HARMONIC = 50  # samples of a search per period of its highest harmonic
 _PER_WAY = 24  # samples of a search per way between postures
 _MOST_SAMPLES = 2000
 _EXACT = 1e6  # exponent of power means that are as good as the extremes themselves
-_MENDING = 0.25  # of the time of a search, for what the proof of its result objects to
+_MENDING = 0.2  # of the time of a search, for what the proof of its result objects to
+_LOOKING = 0.2  # of the time, for a first motion and what its proof says about how the arm follows
 _SHORTEST = 1.0  # s, below which it does not pay to begin another part of a search
 
 
@@ -249,11 +251,26 @@ def _searched(
     def left() -> float:
         return np.inf if budget.seconds is None else budget.seconds - (time.monotonic() - begun)
 
-    first = budget if budget.seconds is None else replace(budget, seconds=(1.0 - _MENDING) * budget.seconds)
+    def part(share: float) -> Budget:
+        return budget if budget.seconds is None else replace(budget, seconds=share * budget.seconds)
 
-    found = search(task, safe, seed, first, per, tell, cancelled, earlier)
+    aimed, looked = task, earlier
+    before: tuple[Candidate, ...] = ()
+    if budget.seconds is not None and budget.starts is None and earlier is None:
+        # What the proof of a first motion finds to be missing is kept free from then on.
+        looked = search(task, safe, seed, part(_LOOKING), per, tell, cancelled)
+        if looked.candidates[0].start >= 0 and not cancelled():
+            aimed = prover.aimed(looked.candidates[0])
+        if aimed is not task:
+            before, looked = looked.candidates, None
+        first = part(1.0 - _LOOKING - _MENDING)
+    else:
+        first = part(1.0 - _MENDING)
+    found = search(aimed, safe, seed, first, per, tell, cancelled, looked)
     kept_back = None if budget.seconds is None else _MENDING * budget.seconds
-    best = prover.best_of(found.candidates, per, kept_back, cancelled)
+    # A search that was cancelled soon may have nothing better than what the first look came to.
+    candidates = (*found.candidates, *before) if cancelled() else found.candidates
+    best = prover.best_of(candidates, per, kept_back, cancelled, task=aimed)
     if best is None:
         raise AssertionError("a search has at least one candidate")
     # What the proof objected to has had its time.

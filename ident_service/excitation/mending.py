@@ -90,6 +90,7 @@ class Prover:
         seconds: float | None,
         cancelled: Callable[[], bool],
         best: Attempt | None = None,
+        task: Task | None = None,
     ) -> Attempt | None:
         """Return the best motion that can be proven, of candidates and an earlier attempt.
 
@@ -99,13 +100,15 @@ class Prover:
             seconds: for searching on, proofs not counted; no bound when None.
             cancelled: asked at every evaluation; True ends searching on.
             best: an earlier attempt.
+            task: of the search that found them; that of all proofs when None.
         """
+        task = task or self._task
         ranked = sorted((self._value(one.coefficients), place) for place, one in enumerate(candidates))
         for value, place in ranked:
             if best is not None and value >= best.value:
                 break  # even without the loss that a proof may cost it is no better
             each = None if seconds is None else seconds / _ROUNDS
-            tries = self._searched_on(candidates[place], per_period, each, cancelled)
+            tries = self._searched_on(task, candidates[place], per_period, each, cancelled)
             seconds = 0.0  # for one candidate: the others are there to be made smaller
             for tried in reversed(tries):
                 one = self._largest(tried)
@@ -114,23 +117,28 @@ class Prover:
                     break
         return best
 
+    def aimed(self, candidate: Candidate) -> Task:
+        """Return the task with as much kept free as the proof of a first motion finds to be missing."""
+        first = self._at_full_size(self._task, candidate)
+        return (tightened(self._task, first.proof, self._limits) if first.why else None) or self._task
+
     def _searched_on(
-        self, candidate: Candidate, per_period: int, seconds: float | None, cancelled: Callable[[], bool]
+        self, task: Task, candidate: Candidate, per_period: int, seconds: float | None, cancelled: Callable[[], bool]
     ) -> list[Attempt]:
         """Return a candidate and what was found from it, each the answer to the proof of the one before."""
-        tried = [self._at_full_size(self._task, candidate)]
+        tried = [self._at_full_size(task, candidate)]
         while tried[-1].why and len(tried) <= _ROUNDS and seconds != 0.0 and not cancelled():
             latest = tried[-1]
-            task, whole = tightened(latest.task, latest.proof, self._limits), latest.candidate.coefficients
-            if task is None or not self.proof(self._scaled(whole, _NEARLY))[1]:
+            harder, whole = tightened(latest.task, latest.proof, self._limits), latest.candidate.coefficients
+            if harder is None or not self.proof(self._scaled(whole, _NEARLY))[1]:
                 break  # there is nothing to search for, or hardly anything to gain by it
             until = None if seconds is None else time.monotonic() + seconds
 
             def over(until: float | None = until) -> bool:
                 return cancelled() or (until is not None and time.monotonic() >= until)
 
-            found = polished(task, whole, self._safe, candidate.start, per_period, over)
-            tried.append(self._at_full_size(task, found))
+            found = polished(harder, whole, self._safe, candidate.start, per_period, over)
+            tried.append(self._at_full_size(harder, found))
         return tried
 
     def _at_full_size(self, task: Task, candidate: Candidate) -> Attempt:
