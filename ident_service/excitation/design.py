@@ -266,11 +266,11 @@ def _searched(
         first = part(1.0 - _LOOKING - _MENDING)
     else:
         first = part(1.0 - _MENDING)
-    found = search(aimed, safe, seed, first, per, tell, cancelled, looked)
+    found = search(aimed, prover.safe(aimed), seed, first, per, tell, cancelled, looked)
     kept_back = None if budget.seconds is None else _MENDING * budget.seconds
-    # A search that was cancelled soon may have nothing better than what the first look came to.
-    candidates = (*found.candidates, *before) if cancelled() else found.candidates
-    best = prover.best_of(candidates, per, kept_back, cancelled, task=aimed)
+    best = prover.best_of(found.candidates, per, kept_back, cancelled, task=aimed)
+    # What the first look came to may be better, made smaller, than what a short or cancelled search came to after it.
+    best = prover.best_of(before[:1], per, 0.0, cancelled, best)
     if best is None:
         raise AssertionError("a search has at least one candidate")
     # What the proof objected to has had its time.

@@ -13,8 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident_service.config.limits import motion_limits
+from ident_service.errors import MotionRefused
 from ident_service.excitation.climb import Candidate
 from ident_service.excitation.path import FourierPath, PosturePath
+from ident_service.excitation.postures import safe_posture
 from ident_service.excitation.proof import Proof, largest_proven, objections, proof_of, tightened
 from ident_service.excitation.search import polished
 from ident_service.excitation.task import Task
@@ -120,7 +122,23 @@ class Prover:
     def aimed(self, candidate: Candidate) -> Task:
         """Return the task with as much kept free as the proof of a first motion finds to be missing."""
         first = self._at_full_size(self._task, candidate)
-        return (tightened(self._task, first.proof, self._limits) if first.why else None) or self._task
+        return (self._harder(first) if first.why else None) or self._task
+
+    def safe(self, task: Task) -> Array:
+        """Return a posture that keeps the limits of a task, shape (joints,)."""
+        if task.extra_clearance == self._task.extra_clearance:
+            return self._safe
+        return safe_posture(self._model, task.limits, extra_clearance=task.extra_clearance)
+
+    def _harder(self, attempt: Attempt) -> Task | None:
+        """Return the task that keeps free what was missing; None where no posture does."""
+        task = tightened(attempt.task, attempt.proof, self._limits)
+        try:
+            if task is not None:
+                self.safe(task)
+        except MotionRefused:
+            return None
+        return task
 
     def _searched_on(
         self, task: Task, candidate: Candidate, per_period: int, seconds: float | None, cancelled: Callable[[], bool]
@@ -129,7 +147,7 @@ class Prover:
         tried = [self._at_full_size(task, candidate)]
         while tried[-1].why and len(tried) <= _ROUNDS and seconds != 0.0 and not cancelled():
             latest = tried[-1]
-            harder, whole = tightened(latest.task, latest.proof, self._limits), latest.candidate.coefficients
+            harder, whole = self._harder(latest), latest.candidate.coefficients
             if harder is None or not self.proof(self._scaled(whole, _NEARLY))[1]:
                 break  # there is nothing to search for, or hardly anything to gain by it
             until = None if seconds is None else time.monotonic() + seconds
@@ -137,7 +155,7 @@ class Prover:
             def over(until: float | None = until) -> bool:
                 return cancelled() or (until is not None and time.monotonic() >= until)
 
-            found = polished(harder, whole, self._safe, candidate.start, per_period, over)
+            found = polished(harder, whole, self.safe(harder), candidate.start, per_period, over)
             tried.append(self._at_full_size(harder, found))
         return tried
 
