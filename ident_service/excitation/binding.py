@@ -34,6 +34,7 @@ _REACHED = 0.05  # share of a limit that may be left where it still counts as re
 _NO_FORCE = -1e6  # a multiplier at which a limit does not press, however far it is exceeded
 _WORTH_TELLING = 0.03  # of lambda; below, twice the limit gives two hundredths more
 _MOST_TOLD = 6
+_MOST = 50.0  # of lambda: slopes of a motion that teaches next to nothing know no bounds
 _MUCH = 1.5  # times: from here on a factor says more than a percentage
 _HALVINGS = 5  # of the way to gains that would do, where those are not stable
 _NOT_WORTH_IT = 1.05  # times the gain: what is below is not proposed
@@ -86,6 +87,7 @@ def binding(task: Task, coefficients: Array, per_period: int) -> tuple[Binding, 
     if not slopes:
         return ()
     forces, _ = nnls(np.array(slopes).T, -alone)
+    forces = np.minimum(forces, _MOST)
     total: dict[tuple[str, int | None], tuple[float, float]] = {}
     for owner, force, part in zip(owners, forces.tolist(), by_gain, strict=True):
         cost, stiffer = total.get(owner, (0.0, 0.0))
