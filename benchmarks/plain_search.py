@@ -1,8 +1,10 @@
-"""A search written in an afternoon: random Fourier motions scaled into the limits, the best improved by Powell.
+"""A search written in an afternoon: random Fourier motions scaled into the limits, the best of each hundred improved.
 
-Torques are pinocchio's, the optimiser is scipy's. The regressor is the traced one of this package, which is many times
-as fast as pinocchio's from Python. It keeps position, velocity, acceleration and torque at its samples, and knows
-neither jerk, clearance nor supply, nor whether the arm can follow. All of that is in its favour.
+Torques are pinocchio's, the optimiser is scipy's: SLSQP with numerical derivatives, begun anew from another hundred
+when it ends, which finds more in the same time than Powell's method, L-BFGS, or random motions alone (decision 0071).
+The regressor is the traced one of this package, which is many times as fast as pinocchio's from Python. It keeps
+position, velocity, acceleration, torque and, where the arm has bodies, the workspace's clearance at its samples, and
+knows neither jerk nor supply, nor whether the arm can follow. All of that is in its favour.
 """
 
 from __future__ import annotations
@@ -18,11 +20,16 @@ from ident_service.config.limits import MotionLimits
 from ident_service.excitation.fourier import FourierSeries
 from ident_service.excitation.path import FourierPath
 from ident_service.model.arm_model import ArmModel, control_model
+from ident_service.model.collision import CollisionModel
 from ident_service.model.regressor import joint_regressor
 from ident_service.model.rigid_body import pinocchio_model
 
 _SAMPLES = 100
-_RANDOM_SHARE = 0.5  # of the time
+_RANDOM = 100  # motions, of which the best is improved
+_STEP, _ITERATIONS = 1e-5, 200
+_HALVINGS = 10
+_SEEN = 4  # clearance is looked at in one sample of so many
+_NOTHING = 1e3  # the value of a motion that teaches nothing
 Array = np.ndarray
 
 
@@ -50,6 +57,7 @@ class PlainSearch:
         self._columns, self._noise = columns, noise
         self._pin = pinocchio_model(model.chain, model.layout, prior)
         self._data = self._pin.createData()
+        self._collision = CollisionModel(model)
         self._time = np.arange(_SAMPLES) / _SAMPLES / design.base_frequency
 
     def run(self, criterion: str, seed: int, seconds: float) -> FourierPath:
@@ -63,21 +71,20 @@ class PlainSearch:
             if time.monotonic() > end:
                 raise _OutOfTime
             path = self._scaled(x)
-            found = self._value(path, criterion)
+            found = min(self._value(path, criterion), _NOTHING)
             if found < best:
-                best, motion = found, (x.copy(), path)
+                best, motion = found, path
             return found
 
         try:
-            while time.monotonic() < end - (1.0 - _RANDOM_SHARE) * seconds:
-                value(rng.normal(size=size))
-            if motion is not None:
-                minimize(value, motion[0], method="Powell", options={"maxiter": 10**6})
+            while True:
+                begin = min((rng.normal(size=size) for _ in range(_RANDOM)), key=value)
+                minimize(value, begin, method="SLSQP", options={"maxiter": _ITERATIONS, "eps": _STEP})
         except _OutOfTime:
             pass
         if motion is None:
             raise RuntimeError("not one motion in the time given")
-        return motion[1]
+        return motion
 
     def _scaled(self, x: Array) -> FourierPath:
         """The motion of variables, scaled about its middle so that the most used limit is just kept."""
@@ -91,20 +98,35 @@ class PlainSearch:
         shares = [np.abs(q - middle) / room, np.abs(dq) / limits.velocity, np.abs(ddq) / limits.acceleration]
         used = np.max(shares, axis=(0, 1))
         factor = (0.98 / used)[:, None]
-        for _ in range(12):
-            series = FourierSeries(self._design.base_frequency, X[:, :n] * factor, X[:, n : 2 * n] * factor, middle)
-            path = FourierPath(series, self._design.periods, self._design.ramp)
-            q, dq, ddq, _ = FourierPath(series, 1, 0.0).at(self._time)
-            torque = np.array([pin.rnea(self._pin, self._data, *row) for row in zip(q, dq, ddq, strict=True)])
-            if (np.abs(torque) <= 0.98 * limits.torque).all():
-                return path
-            factor = 0.8 * factor
-        return path
+
+        def scaled(share: float) -> FourierPath:
+            a, b = (share * factor * part for part in (X[:, :n], X[:, n : 2 * n]))
+            series = FourierSeries(self._design.base_frequency, a, b, middle)
+            return FourierPath(series, self._design.periods, self._design.ramp)
+
+        if self._holds(path := scaled(1.0)):
+            return path
+        low, high = 0.0, 1.0
+        for _ in range(_HALVINGS):
+            share = 0.5 * (low + high)
+            low, high = (share, high) if self._holds(scaled(share)) else (low, share)
+        return scaled(low)
+
+    def _holds(self, path: FourierPath) -> bool:
+        q, dq, ddq, _ = FourierPath(path.series, 1, 0.0).at(self._time)
+        torque = np.array([pin.rnea(self._pin, self._data, *row) for row in zip(q, dq, ddq, strict=True)])
+        if not (np.abs(torque) <= 0.98 * self._limits.torque).all():
+            return False
+        if not self._collision.pairs:
+            return True
+        distances = self._collision.distances(q[::_SEEN])
+        return bool((distances >= self._model.config.workspace.clearance).all())
 
     def _value(self, path: FourierPath, criterion: str) -> float:
         rows = self._rows(path)
         if criterion == "condition_number":
-            return float(np.linalg.cond(rows.reshape(-1, rows.shape[-1])))
+            rows = rows.reshape(-1, rows.shape[-1])
+            return 0.5 * float(np.log(np.linalg.cond(rows.T @ rows)))
         weighted = (rows / self._noise[:, None]).reshape(-1, rows.shape[-1])
         return -float(np.linalg.slogdet(weighted.T @ weighted)[1])
 

@@ -6,8 +6,9 @@ then proven for all time, made smaller where the proof needs it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,15 +16,24 @@ from ident_service.config.design import Criterion, Design
 from ident_service.config.limits import MotionLimits, motion_limits
 from ident_service.errors import MotionRefused, UsageError
 from ident_service.excitation.basis import Basis, FourierBasis, PostureBasis
-from ident_service.excitation.binding import binding, binding_words
+from ident_service.excitation.binding import (
+    Binding,
+    binding,
+    binding_words,
+    gain_words,
+    needed_stiffness,
+    stiffer_gains,
+)
+from ident_service.excitation.climb import Candidate
 from ident_service.excitation.criteria import condition_number, criterion
 from ident_service.excitation.demands import demands
 from ident_service.excitation.excitation import LONGEST, Excitation
 from ident_service.excitation.expectation import described_noise, information, seconds_of_information
-from ident_service.excitation.following import dry_friction
+from ident_service.excitation.following import USABLE, dry_friction
+from ident_service.excitation.mending import Attempt, Prover
 from ident_service.excitation.path import FourierPath, PosturePath
 from ident_service.excitation.postures import safe_posture
-from ident_service.excitation.proof import Proof, largest_proven, objections, proof_of
+from ident_service.excitation.proof import Proof
 from ident_service.excitation.search import Budget, Found, Progress, search
 from ident_service.excitation.task import Task, usable_limits
 from ident_service.model.arm_model import ArmModel, control_model
@@ -35,6 +45,10 @@ from ident_service.model.expected_friction import expected_friction
 _PER_HARMONIC = 50  # samples of a search per period of its highest harmonic
 _PER_WAY = 24  # samples of a search per segment between postures
 _MOST_SAMPLES = 2000
+_EXACT = 1e6  # exponent of power means that are as good as the extremes themselves
+_MENDING = 0.2  # of the time of a search, for what the proof of its result objects to
+_LOOKING = 0.2  # of the time, for a first motion and what its proof says about how the arm follows
+_SHORTEST = 1.0  # s, below which it does not pay to begin another part of a search
 
 
 @dataclass(frozen=True)
@@ -164,6 +178,7 @@ def design_motion(
     added: Array | None = None,
     earlier: Found | None = None,
     veto: Callable[[FourierPath | PosturePath], str | None] = lambda _: None,
+    stable: Callable[[Array, Array], bool] = lambda kp, kd: True,
     tell: Callable[[Progress], None] = lambda _: None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> Designed:
@@ -180,6 +195,7 @@ def design_motion(
         added: information from earlier recordings (`settled`).
         earlier: of a search for the same task, to go on from.
         veto: what else speaks against a motion of which everything is proven, in words; such a motion is made smaller.
+        stable: judges gains kp and kd, each of shape (joints,), before they are proposed.
         tell: called from time to time.
         cancelled: asked from time to time; True ends the search with what it has.
 
@@ -195,58 +211,105 @@ def design_motion(
     _require_free_home(model, task.limits, collision)
     safe = safe_posture(model, task.limits, seed)
     _require_holdable_home(model, task.limits)
-    found = search(task, safe, seed, budget or Budget(), per_period(basis), tell, cancelled, earlier)
-
-    why: list[str] = []
-
-    def proven(coefficients: Array) -> Proof | None:
-        proof = proof_of(basis.path(coefficients), model, task.limits, collision, design.torque_margin)
-        why[:] = objections(proof, model, task.limits)
-        if not why and (vetoed := veto(basis.path(coefficients))) is not None:
-            why[:] = [vetoed]
-        return None if why else proof
-
-    best: tuple[float, Array, Proof] | None = None
-    for candidate in found.candidates:
-        if best is not None and candidate.value >= best[0]:
-            break  # a proof can only make it worse, so it cannot beat the best
-        result = largest_proven(basis, candidate.coefficients, basis.standing(safe), proven)
-        if result is not None:
-            value = criterion_of(task, basis.path(result[0]), base)
-            if best is None or value < best[0]:
-                best = (value, *result)
-    if best is None and any(candidate.start >= 0 for candidate in found.candidates):
+    prover = Prover(model, task, safe, design.torque_margin, lambda X: criterion_of(task, basis.path(X), base), veto)
+    found, best = _searched(task, prover, safe, seed, budget or Budget(), tell, cancelled, earlier)
+    limits = motion_limits(model.config)
+    if best.result is None and best.candidate.start >= 0:
+        gains = _gains(best, (), limits, stable)
+        proposed = "".join(f"{model.chain.names[k]}: {words}. " for k, words in gains.items())
         raise MotionRefused(
             f"{model.config.name}: of {found.finished} motions found none is one that the arm can follow for certain, "
-            f"however small: {'; '.join(why)}. Stiffer gains, a wider following_error, or friction and drive_inertia "
-            "as they are would help"
+            f"however small: {best.refused}. {proposed}Stiffer gains, a wider following_error, or friction and "
+            "drive_inertia as they are would help"
         )
-    if best is None:
-        still = basis.standing(safe)
-        proof = proof_of(basis.path(still), model, task.limits, collision, design.torque_margin)
-        if wrong := objections(proof, model, task.limits):
-            raise MotionRefused(f"not even standing still keeps the limits: {'; '.join(wrong)}")
-        best = (criterion_of(task, basis.path(still), base), still, proof)
-    value, coefficients, proof = best
+    if best.result is None:
+        raise MotionRefused(f"not even standing still keeps the limits: {best.refused}")
+    coefficients, proof = best.result
     path = basis.path(coefficients)
     kappa = condition_number(information(path, model, base, np.ones(model.chain.joints)))
     excitation = Excitation(
-        "designed", path, model.config.motion_sha256, _made(model, design, seed, found, kappa, value, proof)
+        "designed", path, model.config.motion_sha256, _made(model, design, seed, found, kappa, best.value, proof)
     )
-    held = (
-        ()
-        if value >= criterion_of(task, basis.path(basis.still(coefficients)), base)
-        else (
-            *binding_words(
-                binding(task, coefficients, per_period(basis)),
-                task,
-                motion_limits(model.config),
-                proof.demands.velocity,
-                ["rad" if turns else "m" for turns in model.chain.revolute],
-            ),
+    held: tuple[str, ...] = ()
+    if best.value < criterion_of(task, basis.path(basis.still(coefficients)), base):
+        whole = best.candidate.coefficients
+        bound = binding(best.task, whole, per_period(basis))
+        lengths = ["rad" if turns else "m" for turns in model.chain.revolute]
+        gains = _gains(best, bound, limits, stable)
+        held = (
+            *(() if coefficients is whole else (_shrunk_words(task, base, best),)),
+            *binding_words(bound, task, limits, proof.demands.velocity, lengths, gains),
         )
-    )
     return Designed(excitation, proof, kappa, found, held)
+
+
+def _searched(
+    task: Task,
+    prover: Prover,
+    safe: Array,
+    seed: int,
+    budget: Budget,
+    tell: Callable[[Progress], None],
+    cancelled: Callable[[], bool],
+    earlier: Found | None,
+) -> tuple[Found, Attempt]:
+    """Search, prove, and spend what time is left on what the proof objects to, or else on searching on."""
+    begun, per = time.monotonic(), per_period(task.basis)
+
+    def left() -> float:
+        return np.inf if budget.seconds is None else budget.seconds - (time.monotonic() - begun)
+
+    def part(share: float) -> Budget:
+        return budget if budget.seconds is None else replace(budget, seconds=share * budget.seconds)
+
+    aimed, looked = task, earlier
+    before: tuple[Candidate, ...] = ()
+    if budget.seconds is not None and budget.starts is None and earlier is None:
+        # What the proof of a first motion finds to be missing is kept free from then on.
+        looked = search(task, safe, seed, part(_LOOKING), per, tell, cancelled)
+        if looked.candidates[0].start >= 0 and not cancelled():
+            aimed = prover.aimed(looked.candidates[0])
+        if aimed is not task:
+            before, looked = looked.candidates, None
+        first = part(1.0 - _LOOKING - _MENDING)
+    else:
+        first = part(1.0 - _MENDING)
+    found = search(aimed, prover.safe(aimed), seed, first, per, tell, cancelled, looked)
+    kept_back = None if budget.seconds is None else _MENDING * budget.seconds
+    best = prover.best_of(found.candidates, per, kept_back, cancelled, task=aimed)
+    # What the first look came to may be better, made smaller, than what a short or cancelled search came to after it.
+    best = prover.best_of(before[:1], per, 0.0, cancelled, best)
+    if best is None:
+        raise AssertionError("a search has at least one candidate")
+    # What the proof objected to has had its time.
+    at_once = best.task is task and not best.why and best.candidate.start >= 0
+    if at_once and budget.seconds is not None and budget.starts is None and not cancelled() and left() > _SHORTEST:
+        found = search(task, safe, seed, replace(budget, seconds=left()), per, tell, cancelled, found)
+        best = prover.best_of(found.candidates, per, 0.0, cancelled, best) or best
+    return found, best
+
+
+def _gains(
+    attempt: Attempt,
+    bound: Sequence[Binding],
+    limits: MotionLimits,
+    stable: Callable[[Array, Array], bool],
+) -> dict[int, str]:
+    """Propose gains by joint, for a motion as it was found and what its proof came to."""
+    task, tracking = attempt.task, attempt.proof.tracking
+    late = np.zeros(len(limits.kp), dtype=bool)
+    needed = needed_stiffness(task, attempt.candidate.coefficients, per_period(task.basis))
+    if tracking is not None:
+        late = tracking.late(limits)
+        needed = np.maximum(needed, np.where(late, tracking.error / (USABLE * limits.following_error), 0.0))
+    return stiffer_gains(bound, late, needed, limits, stable)
+
+
+def _shrunk_words(task: Task, base: BaseParameters, attempt: Attempt) -> str:
+    """Say what it costs that a motion was made smaller until it could be proven."""
+    lost = attempt.value - criterion_of(task, task.basis.path(attempt.candidate.coefficients), base)
+    gain = gain_words(task.criterion, float(np.exp(max(lost, 0.0))))
+    return f"made smaller until everything could be proven; whole, it would give about {gain}: {attempt.why}"
 
 
 def require_bearable(basis: Basis) -> None:
@@ -274,7 +337,7 @@ def criterion_of(task: Task, path: FourierPath | PosturePath, base: BaseParamete
     G = information(path, task.model, base, task.noise) * seconds_of_information(path) * task.rate
     if task.added is not None:
         G = G + task.added
-    return criterion(task.criterion, G, 64.0, task.chosen, task.scale).value
+    return criterion(task.criterion, G, _EXACT, task.chosen, task.scale).value
 
 
 def _require_holdable_home(model: ArmModel, limits: MotionLimits) -> None:

@@ -20,13 +20,14 @@ _INSIDE = 0.01  # of a joint's range, at either end
 _RESERVE = 0.9  # of the room between clearance and torque limits that the posture should leave to a motion about it
 
 
-def safe_posture(model: ArmModel, limits: MotionLimits, seed: int = 0) -> Array:
+def safe_posture(model: ArmModel, limits: MotionLimits, seed: int = 0, extra_clearance: float = 0.0) -> Array:
     """Return the posture nearest to home that leaves the motion room, shape (joints,).
 
     Args:
         model: its prior gives the gravity torque.
         limits: what a motion may use, margins taken off.
         seed: of the postures that are tried.
+        extra_clearance: kept free beyond the workspace's clearance [m].
 
     Raises:
         MotionRefused: no posture keeps the limits; the message says which of them stand in the way.
@@ -42,7 +43,7 @@ def safe_posture(model: ArmModel, limits: MotionLimits, seed: int = 0) -> Array:
     postures = np.vstack([home, 0.5 * (lower + upper), home + share * (drawn - home)])
     torque = _torque_used(model, limits, postures)
     capsules = CapsuleModel(model)
-    clearance = model.config.workspace.clearance
+    clearance = model.config.workspace.clearance + extra_clearance
     room = np.full(len(postures), np.inf)
     if capsules.pairs:
         distances = capsules.distances(postures)

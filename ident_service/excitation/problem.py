@@ -112,7 +112,8 @@ class Problem:
         step = float(np.median(np.diff(times)))
         # Departure of a point, a metre from an axis, from the straight line between two samples.
         between = min(0.125 * float(limits.acceleration.max()) * step**2, _BETWEEN)
-        self._clearance = model.config.workspace.clearance + between
+        self._clearance = np.full(len(times) + _LINE, model.config.workspace.clearance + between)
+        self._clearance[: len(times)] += task.extra_clearance
         # The straight way from home to where the motion begins, for which only clearance matters.
         self._line = np.linspace(0.0, 1.0, _LINE)[:, None]
         self._begin = maps(task.basis, np.zeros(1))[0]
@@ -201,6 +202,25 @@ class Problem:
         sizes = (self._half, limits.velocity, limits.acceleration, limits.jerk)
         return tuple(zip(self._maps, middles, sizes, strict=True))
 
+    def speed_from_error(self, x: Array) -> Array:
+        """Return which share of its allowed speed the arm needs to fall behind and catch up, shape (samples, joints).
+
+        It is positive where that comes on top of the reference's speed, negative where it takes some off.
+        """
+        q, dq = (values @ self.coefficients(x).T for values in self._maps[:2])
+        if self._following is None:
+            return np.zeros_like(q)
+        catching_up = -(self._rate_of @ self._following.run(q, dq))
+        return np.asarray(catching_up * np.sign(dq + catching_up) / (TOLERATED * self.task.limits.velocity))
+
+    def error_at_velocity_limit(self, x: Array) -> Array:
+        """Return the largest forecast error in the motion's postures at the velocity limits [rad or m], (joints,)."""
+        q, dq = (values @ self.coefficients(x).T for values in self._maps[:2])
+        if self._following is None:
+            return np.zeros(self._n)
+        fastest = np.where(dq < 0.0, -1.0, 1.0) * self.task.limits.velocity
+        return np.asarray(np.abs(self._following.run(q, fastest)).max(axis=0))
+
     def state(self, x: Array, sharpness: float) -> State:
         """Return criterion and limits at x."""
         return self._evaluate(x, sharpness, None)[0]
@@ -250,7 +270,9 @@ class Problem:
             way = limits.home + self._line * (self._begin @ X.T - limits.home)
             # Clearance is that of the arm, which lags behind its reference.
             where = q if self._following is None else q - behind
-            found["clearance"] = (self._clearance - self._capsules.distances(np.concatenate([where, way])).T) / _DEPTH
+            found["clearance"] = (
+                self._clearance[:, None] - self._capsules.distances(np.concatenate([where, way])).T
+            ) / _DEPTH
         state = State(X, value, found)
         if multipliers is None:
             return state, value.value, np.zeros(0)

@@ -12,11 +12,15 @@ from ident_service.excitation.basis import Basis
 from ident_service.excitation.clearance import Clearance, Tube, certified_clearance
 from ident_service.excitation.demands import Demands, demands
 from ident_service.excitation.path import STEP_PEAKS, FourierPath, Path, PosturePath
+from ident_service.excitation.task import Task
 from ident_service.excitation.tracking import Tracking, track, way_width
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel
 
+_LARGE = 0.4  # of a motion's size
+_FREER = 1.1  # times what was missing: a motion that is moved away becomes another one
+_FARTHEST = 0.2  # m, of clearance
 _CALM, _SHORTEST = 0.5, 0.5  # share of the limits on the ways to and from a motion; s
 _SHRINKS = (*(1.0 - 0.002 * 1.35**k for k in range(20)), 0.2, 0.1, 0.05, 0.01)  # 0.998 ... 0.4 ... 0.01
 
@@ -105,6 +109,33 @@ def objections(proof: Proof, model: ArmModel, limits: MotionLimits) -> list[str]
     return found
 
 
+def tightened(task: Task, proof: Proof, limits: MotionLimits) -> Task | None:
+    """Return a task whose search keeps free what a proof has found to be missing; None where that would not help.
+
+    The search forecasts friction alone. The simulated arm also has heavier links, and takes its time to settle, and the
+    tube around its motion is as wide as its worst joint makes it.
+
+    Args:
+        task: of the search that found the motion.
+        proof: of the motion at full size.
+        limits: of the arm.
+    """
+    allowed, velocity, extra = task.limits.following_error, task.limits.velocity, task.extra_clearance
+    if proof.tracking is not None:
+        behind, fast = proof.tracking.used(limits)
+        allowed = allowed / np.where(behind > 1.0, _FREER * behind, 1.0)
+        velocity = velocity / np.where(fast > 1.0, fast, 1.0)
+    if proof.clearance is not None and not proof.clearance.proven:
+        extra += _FREER * (proof.clearance.required - proof.clearance.lower_bound)
+    if not extra < _FARTHEST:
+        return None  # no search could keep so much free
+    mended = replace(
+        task, limits=replace(task.limits, following_error=allowed, velocity=velocity), extra_clearance=extra
+    )
+    same = (allowed == task.limits.following_error).all() and (velocity == task.limits.velocity).all()
+    return None if same and extra == task.extra_clearance else mended
+
+
 def largest_proven(
     basis: Basis,
     coefficients: Array,
@@ -127,7 +158,10 @@ def largest_proven(
     """
     if (proof := proven(coefficients)) is not None:
         return coefficients, proof
+    best: tuple[float, tuple[Array, Proof]] | None = None
     for anchor in (basis.still(coefficients), safe):
+        if best is not None and best[0] >= _LARGE:
+            break  # where a motion's own middle is a bad place, little is left of it; the safe posture may leave more
         found: tuple[Array, Proof] | None = None
         too_large, small_enough = -1, len(_SHRINKS)
         step = 1
@@ -139,6 +173,6 @@ def largest_proven(
                 found, small_enough = (smaller, proof), size
             else:
                 too_large, step = size, 2 * step
-        if found is not None:
-            return found
-    return None
+        if found is not None and (best is None or _SHRINKS[small_enough] > best[0]):
+            best = _SHRINKS[small_enough], found
+    return None if best is None else best[1]

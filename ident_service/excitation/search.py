@@ -132,6 +132,33 @@ def search(
     return run.found()
 
 
+def polished(
+    task: Task, coefficients: Array, safe: Array, start: int, per_period: int, stopped: Callable[[], bool]
+) -> Candidate:
+    """Polish a motion for another task than that which it was found for, in this process.
+
+    Args:
+        task: what to search.
+        coefficients: of the motion, shape (joints, size).
+        safe: a posture that keeps all limits, shape (joints,).
+        start: number of the random start that it came from.
+        per_period: samples per period of the starts.
+        stopped: asked at every evaluation; True ends the polish with what it has.
+    """
+
+    def check() -> None:
+        if stopped():
+            raise Interrupted
+
+    problem = Problem(task, _FINER * per_period)
+    with one_blas_thread():
+        try:
+            x = problem.variables(coefficients)
+            return climbed(problem, x, task.basis.standing(safe), start, check, polish=True)
+        except Stopped as ended:
+            return ended.candidate
+
+
 @dataclass(frozen=True)
 class _Crew:
     """Worker pool: submits a start or a polish, and interrupts running ones."""

@@ -33,6 +33,7 @@ class Task:
         friction: of the drives, which the arm falls behind by; not looked at when None.
         rate: samples per second that will be recorded [Hz].
         added: information from earlier recordings, whitened alike, shape (base, base), or None.
+        extra_clearance: kept free beyond the workspace's clearance while the motion lasts [m].
     """
 
     model: ArmModel
@@ -46,6 +47,7 @@ class Task:
     friction: ExpectedFriction | None
     rate: float
     added: Array | None = None
+    extra_clearance: float = 0.0
 
 
 def usable_limits(names: tuple[str, ...], limits: MotionLimits, design: Design) -> MotionLimits:

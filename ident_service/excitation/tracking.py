@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ident_service.config.limits import MotionLimits, motion_limits
 from ident_service.errors import ModelError
@@ -73,6 +74,14 @@ class Tracking:
     repeated: float = 0.0
     repeats_from: float = np.inf
 
+    def late(self, limits: MotionLimits) -> NDArray[np.bool_]:
+        """Return which joints are too far from their references for the guard of an arm, shape (joints,)."""
+        return np.asarray(~(self.used(limits)[0] <= 1.0))
+
+    def used(self, limits: MotionLimits) -> tuple[Array, Array]:
+        """Return the shares used of what a simulated arm may: of following errors and velocities, shape (joints,)."""
+        return self.error / (_ERROR_USED * limits.following_error), self.velocity / (_VELOCITY_USED * limits.velocity)
+
     def objections(self, names: Sequence[str], limits: MotionLimits) -> list[str]:
         """Return what the safety monitor would stop, or might, in words; empty when the arm can follow.
 
@@ -80,9 +89,9 @@ class Tracking:
             names: of the joints.
             limits: of the arm.
         """
-        found = []
+        found, late = [], self.late(limits)
         for k, name in enumerate(names):
-            if not self.error[k] <= _ERROR_USED * limits.following_error[k]:
+            if late[k]:
                 found.append(
                     f"{name}: falls behind by {self.error[k]:.3f}, with {self.worst}; of its following_error of "
                     f"{limits.following_error[k]:g} a simulated arm may use {_ERROR_USED:.0%}"

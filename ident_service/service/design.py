@@ -26,6 +26,7 @@ from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.information import Information
+from ident_service.motion.preflight.stability import delay_of, stability
 from ident_service.motion.surroundings import touching_stop
 from ident_service.record.part import overlap
 from ident_service.results.files import appearing_folder, require_place, write_atomically
@@ -119,6 +120,7 @@ def design_files(
         added=added,
         earlier=earlier,
         veto=lambda path: touching_stop(path, limits, model),
+        stable=lambda kp, kd: stability(model, replace(limits, kp=kp, kd=kd), delay_of(model.config)).stable,
         tell=tell,
         cancelled=cancelled,
     )

@@ -52,3 +52,13 @@ def test_the_wam_runs_its_designed_motion(starts: int, tmp_path: Path) -> None:
     design = arm.design.model_copy(update={"harmonics": 2, "base_frequency": 0.2, "periods": 1})
     motion = design_motion(arm_model(arm), design, budget=Budget(seconds=None, starts=starts, workers=1)).excitation
     assert_runs(arm, motion, tmp_path)
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("name", ["planar2", "threelink", "sixaxis", "wam7_sim"])
+@pytest.mark.parametrize("seed", range(20))
+def test_a_motion_of_any_seed_runs_at_the_arm_s_own_rate(name: str, seed: int, tmp_path: Path) -> None:
+    """What the description asks for, bounded by starts, so that a busy machine designs the same motion."""
+    arm = load_arm(name)
+    motion = design_motion(arm_model(arm), arm.design, seed=seed, budget=Budget(seconds=None, starts=2, workers=1))
+    assert_runs(arm, motion.excitation, tmp_path)

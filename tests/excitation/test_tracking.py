@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from design_bench import ONE_START, quick, small
+from design_bench import FOURIER, ONE_START, quick, small
 
+from ident_service.config.design import Criterion, Design
 from ident_service.config.limits import motion_limits
 from ident_service.errors import MotionRefused
-from ident_service.excitation.binding import binding, binding_words
+from ident_service.excitation.binding import binding, binding_words, gain_words, needed_stiffness, stiffer_gains
 from ident_service.excitation.clearance import certified_clearance
-from ident_service.excitation.climb import climbed, random_variables
-from ident_service.excitation.design import design_motion, family, per_period, settled
+from ident_service.excitation.climb import Candidate, climbed, random_variables
+from ident_service.excitation.design import criterion_of, design_motion, family, per_period, settled
 from ident_service.excitation.excitation import Excitation
+from ident_service.excitation.mending import Prover
 from ident_service.excitation.path import FourierPath, PosturePath
 from ident_service.excitation.plan import excitation
 from ident_service.excitation.postures import safe_posture
 from ident_service.excitation.problem import Problem
-from ident_service.excitation.proof import objections, proof_of
+from ident_service.excitation.proof import largest_proven, objections, proof_of
+from ident_service.excitation.task import Task
 from ident_service.excitation.tracking import cases, track, way_width
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
 from ident_service.motion.factory import make_arm
+from ident_service.motion.preflight.stability import stability
 from ident_service.motion.run import run
 from ident_service.motion.states import State
 
@@ -112,26 +118,154 @@ def test_the_last_ramp_of_a_motion_of_many_periods_has_the_tube_of_the_simulated
         np.testing.assert_allclose(short.width(times, half), long.width(later, half))
 
 
-@pytest.mark.slow
-def test_the_limit_that_is_widened_by_its_own_word_pays_as_foretold() -> None:
-    """A slower joint is held by its velocity; a design with a little more of it gains what the multiplier says."""
-    model = small(joints={"elbow": {"velocity": 0.6}}, **SLOW)
-    design = quick()
+def polished(model: ArmModel, design: Design) -> tuple[Task, Candidate, Callable[[Task], Candidate]]:
+    """A task, the best motion of one start, and what a polish from there finds for another task."""
     task = settled(model, design, *family(design, model))
     safe = task.basis.standing(safe_posture(model, task.limits))
     problem = Problem(task, per_period(task.basis))
     x = random_variables(problem, np.random.default_rng(1), safe)
     start = climbed(problem, x, safe, 0, lambda: None).coefficients
     best = climbed(problem, problem.variables(start), safe, 0, lambda: None, polish=True)
+
+    def from_there(other: Task) -> Candidate:
+        problem = Problem(other, per_period(other.basis))
+        return climbed(problem, problem.variables(best.coefficients), safe, 0, lambda: None, polish=True)
+
+    return task, best, from_there
+
+
+@pytest.mark.slow
+def test_the_limit_that_is_widened_by_its_own_word_pays_as_foretold() -> None:
+    """A slower joint is held by its velocity; a design with a little more of it gains what the multiplier says."""
+    model = small(joints={"elbow": {"velocity": 0.6}}, **SLOW)
+    task, best, from_there = polished(model, quick())
     found = binding(task, best.coefficients, per_period(task.basis))
     expected = {(one.limit, one.joint): one.exponent for one in found}["velocity", 1]
     assert expected > 0.05
     velocity = task.limits.velocity * np.array([1.0, 1.1])
-    wider = Problem(replace(task, limits=replace(task.limits, velocity=velocity)), per_period(task.basis))
-    more = climbed(wider, wider.variables(best.coefficients), safe, 0, lambda: None, polish=True)
+    more = from_there(replace(task, limits=replace(task.limits, velocity=velocity)))
     assert best.value - more.value == pytest.approx(expected * np.log(1.1), rel=0.3)
     words = binding_words(found, task, motion_limits(model.config), task.limits.velocity, ("rad", "rad"))
     assert any("elbow is held by its velocity; 1.2 would give about" in line for line in words)
+
+
+@pytest.fixture(scope="module")
+def soft() -> tuple[Task, Candidate, Callable[[Task], Candidate]]:
+    """An elbow so soft that the friction which nobody knows of would push it far off its reference."""
+    model = small(joints={"elbow": {"kp": 40.0, "kd": 12.0, "following_error": 0.05}}, **SLOW)
+    return polished(model, quick())
+
+
+@pytest.mark.slow
+def test_stiffer_gains_pay_as_foretold(soft: tuple[Task, Candidate, Callable[[Task], Candidate]]) -> None:
+    task, best, from_there = soft
+    found = binding(task, best.coefficients, per_period(task.basis))
+    expected = sum(one.by_gain for one in found if one.joint == 1)
+    assert expected > 0.05
+    stiffer = from_there(replace(task, limits=replace(task.limits, kp=task.limits.kp * np.array([1.0, 1.1]))))
+    assert best.value - stiffer.value == pytest.approx(expected * np.log(1.1), rel=0.3)
+
+
+@pytest.mark.slow
+def test_gains_are_proposed_only_as_stiff_as_is_stable(
+    soft: tuple[Task, Candidate, Callable[[Task], Candidate]],
+) -> None:
+    task, best, _ = soft
+    found, limits = binding(task, best.coefficients, per_period(task.basis)), motion_limits(task.model.config)
+    needed = needed_stiffness(task, best.coefficients, per_period(task.basis))
+    most = 40.0 * needed[1]  # times the kp that there is
+
+    def words(allowed: float) -> str:
+        def stable(kp: np.ndarray, kd: np.ndarray) -> bool:
+            assert kd[1] ** 2 / kp[1] == pytest.approx(12.0**2 / 40.0)  # the damping stays
+            return bool(kp[1] <= allowed)
+
+        gains = stiffer_gains(found, np.zeros(2, dtype=bool), needed, limits, stable)
+        lines = binding_words(found, task, limits, 0.3 * limits.velocity, ("rad", "rad"), gains)
+        (about,) = [line for line in lines if "elbow is held to" in line]
+        return about
+
+    assert words(1.01 * most).startswith("elbow is held to 30% of its velocity by following_error; 0.1 rad would give")
+    assert words(1.01 * most).endswith(
+        f"; with kp {most:.0f} and kd {12.0 * np.sqrt(most / 40.0):.3g} it would follow at its velocity limit"
+    )
+    assert "are the stiffest that are stable" in words(0.8 * most)
+    assert words(40.0).endswith("; stiffer gains would not be stable")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+def test_with_the_gains_that_are_proposed_the_joint_uses_its_velocity() -> None:
+    """An elbow too soft to move: with the gains, which are stable at this rate, it moves freely."""
+    weak = {"elbow": {"kp": 40.0, "kd": 12.0, "following_error": 0.15}}
+    soft = small(joints=weak, **SLOW)
+    limits = motion_limits(soft.config)
+
+    def stable(kp: np.ndarray, kd: np.ndarray) -> bool:
+        return stability(soft, replace(limits, kp=kp, kd=kd)).stable
+
+    before = design_motion(soft, quick(), budget=ONE_START, stable=stable)
+    told = [line for line in before.binding if line.startswith("elbow")]
+    (proposed,) = re.findall(r"with kp ([0-9.]+) and kd ([0-9.]+) it would follow at its velocity", "; ".join(told))
+    weak["elbow"] |= {"kp": float(proposed[0]), "kd": float(proposed[1])}
+    after = design_motion(small(joints=weak, **SLOW), quick(), budget=ONE_START)
+    slow, fast = (one.proof.demands.velocity[1] for one in (before, after))
+    assert fast > max(2.0 * slow, 0.3 * limits.velocity[1])
+
+
+def test_where_a_motion_s_own_middle_is_a_bad_place_it_shrinks_towards_the_safe_posture() -> None:
+    motion, safe = FOURIER.standing(np.ones(1)), FOURIER.standing(np.zeros(1))
+    motion[0, 0] = 1.0
+
+    def proven(coefficients: np.ndarray) -> Any:
+        """Next to an obstacle at one hardly anything can be proven, farther away half of the motion."""
+        return coefficients if coefficients[0, 0] <= (0.05 if coefficients[0, -1] > 0.6 else 0.6) else None
+
+    found = largest_proven(FOURIER, motion, safe, proven)
+    assert found is not None
+    assert found[0][0, 0] > 0.5
+
+
+@pytest.mark.parametrize(
+    ("criterion", "factor", "words"),
+    [
+        ("d_optimal", 1.04, "4% more information per parameter"),
+        ("d_optimal", 2.0, "2 times the information per parameter"),
+        ("condition_number", 1.25, "a condition number 20% smaller"),
+        ("condition_number", 640.0, "a condition number 640 times smaller"),
+        ("a_optimal", 1.1, "variances 9% smaller"),
+    ],
+)
+def test_a_gain_is_a_percentage_until_a_factor_says_more(criterion: Criterion, factor: float, words: str) -> None:
+    assert gain_words(criterion, factor) == words
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+@pytest.mark.parametrize(
+    ("kp", "reason"), [pytest.param(100.0, "falls behind", marks=pytest.mark.campaign), (200.0, "comes within")]
+)
+def test_what_a_proof_objects_to_is_searched_for_again_and_not_only_made_smaller(kp: float, reason: str) -> None:
+    """A soft arm above a floor: its heavier links, which no forecast knows, and the tube around its motion."""
+    gains = {"kp": kp, "kd": 2.0 * kp**0.5}
+    floor = {"clearance": 0.02, "obstacles": {"floor": {"half_space": {"normal": [0, 1, 0], "offset": -0.6}}}}
+    model = small(joints={"shoulder": gains, "elbow": gains}, workspace=floor, **SLOW)
+    design = quick()
+    task, best, _ = polished(model, design)
+    base, safe = family(design, model)[1], safe_posture(model, task.limits)
+
+    def value(coefficients: np.ndarray) -> float:
+        return criterion_of(task, task.basis.path(coefficients), base)
+
+    prover = Prover(model, task, safe, design.torque_margin, value, lambda path: None)
+    smaller, mended = (prover.best_of([best], per_period(task.basis), time, lambda: False) for time in (0.0, None))
+    assert smaller is not None
+    assert reason in smaller.why
+    assert smaller.value > value(best.coefficients) + 0.01
+    assert mended is not None
+    assert mended.value < smaller.value - 0.01
+    assert mended.result is not None
+    assert not objections(mended.result[1], model, task.limits)
 
 
 def test_the_parts_of_a_long_way_show_the_error_of_the_whole() -> None:
