@@ -181,7 +181,7 @@ class Session:
             DriverError: the arm does not answer.
         """
         self._rows = []
-        learned: list[Vector] = []
+        learned: dict[bool, list[Vector]] = {}
         begin_ns: int | None = None
         while True:
             sample = self._arm.exchange(self._torque)
@@ -198,11 +198,13 @@ class Session:
                 wanted = wanted + moving * shaking[0] * np.sin(2.0 * np.pi * shaking[1] * elapsed)
             self._torque = self._limited(wanted + self._against_friction(setpoint, learning))
             if learning and setpoint.velocity.any():
-                learned.append(self._friction)
+                learned.setdefault(bool(setpoint.velocity.sum() > 0.0), []).append(self._friction)
             if elapsed >= seconds:
                 if learned:
                     # What the model lacks of gravity is taken for friction on one way, and against it on the other.
-                    self._friction = np.mean(learned, axis=0)
+                    # The first half of a way is where it is still being learned.
+                    halves = [np.mean(way[len(way) // 2 :], axis=0) for way in learned.values()]
+                    self._friction = np.mean(halves, axis=0)
                 return self._rows
 
     @property
