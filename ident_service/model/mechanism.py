@@ -156,8 +156,9 @@ def bad_inertias(file: TextFile) -> list[BadInertia]:
             link = attributes.get("name", "")
         elif tag == "inertial":
             inside = True
-        elif inside and tag in ("mass", "inertia", "origin"):
-            for key, text in attributes.items():
+        elif inside:
+            # Attributes of others, such as units, mean nothing to a parser.
+            for key, text in ((key, attributes[key]) for key in _INERTIAL.get(tag, ()) if key in attributes):
                 values = [_as_number(word) for word in text.split()]
                 line = parser.CurrentLineNumber
                 if not all(map(math.isfinite, values)):
@@ -173,6 +174,13 @@ def bad_inertias(file: TextFile) -> list[BadInertia]:
     parser.StartElementHandler, parser.EndElementHandler = begin, end
     parser.Parse(file.text.encode("utf-8", "surrogatepass"), True)
     return found
+
+
+_INERTIAL: Final = {
+    "mass": ("value",),
+    "inertia": ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"),
+    "origin": ("xyz", "rpy"),
+}
 
 
 def _as_number(word: str) -> float:

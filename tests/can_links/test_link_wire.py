@@ -371,7 +371,7 @@ def test_a_frame_comes_when_it_was_sent_however_late_the_wires_host_is() -> None
         # No end may say that it sent something long ago, or will.
         raw = sender._connection._socket
         for lie in (time.monotonic_ns() + 10**12, 1):
-            raw.send(packets.pack_frames([(Frame(0x083, stamp_ns=lie), False)]))
+            raw.send(pack_frames([(Frame(0x083, stamp_ns=lie), False)]))
             last = port.receive(soon())
             assert last is not None
             assert heard[-1].stamp_ns <= last.stamp_ns <= time.monotonic_ns()

@@ -180,9 +180,16 @@ def test_words_that_cannot_be_meant(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert not (tmp_path / "out").exists()
 
 
+class Knowing(IdentClient):
+    """A client of a daemon that has every run."""
+
+    def get(self, path: str, **_: object) -> dict[str, object]:
+        return {"path": path}
+
+
 def remote_recording(path: Path) -> dict[str, object]:
-    """Name a recording of a daemon, which is not asked for that."""
-    client = IdentClient("http://127.0.0.1:1", "token")
+    """Name a recording of a daemon, which is asked for nothing else."""
+    client = Knowing("http://127.0.0.1:1", "token")
     return recording(client, argparse.Namespace(json=True), "planar2", path)
 
 
