@@ -77,6 +77,12 @@ def to_be_fitted(model: ArmModel) -> tuple[str, ...]:
     )
 
 
+def searched(key: str) -> float:
+    """Give the standard deviation of a number's logarithm if any value that is searched were as likely."""
+    grid = _GRIDS[key][_GRIDS[key] > 0.0]
+    return float(np.log(grid[-1] / grid[0]) / np.sqrt(12.0))
+
+
 def fit_friction(
     trials: FrictionTrials | None, model: ArmModel, base: BaseParameters, conditions: FeasibleSet | None = None
 ) -> tuple[ArmModel, tuple[Choice, ...]]:
