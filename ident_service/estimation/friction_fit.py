@@ -43,6 +43,8 @@ _GRIDS: dict[str, Array] = {
 _NONE = {"presliding": 0.0, "stribeck_velocity": NO_STRIBECK}
 _FINER = np.array([0.6, 0.8, 1.0, 1.25, 1.6])
 _ROUNDS = 2
+# So near that what is left of the grid moves no parameter by much beside its deviation.
+_NEARER = (np.array([0.9, 0.95, 1.0, 1.05, 1.1]), np.array([0.975, 1.0, 1.025]), np.array([0.99, 1.0, 1.01]))
 _RATE = 125.0  # Hz; friction changes slowly enough to be fitted on fewer rows
 
 
@@ -112,7 +114,7 @@ def fit_friction(
         found = [
             search.finer(start, wanted) for start in (search.in_turn(values, wanted), search.pairs(values, wanted))
         ]
-        start, values = values, search.best(values, found, predicting=True)
+        start, values = values, search.nearer(search.best(values, found, predicting=True), wanted)
         if conditions is not None:
             values, choices = search.chosen(start, values, wanted, conditions)
     return with_friction(model, _shape(values)), tuple(choices)
@@ -166,9 +168,19 @@ class _Search:
     def finer(self, values: _Numbers, wanted: Sequence[str]) -> _Numbers:
         """Around the values, inside the grids."""
         for key in [*wanted] * _ROUNDS:
-            low, high = _GRIDS[key][0], _GRIDS[key][-1]
-            values = self.best(values, [{key: np.clip(values[key] * factor, low, high)} for factor in _FINER])
+            values = self._around(values, key, _FINER)
         return values
+
+    def nearer(self, values: _Numbers, wanted: Sequence[str]) -> _Numbers:
+        """Closer and closer around values that the finer steps have found."""
+        for factors in _NEARER:
+            for key in [*wanted] * _ROUNDS:
+                values = self._around(values, key, factors)
+        return values
+
+    def _around(self, values: _Numbers, key: str, factors: Array) -> _Numbers:
+        low, high = _GRIDS[key][0], _GRIDS[key][-1]
+        return self.best(values, [{key: np.clip(values[key] * factor, low, high)} for factor in factors])
 
     def best(self, values: _Numbers, trials: Sequence[_Numbers], *, predicting: bool = False) -> _Numbers:
         """Per drive, the trial that leaves its joint the smallest residual, or predicts its torque best."""
