@@ -168,19 +168,21 @@ class _Search:
     def finer(self, values: _Numbers, wanted: Sequence[str]) -> _Numbers:
         """Around the values, inside the grids."""
         for key in [*wanted] * _ROUNDS:
-            values = self._around(values, key, _FINER)
+            values = self._around(values, key, _FINER, np.ones_like(values[key], dtype=bool))
         return values
 
     def nearer(self, values: _Numbers, wanted: Sequence[str]) -> _Numbers:
-        """Closer and closer around values that the finer steps have found."""
+        """Closer and closer around values that the finer steps have found; what is at the edge stays, and is said."""
+        inside = {key: (values[key] > _GRIDS[key][0]) & (values[key] < _GRIDS[key][-1]) for key in wanted}
         for factors in _NEARER:
             for key in [*wanted] * _ROUNDS:
-                values = self._around(values, key, factors)
+                values = self._around(values, key, factors, inside[key])
         return values
 
-    def _around(self, values: _Numbers, key: str, factors: Array) -> _Numbers:
+    def _around(self, values: _Numbers, key: str, factors: Array, moving: NDArray[np.bool_]) -> _Numbers:
         low, high = _GRIDS[key][0], _GRIDS[key][-1]
-        return self.best(values, [{key: np.clip(values[key] * factor, low, high)} for factor in factors])
+        trials = [np.where(moving, np.clip(values[key] * factor, low, high), values[key]) for factor in factors]
+        return self.best(values, [{key: trial} for trial in trials])
 
     def best(self, values: _Numbers, trials: Sequence[_Numbers], *, predicting: bool = False) -> _Numbers:
         """Per drive, the trial that leaves its joint the smallest residual, or predicts its torque best."""
