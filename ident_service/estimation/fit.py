@@ -68,7 +68,7 @@ class Fit:
     Attributes:
         fit: the least squares whose factors constrained estimates use.
         equations: what it solves, with row weights where the method has them.
-        covariance: from blocks of scores, shape (base, base).
+        covariance: from blocks of scores, with the doubt about fitted shapes of friction, shape (base, base).
         deviations: standard deviations on the careful side, shape (base,), see `doubt.py`.
         degrees: degrees of freedom of the deviations, shape (base,).
         noise: variances by what differs between repetitions of the motion, shape (base,); None where most is not
@@ -200,7 +200,7 @@ def unconstrained(
     found = _with_known_shape(method, recordings, prepared, base, conditions)
     if not prepared.shapes:
         return found
-    # Huber's rows have their weights, and one weight per joint is left for them as they are.
+    # The weights of Huber's rows are in his equations, not among those per joint.
     weights = weighted_least_squares(prepared.equations.with_near(found.shares).total).weights
     added = shape_covariance(
         recordings,
