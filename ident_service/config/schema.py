@@ -254,8 +254,14 @@ class Identification(GrownSection):
     def _averaged_instead(self) -> Identification:
         if self.period is None:
             return self
-        given = self.smoothing.model_fields_set & {"filter_torque", "regressor_cutoff", "decimate"}
-        if used := sorted(key for key in given if getattr(self.smoothing, key) not in (False, None, 1)):
+        smoothing = self.smoothing
+        # True equals 1, so each is held against its own way of saying no.
+        filters = {
+            "decimate": smoothing.decimate != 1,
+            "filter_torque": smoothing.filter_torque,
+            "regressor_cutoff": smoothing.regressor_cutoff is not None,
+        }
+        if used := [key for key, is_on in filters.items() if is_on and key in smoothing.model_fields_set]:
             raise ValueError(f"period averages instead of filtering; leave out smoothing.{', smoothing.'.join(used)}")
         return self
 

@@ -143,9 +143,33 @@ def equations(
         RecordingError: a recording does not fit the arm, or some joint does not move in it.
     """
     whole = tuple(recordings) if isinstance(recordings, Sequence) else (recordings,)
+    felt = supports(model.chain, model.layout, base.base)
+    return equations_of(whole, model, felt, lambda recording: equation_rows(recording, model, base), row_weights)
+
+
+@one_blas_thread()
+def equations_of(
+    recordings: Sequence[Recording],
+    model: ArmModel,
+    felt: tuple[NDArray[np.intp], ...],
+    rows_of: Callable[[Recording], Iterator[Rows]],
+    row_weights: RowWeights | None = None,
+) -> Equations:
+    """Gather the rows that a function gives, which may have further columns, as `equations` gathers its own.
+
+    Args:
+        recordings: to read.
+        model: its configuration says how to cut them into blocks.
+        felt: per joint, which columns it feels, increasing.
+        rows_of: gives a recording's rows in consecutive chunks.
+        row_weights: what each row is multiplied by, as of `equations`.
+
+    Raises:
+        RecordingError: a recording does not fit the arm, or some joint does not move in it.
+    """
     gathered = Equations((), 0)
-    for recording, cut in zip(whole, cut_into_stretches(whole, model), strict=True):
-        gathered = _gathered(gathered, recording, settled(model, [recording]), base, cut, row_weights)
+    for recording, cut in zip(recordings, cut_into_stretches(recordings, model), strict=True):
+        gathered = _gathered(gathered, recording, rows_of(recording), model.chain.names, felt, cut, row_weights)
     return gathered
 
 
@@ -164,15 +188,15 @@ def cut_into_stretches(recordings: Sequence[Recording], model: ArmModel) -> tupl
 def _gathered(
     before: Equations,
     recording: Recording,
-    model: ArmModel,
-    base: BaseParameters,
+    consecutive: Iterator[Rows],
+    names: Sequence[str],
+    joint_supports: tuple[NDArray[np.intp], ...],
     cut: Stretches,
     row_weights: RowWeights | None,
 ) -> Equations:
-    joint_supports = supports(model.chain, model.layout, base.base)
-    moved = np.zeros(model.chain.joints, dtype=bool)
+    moved = np.zeros(len(names), dtype=bool)
     samples, current, origin = 0, None, cut.origin
-    for rows in equation_rows(recording, model, base):
+    for rows in consecutive:
         origin = float(rows.time[0]) if origin is None else origin
         samples += len(rows.time)
         # Blocks are stretches of time, whatever the rate after decimation and wherever chunks meet.
@@ -199,7 +223,7 @@ def _gathered(
             current = number[begin]
         moved |= rows.moving.any(axis=0)
         before = bounded(Equations(tuple(blocks), before.samples, tuple(near), tuple(labels)))
-    if still := [name for name, moves in zip(model.chain.names, moved, strict=True) if not moves]:
+    if still := [name for name, moves in zip(names, moved, strict=True) if not moves]:
         raise RecordingError(
             recording.path,
             f"{', '.join(still)}: never faster than identification.reversal.speed, nothing to identify from",

@@ -27,6 +27,7 @@ from ident_service.estimation.friction_fit import fit_friction, friction_trials,
 from ident_service.estimation.instruments import instrumental_variables
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares, weighted_least_squares
 from ident_service.estimation.robust import held_out_errors, huber
+from ident_service.estimation.shape_doubt import shape_covariance
 from ident_service.estimation.spectra import settled
 from ident_service.estimation.standstill import standstill_shares
 from ident_service.model.arm_model import ArmModel
@@ -49,6 +50,7 @@ class Prepared:
         delay: between position and torque, where it was estimated.
         torque_scales: what each joint's measured torque was multiplied by, shape (joints,).
         choices: of what the configuration left to be chosen.
+        shapes: which numbers of the friction's shape were fitted.
     """
 
     model: ArmModel
@@ -56,6 +58,7 @@ class Prepared:
     delay: Delay | None
     torque_scales: Array
     choices: tuple[Choice, ...] = ()
+    shapes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,7 @@ class Fit:
     Attributes:
         fit: the least squares whose factors constrained estimates use.
         equations: what it solves, with row weights where the method has them.
-        covariance: from blocks of scores, shape (base, base).
+        covariance: from blocks of scores, with the doubt about fitted shapes of friction, shape (base, base).
         deviations: standard deviations on the careful side, shape (base,), see `doubt.py`.
         degrees: degrees of freedom of the deviations, shape (base,).
         noise: variances by what differs between repetitions of the motion, shape (base,); None where most is not
@@ -128,6 +131,7 @@ def prepare(
         trials = trials if seconds == 0.0 else None
     if trials is None and to_be_fitted(model):
         trials = friction_trials(recordings, model, base)
+    fitted = to_be_fitted(model)
     model, shapes = fit_friction(trials, model, base, conditions)
     choices += shapes
     gathered = gather(recordings, model, base)
@@ -136,7 +140,7 @@ def prepare(
         weights = weighted_least_squares(gathered.total).weights
         scales = constrained_least_squares_with_scales(gathered.total, base, conditions, bounds, weights).scales
         gathered = gathered.with_torques_times(scales)
-    return Prepared(model, gathered, delay, scales, choices)
+    return Prepared(model, gathered, delay, scales, choices, fitted)
 
 
 def _with_velocity(
@@ -184,13 +188,41 @@ def unconstrained(
     base: BaseParameters,
     conditions: FeasibleSet,
 ) -> Fit:
-    """Return the estimate of a method, or of the one of `wls` and `huber` that predicts held-out thirds better.
+    """Estimate by a method, or by the one of `wls` and `huber` that predicts held-out thirds better.
+
+    The covariance has the doubt about the friction's shape in it, where that was fitted.
 
     Raises:
         RecordingError: a recording cannot be used.
         ModelError: the joints' weights do not settle, or instruments say nothing.
         SolverError: the solver stopped without an optimum.
     """
+    found = _with_known_shape(method, recordings, prepared, base, conditions)
+    if not prepared.shapes:
+        return found
+    # The weights of Huber's rows are in his equations, not among those per joint.
+    weights = weighted_least_squares(prepared.equations.with_near(found.shares).total).weights
+    added = shape_covariance(
+        recordings,
+        prepared.model,
+        base,
+        prepared.shapes,
+        found.fit.beta,
+        weights if found.method == "huber" else found.fit.weights,
+        prepared.torque_scales,
+        found.shares,
+    )
+    deviations = np.sqrt(found.deviations**2 + np.diag(added) * widening(found.degrees) ** 2)
+    return replace(found, covariance=found.covariance + added, deviations=deviations)
+
+
+def _with_known_shape(
+    method: Method | Literal["choose"],
+    recordings: Sequence[Recording],
+    prepared: Prepared,
+    base: BaseParameters,
+    conditions: FeasibleSet,
+) -> Fit:
     model = prepared.model
     shares = standstill_shares(prepared.equations)
     gathered = prepared.equations.with_near(shares)

@@ -43,6 +43,8 @@ _GRIDS: dict[str, Array] = {
 _NONE = {"presliding": 0.0, "stribeck_velocity": NO_STRIBECK}
 _FINER = np.array([0.6, 0.8, 1.0, 1.25, 1.6])
 _ROUNDS = 2
+# So near that what is left of the grid moves no parameter by much beside its deviation.
+_NEARER = (np.array([0.9, 0.95, 1.0, 1.05, 1.1]), np.array([0.975, 1.0, 1.025]), np.array([0.99, 1.0, 1.01]))
 _RATE = 125.0  # Hz; friction changes slowly enough to be fitted on fewer rows
 
 
@@ -77,6 +79,12 @@ def to_be_fitted(model: ArmModel) -> tuple[str, ...]:
     )
 
 
+def searched(key: str) -> float:
+    """Give the standard deviation of a number's logarithm if any value that is searched were as likely."""
+    grid = _GRIDS[key][_GRIDS[key] > 0.0]
+    return float(np.log(grid[-1] / grid[0]) / np.sqrt(12.0))
+
+
 def fit_friction(
     trials: FrictionTrials | None, model: ArmModel, base: BaseParameters, conditions: FeasibleSet | None = None
 ) -> tuple[ArmModel, tuple[Choice, ...]]:
@@ -106,7 +114,7 @@ def fit_friction(
         found = [
             search.finer(start, wanted) for start in (search.in_turn(values, wanted), search.pairs(values, wanted))
         ]
-        start, values = values, search.best(values, found, predicting=True)
+        start, values = values, search.nearer(search.best(values, found, predicting=True), wanted)
         if conditions is not None:
             values, choices = search.chosen(start, values, wanted, conditions)
     return with_friction(model, _shape(values)), tuple(choices)
@@ -160,9 +168,21 @@ class _Search:
     def finer(self, values: _Numbers, wanted: Sequence[str]) -> _Numbers:
         """Search around the values, inside the grids."""
         for key in [*wanted] * _ROUNDS:
-            low, high = _GRIDS[key][0], _GRIDS[key][-1]
-            values = self.best(values, [{key: np.clip(values[key] * factor, low, high)} for factor in _FINER])
+            values = self._around(values, key, _FINER, np.ones_like(values[key], dtype=bool))
         return values
+
+    def nearer(self, values: _Numbers, wanted: Sequence[str]) -> _Numbers:
+        """Closer and closer around values that the finer steps have found; what is at the edge stays, and is said."""
+        inside = {key: (values[key] > _GRIDS[key][0]) & (values[key] < _GRIDS[key][-1]) for key in wanted}
+        for factors in _NEARER:
+            for key in [*wanted] * _ROUNDS:
+                values = self._around(values, key, factors, inside[key])
+        return values
+
+    def _around(self, values: _Numbers, key: str, factors: Array, moving: NDArray[np.bool_]) -> _Numbers:
+        low, high = _GRIDS[key][0], _GRIDS[key][-1]
+        trials = [np.where(moving, np.clip(values[key] * factor, low, high), values[key]) for factor in factors]
+        return self.best(values, [{key: trial} for trial in trials])
 
     def best(self, values: _Numbers, trials: Sequence[_Numbers], *, predicting: bool = False) -> _Numbers:
         """Return, per drive, the trial that leaves its joint the smallest residual, or predicts its torque best."""

@@ -112,7 +112,7 @@ class Estimate:
         delta: link parameters with K delta = beta inside the set, shape (parameters,); None where none exist.
         margin: of delta inside the set, or of the feasibility test when infeasible.
         tight: blocks of the set that the estimate presses against or violates.
-        covariance: of the unconstrained estimate, from blocks of scores, shape (base, base).
+        covariance: of the unconstrained estimate, see `Fit`, shape (base, base).
         standard_deviations: on the careful side, shape (base,): at least its diagonal's square root, see `doubt.py`.
         white_standard_deviations: the paper's (eq. 81), shape (base,).
         degrees: degrees of freedom of the standard deviations, shape (base,).

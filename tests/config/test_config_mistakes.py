@@ -174,6 +174,32 @@ def test_one_mistake_is_reported_where_it_stands(tmp_path: Path, old: str, new: 
     assert message in found[0].message
 
 
+@pytest.mark.parametrize(
+    ("smoothing", "named"),
+    [
+        ("regressor_cutoff: 5", "smoothing.regressor_cutoff"),
+        ("decimate: 4", "smoothing.decimate"),
+        ("filter_torque: true", "smoothing.filter_torque"),
+        ("filter_torque: true, decimate: 2", "smoothing.decimate, smoothing.filter_torque"),
+    ],
+)
+def test_a_period_beside_filters_that_it_replaces_is_refused(tmp_path: Path, smoothing: str, named: str) -> None:
+    mark = "identification: {smoothing"
+    text = GOOD.replace("{smoothing: {order: 3, filter_torque: false}}", f"{{smoothing: {{{smoothing}}}, period: 2.5}}")
+    assert text != GOOD
+    (problem,) = problems_of(tmp_path, text)
+    assert problem.message.endswith(f"period averages instead of filtering; leave out {named}")
+    assert (problem.line, problem.column) == place_of(text, mark)
+
+
+def test_a_period_beside_what_it_does_not_touch_is_taken(tmp_path: Path) -> None:
+    path = tmp_path / "arm.yaml"
+    path.write_text(
+        GOOD.replace("filter_torque: false}}", "filter_torque: false, decimate: 1, cutoff: 5}, period: 2.5}")
+    )
+    assert load_arm(path).identification.period == 2.5
+
+
 def test_all_mistakes_are_reported_at_once(tmp_path: Path) -> None:
     text = GOOD
     changes = (

@@ -18,9 +18,11 @@ from ident_service.estimation.delay import Delay, estimate_delay, with_delay
 from ident_service.estimation.direction import direction
 from ident_service.estimation.equations import equations
 from ident_service.estimation.feasible.feasible_set import feasible_set
+from ident_service.estimation.fit import prepare, unconstrained
 from ident_service.estimation.friction_fit import at_the_edge, fit_friction, friction_trials, with_friction
 from ident_service.estimation.identify import identify
 from ident_service.estimation.least_squares import torque_error, weighted_least_squares
+from ident_service.estimation.shape_doubt import shape_covariance
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters, base_parameters
 from ident_service.model.layout import NO_STRIBECK, Layout
@@ -198,13 +200,20 @@ def slow_waves() -> Waves:
     return Waves(rng.uniform(0.05, 0.4, (2, 4)), rng.uniform(0.0, 6.3, (2, 4)), rng.uniform(0.05, 0.3, (2, 4)))
 
 
-def rubbed(model: ArmModel, delta: np.ndarray, presliding: np.ndarray, seconds: float = 40.0) -> SampledRecording:
+def rubbed(
+    model: ArmModel,
+    delta: np.ndarray,
+    presliding: np.ndarray,
+    seconds: float = 40.0,
+    noise: float = NOISE,
+    seed: int = 2,
+) -> SampledRecording:
     time = np.arange(round(seconds * RATE)) / RATE
     q, dq, ddq = (slow_waves().derivative(time, order) for order in range(3))
     s = direction(dq, 1.0 / RATE, presliding)
     torque = np.einsum("jps,p->sj", joint_regressor(model.chain, model.layout, q, dq, ddq, direction=s), delta)
     return SampledRecording(
-        stamps(len(time), RATE), q, torque + NOISE * np.random.default_rng(2).normal(size=torque.shape)
+        stamps(len(time), RATE), q, torque + noise * np.random.default_rng(seed).normal(size=torque.shape)
     )
 
 
@@ -299,6 +308,52 @@ def test_the_rate_and_other_options_come_back_untouched() -> None:
     after = fitted_friction([rubbed(model, delta, PRESLIDING)], model, base).config.identification
     assert after.model_copy(update={"friction": before.friction}) == before
     assert model.config.identification is before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [NOISE, 0.3])
+def test_deviations_of_friction_hold_where_its_shape_was_fitted(noise: float) -> None:
+    model, base, delta = rubbing(FIT)
+    conditions = feasible_set("pseudo_inertia", base.names, model.config)
+    shares, ratios = [], []
+    for seed in range(10):
+        recording = rubbed(model, delta, PRESLIDING, noise=noise, seed=seed)
+        prepared = prepare([recording], model, base, conditions)
+        found = unconstrained("wls", [recording], prepared, base, conditions)
+        known = unconstrained("wls", [recording], replace(prepared, shapes=()), base, conditions)
+        np.testing.assert_array_equal(found.fit.beta, known.fit.beta)
+        shares.append((found.fit.beta - base.K @ delta) / found.deviations)
+        ratios.append(found.deviations / known.deviations)
+        assert np.linalg.eigvalsh(found.covariance - known.covariance).min() > -1e-9 * np.trace(found.covariance)
+    size, wider = np.sqrt(np.mean(np.square(shares), axis=0)), np.mean(ratios, axis=0)
+    names = [base.names[column] for column in base.base]
+    for name in ("fv1", "fc1", "fs1", "fv2", "fc2", "fs2"):
+        assert 0.2 < size[names.index(name)] < 1.5, name
+    # Where the shape is not known well, Coulomb friction is not; gravity does not mind.
+    assert wider[names.index("fc2")] > 1.1
+    assert np.all(wider >= 1.0)
+    assert wider[names.index("lx1")] < 1.02
+
+
+@pytest.mark.slow
+def test_friction_that_is_not_there_adds_no_doubt_of_its_shape() -> None:
+    model, base, delta = rubbing(FIT)
+    conditions = feasible_set("pseudo_inertia", base.names, model.config)
+    recording = rubbed(model, delta, PRESLIDING)
+    prepared = prepare([recording], model, base, conditions)
+    found = unconstrained("wls", [recording], prepared, base, conditions)
+    beta = np.where([name in ("fc", "fs") for name in (base.names[c][:2] for c in base.base)], 0.0, found.fit.beta)
+    added = shape_covariance(
+        [recording],
+        prepared.model,
+        base,
+        prepared.shapes,
+        beta,
+        found.fit.weights,
+        prepared.torque_scales,
+        found.shares,
+    )
+    np.testing.assert_array_equal(added, 0.0)
 
 
 def test_a_number_at_the_end_of_its_search_is_said() -> None:

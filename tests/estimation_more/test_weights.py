@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +23,7 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters, base_parameters
 from ident_service.model.information import Information, information_of, supports
 from ident_service.model.regressor import joint_regressor
+from ident_service.results.parameter_file import parameters_document, write_parameters
 
 
 @cache
@@ -216,6 +219,38 @@ def test_weights_that_do_not_settle_give_the_best_round_and_say_so(monkeypatch: 
     assert "Huber's weights did not settle: of all rounds the one is used" in estimate.remarks[0]
     monkeypatch.undo()
     assert identify(model, [with_noise(0.02)], method="huber").remarks == ()
+
+
+def test_instruments_that_do_not_settle_give_the_best_round_and_say_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, _, _ = three_links()
+    settled = identify(model, [with_noise(0.0)], method="iv")
+    assert settled.remarks == ()
+    monkeypatch.setattr("ident_service.estimation.instruments._MOST_ROUNDS", 3)
+    monkeypatch.setattr("ident_service.estimation.instruments.SETTLED", 0.0)
+    estimate = identify(model, [with_noise(0.0)], method="iv")
+    (remark,) = estimate.remarks
+    assert remark.startswith("the instrumental estimate did not settle: of all rounds the one is used that changed a")
+    assert estimate.method == "iv"
+    assert np.all(np.abs(estimate.beta - settled.beta) < 0.1 * settled.standard_deviations)
+    assert np.isfinite(estimate.standard_deviations).all()
+
+
+@pytest.mark.parametrize("torque", [0.0, 1.5])
+def test_a_torque_that_never_changes_leaves_numbers_everywhere(torque: float, tmp_path: Path) -> None:
+    model, _, _ = three_links()
+    recording = with_noise(0.0)
+    columns = recording.torque.copy()
+    columns[:, 2] = torque
+    estimate = identify(model, [replace(recording, torque=columns)], method="wls")
+    assert estimate.method == "wls"
+    assert estimate.feasible
+    assert estimate.delta is not None
+    for values in (estimate.beta, estimate.standard_deviations, estimate.covariance, estimate.delta):
+        assert np.isfinite(values).all()
+    path = tmp_path / "parameters.json"
+    write_parameters(path, parameters_document(estimate))
+    document = json.loads(path.read_text(), parse_constant=lambda word: pytest.fail(f"{word} in the file"))
+    assert document["base_parameters"]
 
 
 def test_the_rows_that_weights_are_found_on_do_not_grow_with_the_recording(monkeypatch: pytest.MonkeyPatch) -> None:
