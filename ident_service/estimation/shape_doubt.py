@@ -1,4 +1,4 @@
-"""How far base parameters may be off because the shape of the friction was fitted, too.
+"""Add to covariances how far base parameters may be off because the shape of the friction was fitted, too.
 
 The pre-sliding distance and the Stribeck velocity are found by search (`friction_fit.py`), and the estimate is linear
 once they are numbers. An error of such a number moves the parameters along with it: viscous and Coulomb friction most.
